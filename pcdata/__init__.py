@@ -1,0 +1,64 @@
+"""pcdata: from raw depth frames to point clouds a robot-learning model can train on.
+
+Importing pcdata is cheap: every public name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"],
+    "pcdata.transforms": [
+        "Center",
+        "ClusterObjects",
+        "Compose",
+        "CropWorkspace",
+        "Deproject",
+        "EstimateNormals",
+        "FarthestPointSample",
+        "MaskDepth",
+        "MergeViews",
+        "NormalizeUnitSphere",
+        "NormalizeWorkspace",
+        "RandomApply",
+        "RandomColorJitter",
+        "RandomFlip",
+        "RandomJitter",
+        "RandomPointCount",
+        "RandomPointDropout",
+        "RandomRotation",
+        "RandomSample",
+        "RandomScale",
+        "RandomTranslation",
+        "RemovePlane",
+        "RemoveRadiusOutliers",
+        "RemoveStatisticalOutliers",
+        "SplitObjects",
+        "ToFrame",
+        "Transform",
+        "VoxelDownsample",
+    ],
+    "pcdata.io": ["open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
+    "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
+    "pcdata.build": ["build_dataset", "load_config"],
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "models", "report", "structures", "synthetic", "transforms"]
+
+__all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        return getattr(importlib.import_module(_HOME_OF[name]), name)
+    if name in _SUBMODULES:
+        return importlib.import_module(f"pcdata.{name}")
+    raise AttributeError(f"module 'pcdata' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,87 @@
+"""The exceptions pcdata raises; each is also the builtin a caller would expect to catch.
+
+Every message says where, what must hold, what was given and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class PcdataError(Exception):
+    """Base of every error that pcdata raises on purpose."""
+
+
+class ShapeError(PcdataError, ValueError):
+    """A tensor has the wrong shape, or tensors that must agree do not."""
+
+
+class DTypeError(PcdataError, TypeError):
+    """A tensor has the wrong dtype, or a value the wrong type."""
+
+
+class DeviceError(PcdataError, RuntimeError):
+    """Tensors that must be on one device are not."""
+
+
+class NonFiniteError(PcdataError, ValueError):
+    """NaN or infinity where only finite numbers are allowed."""
+
+
+class FrameError(PcdataError, ValueError):
+    """A coordinate frame is unknown, or two frames were about to be mixed."""
+
+
+class UnitError(PcdataError, ValueError):
+    """Lengths are not in the unit that the step needs."""
+
+
+class PoseError(PcdataError, ValueError):
+    """A matrix that must be a rigid pose is not."""
+
+
+class TooFewPointsError(PcdataError, ValueError):
+    """A cloud has fewer points than the step needs, possibly none."""
+
+
+class NoPlaneError(PcdataError, ValueError):
+    """No plane satisfies the constraints."""
+
+
+class ConfigError(PcdataError, ValueError):
+    """A transform's fields or a configuration file are wrong; lists every fault at once."""
+
+
+class CaptureError(PcdataError, ValueError):
+    """A raw capture (depth, colour, intrinsics, pose, cloud file) cannot be trusted."""
+
+
+class CacheError(PcdataError, RuntimeError):
+    """A stored dataset is damaged, hostile, incomplete or made by another pipeline."""
+
+
+class BackendError(PcdataError, RuntimeError):
+    """A named backend is absent or cannot keep the contract for this call."""
+
+
+class MissingExtraError(PcdataError, ImportError):
+    """An optional dependency is not installed, or cannot be loaded."""
+
+
+def add_note(error: BaseException, note: str) -> None:
+    """Attach context to an exception in flight, keeping its type and traceback.
+
+    Python 3.10 has no ``add_note``: there the note joins the message.
+    """
+    if hasattr(error, "add_note"):
+        error.add_note(note)
+    elif error.args and isinstance(error.args[0], str):
+        error.args = (f"{error.args[0]}\n{note}", *error.args[1:])
+
+
+def near_matches(word: str, known: Iterable[str]) -> str:
+    """Return a ``; did you mean 'x'?`` hint, or an empty string when nothing is close."""
+    folded = {name.lower(): name for name in known}
+    close = [folded[match] for match in difflib.get_close_matches(word.lower(), folded, n=3, cutoff=0.6)]
+    return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""

@@ -1,0 +1,109 @@
+"""Masks of stray points, with Open3D's semantics so that the masks can be compared exactly.
+
+Source: Open3D ``PointCloud.remove_statistical_outlier`` and ``remove_radius_outlier`` (legacy geometry), whose edge
+cases were found by experiment; Rusu et al., Towards 3D point cloud based object maps, RAS 2008.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import op
+from pcdata.functional.cells import Cells
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.nearest import nearest_chunks
+from pcdata.functional.parameters import check_grid, require_count, require_length
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask, segment_sum
+
+
+@op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
+def statistical_outlier_mask(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    num_neighbors: int = 20,
+    std_ratio: float = 2.0,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool, True = outlier
+    """Mark points whose mean distance to their nearest neighbours is unusual for their cloud.
+
+    A point stays when 0 < mean < mu + std_ratio * sigma. ``mean`` is over its ``num_neighbors`` nearest points, itself
+    included at distance 0 (all points, in a smaller cloud); mu is the average of the means over the cloud; sigma their
+    sample deviation, n - 1. All sums are float64.
+
+    As in Open3D: points with ``num_neighbors`` or more copies at one spot have mean 0, so they are outliers and add
+    nothing to sigma; and where sigma cannot separate anything, all points are outliers: clouds of one or two points,
+    clouds whose means are all equal, ``num_neighbors=1``.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+        ConfigError: num_neighbors is less than 1, or std_ratio is not positive.
+    """
+    where = "statistical_outlier_mask"
+    assert ptr is not None  # @op fills it
+    require_count(where, "num_neighbors", num_neighbors)
+    require_length(where, "std_ratio", std_ratio)
+    check_grid(where, grid, points, ptr)
+    mean = torch.zeros(len(points), dtype=torch.float64, device=points.device)
+    for near in nearest_chunks(points, ptr, num_neighbors):
+        distance = torch.where(near.found, near.squared.double().sqrt(), 0.0)
+        mean[near.query] = distance.sum(1) / near.found.sum(1)
+    cloud, counts = cloud_of_rows(ptr), counts_from_ptr(ptr).double()
+    average = segment_sum(mean, ptr) / counts
+    spread = torch.where(mean > 0, (mean - average[cloud]) ** 2, 0.0)
+    deviation = (segment_sum(spread, ptr) / (counts - 1)).sqrt()  # NaN for one point: every comparison is then false
+    threshold = average + std_ratio * deviation
+    return ~((mean > 0) & (mean < threshold[cloud]))
+
+
+@op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
+def radius_outlier_mask(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    min_neighbors: int = 5,
+    radius: float = 0.01,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool, True = outlier
+    """Mark points with too few neighbours: a point stays when more than ``min_neighbors`` points have d < radius.
+
+    As in Open3D the point counts itself and both tests are strict; d < radius is
+    ``d2 < float32(radius) * float32(radius)``.
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers of the points.
+        min_neighbors: this many, the point itself included, are not yet enough.
+        radius: in the unit of the points.
+        grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+        ConfigError: min_neighbors is less than 1, the radius is not a positive length, or it is too small for the
+            extent of the cloud (see :class:`pcdata.functional.cells.Cells`).
+    """
+    where = "radius_outlier_mask"
+    assert ptr is not None  # @op fills it
+    require_count(where, "min_neighbors", min_neighbors)
+    require_length(where, "radius", radius)
+    check_grid(where, grid, points, ptr)
+    # All points of a cell are within the radius of each other: a full cell needs no distances.
+    outlier = Cells.within(where, points, ptr, radius).crowd() <= min_neighbors
+    undecided = outlier.nonzero().squeeze(1)
+    searches = nearest_chunks(
+        points,
+        ptr,
+        min_neighbors + 1,
+        queries=points[undecided],
+        queries_ptr=ptr_after_mask(outlier, ptr),
+        radius=float(radius),
+    )
+    for near in searches:
+        outlier[undecided[near.query]] = ~near.found.all(1)
+    return outlier

@@ -1,0 +1,54 @@
+"""Checks on the plain numbers that operations take beside tensors."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from pcdata.errors import ConfigError, DTypeError, ShapeError
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.ragged import counts_from_ptr
+
+
+def require_count(where: str, name: str, value: int, *, minimum: int = 1) -> None:
+    """Require a whole number of at least ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise DTypeError(f"{where}: {name} must be an int, not {type(value).__name__}")
+    if value < minimum:
+        raise ConfigError(f"{where}: {name} must be at least {minimum}, got {value}")
+
+
+def require_length(where: str, name: str, value: float) -> None:
+    """Require a positive, finite length whose square is still positive in float32 (about 1e-22 or more)."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DTypeError(f"{where}: {name} must be a number in the unit of the points, not {type(value).__name__}")
+    if not math.isfinite(value) or not 1e-22 <= value <= 1e19:
+        raise ConfigError(f"{where}: {name} must be a length in the unit of the points, 1e-22 to 1e19, got {value}")
+
+
+def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) -> None:
+    """Require that an image grid, when given, describes exactly these points: a kernel will trust it.
+
+    Raises:
+        ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
+            intrinsics are not one per cloud.
+    """
+    if grid is None:
+        return
+    pixel, (height, width) = grid.pixel_index, grid.size
+    if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (len(ptr) - 1, 3, 3):
+        raise ShapeError(
+            f"{where}: grid has {tuple(pixel.shape)} pixels and {tuple(grid.intrinsics.shape)} intrinsics for "
+            f"{len(points)} points in {len(ptr) - 1} clouds; drop the grid, or select it together with the points"
+        )
+    if len(pixel) == 0:
+        return
+    rises = pixel[1:] > pixel[:-1]
+    inner_start = ptr[1:-1][(counts_from_ptr(ptr)[1:] > 0) & (ptr[1:-1] > 0)]
+    rises[inner_start - 1] = True
+    if not bool(rises.all()) or int(pixel.min()) < 0 or int(pixel.max()) >= height * width:
+        raise ShapeError(
+            f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
+            "the points were reordered or repeated since they were read, so pass grid=None"
+        )

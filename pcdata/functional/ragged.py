@@ -1,0 +1,54 @@
+"""Arithmetic on packed clouds: rows of many clouds one after another, cut by row pointers.
+
+Cloud b of a batch is rows ``ptr[b]:ptr[b+1]``; any cloud may be empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+
+def counts_from_ptr(ptr: Tensor) -> Tensor:
+    """Return the (B,) number of rows of every cloud."""
+    return ptr[1:] - ptr[:-1]
+
+
+def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None = None) -> Tensor:
+    """Return (B+1,) row pointers for (B,) counts."""
+    counts = torch.as_tensor(counts if isinstance(counts, Tensor) else list(counts), dtype=torch.int64, device=device)
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def cloud_of_rows(ptr: Tensor) -> Tensor:
+    """Return (N,) int64: the cloud that each row belongs to."""
+    counts = counts_from_ptr(ptr)
+    return torch.repeat_interleave(torch.arange(len(counts), device=ptr.device), counts)
+
+
+def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
+    """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
+    kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
+    return kept[ptr]
+
+
+def segment_sum(values: Tensor, ptr: Tensor) -> Tensor:
+    """Sum (N, ...) rows per cloud into (B, ...), in float64 for floats; an empty cloud sums to 0."""
+    wide = values.double() if values.dtype.is_floating_point else values
+    total = wide.new_zeros((len(ptr) - 1, *values.shape[1:]))
+    return total.index_add_(0, cloud_of_rows(ptr), wide)
+
+
+def segment_mean(values: Tensor, ptr: Tensor) -> Tensor:
+    """Average (N, ...) rows per cloud into (B, ...) float64; an empty cloud averages to 0."""
+    counts = counts_from_ptr(ptr).clamp(min=1).double()
+    return segment_sum(values, ptr) / counts.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def segment_max(values: Tensor, ptr: Tensor) -> Tensor:
+    """Take the maximum of (N,) values per cloud; an empty cloud gives the dtype's lowest value."""
+    info = torch.finfo(values.dtype) if values.dtype.is_floating_point else torch.iinfo(values.dtype)
+    lowest = torch.full((len(ptr) - 1,), info.min, dtype=values.dtype, device=values.device)
+    return lowest.scatter_reduce_(0, cloud_of_rows(ptr), values, "amax")

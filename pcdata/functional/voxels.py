@@ -1,0 +1,230 @@
+"""Thinning clouds on a voxel grid, and averaging whatever the points carry over the same voxels.
+
+The grid is Open3D's: per cloud, it starts half a voxel below the lowest corner, and a point's voxel is
+``floor((point - origin) / voxel_size)`` in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import op
+from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
+from pcdata.functional.groups import group_count, group_first, group_sum
+from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+
+# Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
+# A sum fits 63 bits for up to 2^32 points.
+_FIXED_POINT = 2.0**31
+# Beyond this, float64 no longer tells neighbouring voxels apart.
+_MAX_VOXELS_PER_AXIS = 2.0**53
+# find_voxel_size stops when the bracket is this tight; 25 halvings away from a bracket of one octave.
+_SIZE_TOLERANCE = 1e-6
+
+
+@op(points="N 3", ptr="ptr N B")
+def voxel_downsample(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,)
+    *,
+    voxel_size: float | Sequence[float] | Tensor,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # means (M, 3) float32, ptr (B+1,), inverse (N,) int64
+    """Replace the points of each voxel by their mean; ``inverse[i]`` is the row of ``means`` that point i went into.
+
+    Voxels are ordered by the lowest row they contain. The mean is
+    ``origin + (voxel + mean offset) * voxel_size`` with offsets summed in fixed point (2^-31 of a voxel), so neither the
+    order of the points nor the device changes a bit of it.
+
+    Args:
+        voxel_size: edge length in the unit of the points; one, or one per cloud (B,).
+
+    Raises:
+        ConfigError: a voxel size that is not positive.
+        UnitError: an extent of 2^53 voxels or more.
+    """
+    assert ptr is not None
+    sizes = _sizes_per_cloud("voxel_downsample", voxel_size, ptr)
+    cloud, origin, scaled = _scale_to_grid(points, ptr, sizes)
+    voxel = scaled.floor()
+    inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
+    offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
+    count = group_count(inverse, len(first))
+    mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
+    owner = cloud[first]
+    means = origin[owner] + (voxel[first] + mean_offset) * sizes[owner, None]
+    return means.float(), ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
+
+
+@op(points="N 3", ptr="ptr N B")
+def find_voxel_size(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,)
+    *,
+    num_points: int,
+    backend: str = "auto",
+) -> Tensor:  # (B,) float64
+    """Find, per cloud, the voxel size whose :func:`voxel_downsample` leaves ``num_points``, or as few more as possible.
+
+    The size returned leaves at least ``num_points``; either exactly that many, or a size one part in a million larger
+    leaves fewer. (The number of voxels is not monotonic in their size, so a larger size elsewhere may leave as many.)
+
+    Raises:
+        TooFewPointsError: a cloud has fewer than ``num_points`` distinct points.
+    """
+    assert ptr is not None
+    if num_points < 1:
+        raise ConfigError(f"find_voxel_size: num_points must be at least 1, got {num_points}")
+    bounds = ptr.tolist()
+    sizes = [_search_size(points[a:b], num_points, cloud) for cloud, (a, b) in enumerate(pairwise(bounds))]
+    return torch.tensor(sizes, dtype=torch.float64, device=points.device)
+
+
+def count_voxels(points: Tensor, voxel_size: float) -> int:
+    """Return how many points :func:`voxel_downsample` leaves of one cloud."""
+    ptr = torch.tensor([0, len(points)], device=points.device)
+    cloud, _, scaled = _scale_to_grid(points, ptr, _sizes_per_cloud("count_voxels", voxel_size, ptr))
+    return _rank(_voxel_keys(cloud, scaled.floor(), 1))[1]
+
+
+def count_distinct(points: Tensor) -> int:
+    """Return the number of different points of one cloud."""
+    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
+    return _rank(_voxel_keys(torch.zeros_like(ranks[:, 0]), ranks, 1))[1]
+
+
+def voxel_mean(
+    values: Tensor,  # (N, C) float
+    inverse: Tensor,  # (N,) int64, as voxel_downsample returns it
+    num_voxels: int,
+) -> Tensor:  # (M, C) in the dtype of the values
+    """Average rows per voxel (colours, features), summed in float64; 0 for an empty voxel.
+
+    Raises:
+        DTypeError: integers, which have no mean (labels vote: :func:`voxel_majority`).
+    """
+    if not values.dtype.is_floating_point:
+        raise DTypeError(f"voxel_mean: values must be float, not {values.dtype}; labels go through voxel_majority")
+    count = group_count(inverse, num_voxels).clamp(min=1)
+    return (group_sum(values.double(), inverse, num_voxels) / count[:, None]).to(values.dtype)
+
+
+def voxel_mean_direction(
+    directions: Tensor,  # (N, 3) float, unit vectors
+    inverse: Tensor,  # (N,) int64
+    num_voxels: int,
+) -> Tensor:  # (M, 3) unit vectors
+    """Average directions per voxel and bring them back to unit length; directions that cancel give zero."""
+    total = group_sum(directions.double(), inverse, num_voxels)
+    return torch.nn.functional.normalize(total, dim=1).to(directions.dtype)
+
+
+def voxel_majority(
+    labels: Tensor,  # (N,) int64
+    inverse: Tensor,  # (N,) int64
+    num_voxels: int,
+) -> Tensor:  # (M,) int64
+    """Return the most frequent label of each voxel, the lowest among equals; -1 for an empty voxel.
+
+    Raises:
+        DTypeError: the labels are not int64.
+    """
+    if labels.dtype != torch.int64:
+        raise DTypeError(f"voxel_majority: labels must be int64, not {labels.dtype}")
+    names, rank = labels.unique(return_inverse=True)
+    num_names = max(len(names), 1)
+    pairs, votes = (inverse * num_names + rank).unique(return_counts=True)
+    voxel, rank = pairs // num_names, pairs % num_names
+    # More votes first, then the lower label: both in one number whose maximum wins.
+    ballot = votes * num_names + (num_names - 1 - rank)
+    best = torch.full((num_voxels,), -1, device=labels.device).scatter_reduce_(0, voxel, ballot, "amax")
+    winner = num_names - 1 - best.remainder(num_names)
+    return torch.where(best < 0, -1, names[winner]) if len(names) else best
+
+
+def _search_size(points: Tensor, num_points: int, cloud: int) -> float:
+    """Bisect on a logarithmic scale between a size that leaves enough points and one that leaves too few."""
+    distinct = count_distinct(points) if len(points) >= num_points else len(points)
+    if distinct < num_points:
+        raise TooFewPointsError(
+            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {distinct} distinct ones"
+        )
+    extent = float((points.amax(0) - points.amin(0)).double().max())
+    too_large = 3.0 * extent or 1.0  # everything lies in one voxel
+    if num_points == 1:
+        return too_large
+    enough = extent / math.sqrt(num_points)  # right for a surface, up to a factor
+    while (count := count_voxels(points, enough)) < num_points:
+        enough, too_large = enough / 2, enough
+    while count > num_points and too_large > enough * (1 + _SIZE_TOLERANCE):
+        middle = math.sqrt(enough * too_large)
+        middle_count = count_voxels(points, middle)
+        if middle_count >= num_points:
+            enough, count = middle, middle_count
+        else:
+            too_large = middle
+    return enough
+
+
+def _sizes_per_cloud(where: str, voxel_size: float | Sequence[float] | Tensor, ptr: Tensor) -> Tensor:
+    sizes = torch.as_tensor(voxel_size, dtype=torch.float64, device=ptr.device)
+    num_clouds = len(ptr) - 1
+    if sizes.ndim == 0:
+        sizes = sizes.expand(num_clouds)
+    if sizes.shape != (num_clouds,):
+        raise ShapeError(f"{where}: voxel_size must be one number or ({num_clouds},), got {tuple(sizes.shape)}")
+    if not bool((torch.isfinite(sizes) & (sizes > 0)).all()):
+        raise ConfigError(f"{where}: voxel_size must be positive, got {sizes.tolist()}")
+    return sizes
+
+
+def _scale_to_grid(points: Tensor, ptr: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each row's cloud (N,), the grids' origins (B, 3), and the points in voxels from there (N, 3); float64."""
+    cloud = cloud_of_rows(ptr)
+    wide = points.double()
+    lowest = wide.new_zeros((len(ptr) - 1, 3))
+    bounds = ptr.tolist()
+    for one, (start, stop) in enumerate(pairwise(bounds)):
+        if stop > start:
+            lowest[one] = wide[start:stop].amin(0)
+    origin = lowest - sizes[:, None] / 2
+    scaled = (wide - origin[cloud]) / sizes[cloud, None]
+    if len(points) and float(scaled.max()) >= _MAX_VOXELS_PER_AXIS:
+        worst = int(cloud[scaled.amax(1).argmax()])
+        raise UnitError(
+            f"voxel_downsample: cloud {worst} spans {float(scaled.max()):.3g} voxels of {float(sizes[worst]):g}, more than "
+            "2^53; is the voxel size in the unit of the points, and are there stray points?"
+        )
+    return cloud, origin, scaled
+
+
+def _voxel_keys(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
+    """Number the pairs of cloud (N,) and voxel (N, 3, not negative) by (N,) int64 keys that never collide."""
+    key, size = cloud, num_clouds
+    for axis in voxel.long().unbind(1):
+        axis_size = int(axis.max()) + 1 if len(axis) else 1
+        if size * axis_size >= 2**63:
+            # Ranks are below N, so the product of two of them fits.
+            key, size = _rank(key)
+            axis, axis_size = _rank(axis)
+        key, size = key * axis_size + axis, size * axis_size
+    return key
+
+
+def _rank(values: Tensor) -> tuple[Tensor, int]:
+    distinct, rank = values.unique(return_inverse=True)
+    return rank, len(distinct)
+
+
+def _group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
+    """Number equal keys in the order they first appear; return (N,) group of each row and (G,) first row of each group."""
+    group, num_groups = _rank(key)
+    first, order = group_first(group, num_groups).sort()
+    position = torch.empty_like(order)
+    position[order] = torch.arange(num_groups, device=key.device)
+    return position[group], first

@@ -1,0 +1,296 @@
+"""Depth, colour, label and mask images <-> tensors.
+
+Nothing is guessed: the unit of depth is an argument, and an image whose type could mean two things is refused.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from pcdata.checks import check_tensors
+from pcdata.errors import CaptureError, DTypeError, UnitError
+from pcdata.io.files import existing_file, replacing
+
+MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
+_MAX_BYTES = 1 << 30
+_PNG, _TIFF, _JPEG = "PNG", "TIFF", "JPEG"
+_FORMATS = {".png": _PNG, ".tif": _TIFF, ".tiff": _TIFF, ".jpg": _JPEG, ".jpeg": _JPEG}
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+_NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame lies outside
+
+
+def check_metres_per_unit(where: str, metres_per_unit: float) -> float:
+    """Return the factor as a float; it must lie in (0, 1].
+
+    No sensor stores a unit longer than a metre, and the bound catches a divisor (1000, 5000) given in its place.
+    """
+    ok = isinstance(metres_per_unit, (int, float)) and not isinstance(metres_per_unit, bool)
+    if not ok or not 0 < metres_per_unit <= 1:
+        raise UnitError(
+            f"{where}: metres_per_unit must be a number above 0 and at most 1, got {metres_per_unit!r}; "
+            "0.001 for millimetres, 1.0 for metres, 1 / factor where a data set documents a divisor"
+        )
+    return float(metres_per_unit)
+
+
+def read_depth(
+    path: str | os.PathLike[str],
+    *,
+    metres_per_unit: float,
+    invalid_values: Collection[int] = (),
+) -> Tensor:  # (H, W) float32 metres, 0 = no reading
+    """Read a depth image as metres along z, 0 where the sensor had no reading.
+
+    Accepted: 16-bit grey PNG or TIFF, uint16 ``.npy``; float TIFF and float ``.npy``, which must already be in metres
+    (``metres_per_unit=1.0``) and whose NaN and infinite pixels mean "no reading" and become 0.
+
+    Args:
+        path: ``.png``, ``.tif``, ``.tiff`` or ``.npy``.
+        metres_per_unit: length of one stored unit: 0.001 for millimetres, 0.0002 for TUM, 1.0 for metres.
+        invalid_values: stored values besides 0 that mean "no reading", e.g. ``(65535,)`` for 7-Scenes.
+
+    Raises:
+        CaptureError: the file is missing, damaged, not a depth image, holds negative depth or no valid pixel at all.
+        UnitError: the unit is not a positive number, a float image is not in metres, or the median is implausible.
+    """
+    where = f"read_depth: {path}"
+    unit = check_metres_per_unit(where, metres_per_unit)
+    raw = _read_raw_depth(where, Path(path))
+    if raw.dtype == np.uint16:
+        if not all(0 <= value <= 65535 for value in invalid_values):
+            raise CaptureError(f"{where}: invalid_values must lie in 0 .. 65535, got {tuple(invalid_values)}")
+        table = _metres_of_value(unit)
+        table[[0, *invalid_values]] = 0.0
+        depth = table[raw]
+    else:
+        depth = _clean_float_depth(where, raw, unit, invalid_values)
+    _check_plausible(where, depth, unit)
+    return torch.from_numpy(depth)
+
+
+def _read_raw_depth(where: str, path: Path) -> NDArray[Any]:
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        hint = "; convert EXR to a float32 .npy in metres" if suffix == ".exr" else ""
+        raise CaptureError(f"{where}: depth must be one of {', '.join(DEPTH_SUFFIXES)}, not {suffix!r}{hint}")
+    if suffix == ".npy":
+        return _read_npy(where, path)
+    mode, pixels, (bits, _) = _decode(where, path, (_FORMATS[suffix],))
+    if mode.startswith("I;16"):
+        return pixels.astype(np.uint16)
+    if mode == "F":
+        return pixels
+    if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit grey PNG as 32-bit integers
+        return pixels.astype(np.uint16)
+    found = {"L": "8-bit grey", "P": "palette", "1": "1-bit", "RGB": "colour", "RGBA": "colour with alpha"}.get(mode, mode)
+    raise CaptureError(
+        f"{where}: a depth image must be 16-bit grey, but this is a {found} image; is it a picture of the depth made for "
+        "viewing? Its values are no lengths: export the raw 16-bit depth"
+    )
+
+
+def _read_npy(where: str, path: Path) -> NDArray[Any]:
+    existing_file(where, path, max_bytes=_MAX_BYTES)
+    try:  # mapped, so that a header that promises more than the file holds fails before anything is allocated
+        array = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError) as error:
+        raise CaptureError(f"{where}: not a readable .npy file of numbers: {error}") from error
+    if array.ndim != 2:
+        raise CaptureError(f"{where}: depth must be one image (H, W), got shape {array.shape}; save one file per view")
+    _check_pixels(where, array.shape[1], array.shape[0])
+    if array.dtype.newbyteorder("=") not in (np.uint16, np.float32, np.float64):
+        raise CaptureError(f"{where}: depth must be uint16, float32 or float64, got {array.dtype}; convert it explicitly")
+    return np.array(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _metres_of_value(metres_per_unit: float) -> NDArray[np.float32]:
+    """Return the nearest float32 metres of each of the 65536 stored values."""
+    return (np.arange(1 << 16, dtype=np.float64) * metres_per_unit).astype(np.float32)
+
+
+def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Collection[int]) -> NDArray[np.float32]:
+    if unit != 1.0:
+        raise UnitError(
+            f"{where}: float depth must already be in metres (metres_per_unit=1.0), got metres_per_unit={unit:g}; "
+            "convert the file to metres, or to uint16 with its unit"
+        )
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, so no reading either
+        depth = raw.astype(np.float32)
+    depth[~np.isfinite(depth) | np.isin(raw, list(invalid))] = 0.0
+    depth += 0.0  # turns -0.0 into 0.0
+    if (depth < 0).any():
+        raise CaptureError(
+            f"{where}: {int((depth < 0).sum())} pixels have negative depth, down to {depth.min():g} m; "
+            "is z pointing backwards (OpenGL axes)? Flip the sign when exporting, and write 0 for 'no reading'"
+        )
+    return depth
+
+
+def _check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
+    valid = depth[depth > 0]
+    if not len(valid):
+        raise CaptureError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
+    median = float(np.median(valid[:: max(1, len(valid) >> 16)]))  # 65,536 pixels tell as much as all
+    if not _NEAREST <= median <= _FARTHEST:
+        raise UnitError(
+            f"{where}: half of the valid depth is {'beyond' if median > 1 else 'within'} {median:g} m with "
+            f"metres_per_unit={unit:g}; is metres_per_unit right? 0.001 for millimetres, 1.0 for metres"
+        )
+
+
+def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
+    """Read an 8-bit colour PNG or JPEG as RGB; an alpha channel is dropped, orientation tags are not applied.
+
+    Raises:
+        CaptureError: the file is missing, damaged, grey, palette, CMYK or deeper than 8 bits per channel.
+    """
+    where = f"read_color: {path}"
+    _check_suffix(where, path, COLOR_SUFFIXES)
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG, _JPEG))
+    if mode not in ("RGB", "RGBA") or bits == 16:
+        found = f"{bits}-bit {mode}" if bits else mode
+        raise CaptureError(
+            f"{where}: colour must be 8-bit RGB, but this image is {found}; convert it on purpose "
+            "(for one grey or infrared channel: repeat it three times, or leave the colours out)"
+        )
+    return torch.from_numpy(np.array(pixels[..., :3]))
+
+
+def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
+    """Read an 8-bit grey, 16-bit grey or palette PNG of object ids; of a palette the index is the id.
+
+    Raises:
+        CaptureError: the file is missing, damaged, colour, or grey of fewer than 8 bits (which viewers rescale).
+    """
+    where = f"read_labels: {path}"
+    _check_suffix(where, path, (".png",))
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
+    if not (mode == "P" or (mode == "L" and bits == 8) or (bits == 16 and mode.startswith("I"))):
+        raise CaptureError(
+            f"{where}: labels must be an 8-bit, 16-bit or palette PNG of ids, but this image is {bits}-bit {mode}; "
+            "map its colours to ids first"
+        )
+    return torch.from_numpy(pixels.astype(np.int64))
+
+
+def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
+    """Read a 1-bit or 8-bit grey PNG as a mask; every value but 0 is inside.
+
+    Raises:
+        CaptureError: the file is missing, damaged, or of another type.
+    """
+    where = f"read_mask: {path}"
+    _check_suffix(where, path, (".png",))
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
+    if mode not in ("1", "L"):
+        raise CaptureError(f"{where}: a mask must be a 1-bit or 8-bit grey PNG, but this image is {bits}-bit {mode}")
+    return torch.from_numpy(pixels != 0)
+
+
+def write_depth(
+    path: str | os.PathLike[str],
+    depth: Tensor,  # (H, W) float32 metres, 0 = no reading
+    *,
+    metres_per_unit: float,
+    round_to_unit: bool = False,
+) -> None:
+    """Write depth as a 16-bit PNG from which :func:`read_depth` returns the same values.
+
+    Args:
+        path: a ``.png`` file; it appears complete or not at all.
+        depth: metres, 0 = no reading.
+        metres_per_unit: length of one stored unit.
+        round_to_unit: accept depths between two units and round them, which loses up to half a unit.
+
+    Raises:
+        CaptureError: a value is negative, above 65535 units, or between two units without ``round_to_unit``.
+        DTypeError, ShapeError, NonFiniteError: the tensor is not a finite float32 (H, W).
+    """
+    where = f"write_depth: {path}"
+    _check_suffix(where, path, (".png",))
+    unit = check_metres_per_unit(where, metres_per_unit)
+    check_tensors(where, {"depth": depth}, {"depth": "H W"})
+    metres = depth.detach().cpu().numpy()
+    units = np.rint(metres.astype(np.float64) / unit)
+    if (metres < 0).any() or (units > 65535).any():
+        raise CaptureError(
+            f"{where}: depth must lie in 0 .. {65535 * unit:g} m, got {metres.min():g} .. {metres.max():g}; "
+            "choose a larger metres_per_unit"
+        )
+    raw = units.astype(np.uint16)
+    # Two float32 steps: depth computed as float32(n) * float32(unit) is n units, though not the float nearest to them.
+    exact = np.abs(_metres_of_value(unit)[raw] - metres) <= 2 * np.spacing(metres)
+    if not round_to_unit and not exact.all():
+        raise CaptureError(
+            f"{where}: {int((~exact).sum())} pixels of {exact.size} are not whole multiples of {unit:g} m; choose the "
+            "unit of the sensor, pass round_to_unit=True to lose up to half a unit, or save float32 .npy"
+        )
+    if ((raw == 0) & (metres > 0)).any():
+        raise CaptureError(f"{where}: depth below half of {unit:g} m would become 'no reading'; use a smaller unit")
+    with replacing(where, path) as temporary:
+        Image.fromarray(raw).save(temporary, format=_PNG)
+
+
+def write_color(
+    path: str | os.PathLike[str],
+    colors: Tensor,  # (H, W, 3) uint8
+) -> None:
+    """Write RGB as an 8-bit PNG, which loses nothing.
+
+    Raises:
+        CaptureError: the path does not end in ``.png``, or cannot be written.
+        DTypeError, ShapeError: the tensor is not uint8 (H, W, 3).
+    """
+    where = f"write_color: {path}"
+    _check_suffix(where, path, (".png",))
+    if isinstance(colors, Tensor) and colors.is_floating_point():
+        raise DTypeError(f"{where}: colors must be uint8 0..255, not {colors.dtype}; (colors * 255).round().byte()")
+    check_tensors(where, {"colors": colors}, {"colors": "H W 3 : uint8"})
+    with replacing(where, path) as temporary:
+        Image.fromarray(colors.detach().cpu().numpy()).save(temporary, format=_PNG)
+
+
+def _check_suffix(where: str, path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> None:
+    if Path(path).suffix.lower() not in suffixes:
+        raise CaptureError(f"{where}: the file must end in {' or '.join(suffixes)}, not {Path(path).suffix!r}")
+
+
+def _check_pixels(where: str, width: int, height: int) -> None:
+    if not 0 < width * height <= MAX_PIXELS:
+        raise CaptureError(f"{where}: an image must have 1 .. {MAX_PIXELS} pixels, this one claims {width}x{height}")
+
+
+def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDArray[Any], tuple[int, int]]:
+    """Return Pillow's mode, the pixels, and (bit depth, colour type) as a PNG's own header states them, else 0, 0."""
+    existing_file(where, path, max_bytes=_MAX_BYTES)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(26)
+        with Image.open(path, formats=formats) as image:
+            _check_pixels(where, *image.size)
+            if getattr(image, "n_frames", 1) != 1:
+                raise CaptureError(f"{where}: must hold one image, but holds {image.n_frames}; save one file each")
+            image.load()
+            pixels = np.asarray(image)
+            mode, is_png = image.mode, image.format == _PNG
+    except CaptureError:
+        raise
+    except (
+        OSError, ValueError, SyntaxError, EOFError, TypeError, IndexError, KeyError, OverflowError, MemoryError,
+        struct.error, zlib.error, Image.DecompressionBombError, Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip  # what Pillow's parsers are known to raise on damaged files
+        raise CaptureError(f"{where}: not a readable {' or '.join(formats)} image: {error}") from error
+    # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
+    return mode, pixels, (head[24], head[25]) if is_png else (0, 0)

@@ -1,0 +1,79 @@
+"""Explicit randomness: every draw is keyed by (seed, epoch, sample id), never by a worker or a global state.
+
+Decisions are drawn on the CPU, one stream per cloud, so that a cloud gets the same draws alone or in a batch, on any
+device and for any number of workers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import torch
+from torch import Generator, Tensor
+
+from pcdata.errors import DTypeError, ShapeError
+
+
+def seeded(seed: int) -> Generator:
+    """Return a fresh CPU generator for one seed."""
+    return Generator().manual_seed(seed)
+
+
+def generator_for(seed: int, epoch: int, sample_id: str) -> Generator:
+    """Return the generator that belongs to one sample in one epoch.
+
+    The key is hashed (SHA-256), so neighbouring seeds and ids give unrelated streams.
+    """
+    digest = hashlib.sha256(f"{seed}\0{epoch}\0{sample_id}".encode()).digest()
+    return seeded(int.from_bytes(digest[:8], "big") >> 1)
+
+
+def child_seed(generator: Generator) -> int:
+    """Draw one 62-bit seed."""
+    return int(torch.randint(0, 2**62, (), generator=generator))
+
+
+class Streams:
+    """One random stream per cloud of a batch; every method draws the same amount from each, in order."""
+
+    def __init__(self, generators: Sequence[Generator]) -> None:
+        self.generators = list(generators)
+
+    @classmethod
+    def of(cls, generator: Generator | Sequence[Generator], num_clouds: int) -> Streams:
+        """Take one generator per cloud as given, or split a single one: each cloud in turn draws a seed from it.
+
+        Raises:
+            ShapeError: a sequence whose length is not the number of clouds.
+            DTypeError: something other than generators.
+        """
+        if isinstance(generator, Generator):
+            return cls([seeded(child_seed(generator)) for _ in range(num_clouds)])
+        generators = list(generator)
+        if not all(isinstance(one, Generator) for one in generators):
+            raise DTypeError("generator must be a torch.Generator, or a sequence with one per cloud")
+        if len(generators) != num_clouds:
+            raise ShapeError(f"generator: {len(generators)} generators were given for {num_clouds} clouds")
+        return cls(generators)
+
+    def __len__(self) -> int:
+        return len(self.generators)
+
+    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        """Draw (B, *shape) float64 values in [low, high)."""
+        unit = [torch.rand(shape, generator=one, dtype=torch.float64) for one in self.generators]
+        return low + (high - low) * _stack(unit, shape)
+
+    def normal(self, *shape: int) -> Tensor:
+        """Draw (B, *shape) float64 standard normal values."""
+        values = [torch.randn(shape, generator=one, dtype=torch.float64) for one in self.generators]
+        return _stack(values, shape)
+
+    def seeds(self) -> Tensor:
+        """Draw (B,) int64 seeds, for decisions too large to keep (per-point noise, permutations)."""
+        return torch.tensor([child_seed(one) for one in self.generators], dtype=torch.int64)
+
+
+def _stack(values: list[Tensor], shape: tuple[int, ...]) -> Tensor:
+    return torch.stack(values) if values else torch.empty((0, *shape), dtype=torch.float64)

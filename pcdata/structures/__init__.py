@@ -1,0 +1,9 @@
+"""The nouns: cameras, depth frames, point clouds."""
+
+from pcdata.structures.camera import Camera
+from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
+from pcdata.structures.fields import Kind
+from pcdata.structures.padded import PaddedClouds
+from pcdata.structures.point_cloud import METRE, NORMALIZED, PointCloud
+
+__all__ = ["CAMERA_FRAME", "METRE", "NORMALIZED", "Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"]

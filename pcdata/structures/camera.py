@@ -1,0 +1,137 @@
+"""The pinhole camera with OpenCV axes and lens distortion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.checks import check_tensors
+from pcdata.errors import CaptureError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """V >= 1 pinhole cameras of one image size.
+
+    Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) with integer coordinates is the centre of that pixel,
+    so an image spans -0.5 .. width-0.5. The intrinsics belong to the stream that the depth is registered to.
+    """
+
+    intrinsics: Tensor  # (V, 3, 3) float64, pixels
+    size: tuple[int, int]  # (height, width) in pixels
+    distortion: Tensor | None = None  # (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
+
+    def __post_init__(self) -> None:
+        check_tensors(
+            "Camera",
+            {"intrinsics": self.intrinsics, "distortion": self.distortion},
+            {"intrinsics": "V 3 3 : float64", "distortion": "V D : float64"},
+        )
+        height, width = self.size
+        if height < 1 or width < 1:
+            raise CaptureError(f"Camera: size must be (height, width) of at least one pixel, got {self.size}")
+        for view, k in enumerate(self.intrinsics.tolist()):
+            _check_intrinsics(view, k, self.size)
+
+    @classmethod
+    def pinhole(
+        cls,
+        *,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        size: tuple[int, int],
+        distortion: Sequence[float] | None = None,
+    ) -> Camera:
+        """Make one camera from focal lengths and principal point in pixels; ``size`` is (height, width)."""
+        intrinsics = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+        coefficients = None if distortion is None else torch.tensor([list(distortion)], dtype=torch.float64)
+        return cls(intrinsics=intrinsics, size=size, distortion=coefficients)
+
+    @property
+    def num_views(self) -> int:
+        """The number of cameras V."""
+        return self.intrinsics.shape[0]
+
+    def view(self, index: int) -> Camera:
+        """Return one camera of the V as a camera of its own."""
+        keep = slice(index, index + 1)
+        distortion = None if self.distortion is None else self.distortion[keep]
+        return replace(self, intrinsics=self.intrinsics[keep], distortion=distortion)
+
+    def resized(self, size: tuple[int, int]) -> Camera:
+        """Return the camera of the same image sampled at another (height, width).
+
+        Pixel centres are at integers, so c' = (c + 0.5) s - 0.5, not c s.
+        """
+        scale_v, scale_u = size[0] / self.size[0], size[1] / self.size[1]
+        intrinsics = self.intrinsics.clone()
+        intrinsics[:, 0] *= scale_u
+        intrinsics[:, 1] *= scale_v
+        intrinsics[:, 0, 2] += 0.5 * (scale_u - 1.0)
+        intrinsics[:, 1, 2] += 0.5 * (scale_v - 1.0)
+        return replace(self, intrinsics=intrinsics, size=size)
+
+    def cropped(self, top: int, left: int, size: tuple[int, int]) -> Camera:
+        """Return the camera of the window of (height, width) whose first pixel is (left, top).
+
+        Raises:
+            CaptureError: the window leaves the image.
+        """
+        if top < 0 or left < 0 or top + size[0] > self.size[0] or left + size[1] > self.size[1]:
+            raise CaptureError(f"Camera.cropped: window at ({top}, {left}) of {size} leaves the image {self.size}")
+        intrinsics = self.intrinsics.clone()
+        intrinsics[:, 0, 2] -= left
+        intrinsics[:, 1, 2] -= top
+        return replace(self, intrinsics=intrinsics, size=size)
+
+    def to(self, device: torch.device | str) -> Camera:
+        """Move the tensors to a device."""
+        distortion = None if self.distortion is None else self.distortion.to(device)
+        return replace(self, intrinsics=self.intrinsics.to(device), distortion=distortion)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON; :meth:`from_dict` reads them back exactly."""
+        distortion = None if self.distortion is None else self.distortion.tolist()
+        return {"intrinsics": self.intrinsics.tolist(), "size": list(self.size), "distortion": distortion}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Camera:
+        """Rebuild the camera written by :meth:`to_dict`."""
+        distortion = data.get("distortion")
+        return cls(
+            intrinsics=torch.tensor(data["intrinsics"], dtype=torch.float64),
+            size=(int(data["size"][0]), int(data["size"][1])),
+            distortion=None if distortion is None else torch.tensor(distortion, dtype=torch.float64),
+        )
+
+    def __repr__(self) -> str:
+        height, width = self.size
+        lens = "" if self.distortion is None else f", {self.distortion.shape[1]} distortion coefficients"
+        focal = ", ".join(f"{k[0][0]:.1f}" for k in self.intrinsics.tolist())
+        return f"Camera({self.num_views} views, {width}x{height}, fx {focal}{lens})"
+
+
+def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int]) -> None:
+    """Refuse matrices that cannot be the intrinsics of this image."""
+    fx, fy, cx, cy = k[0][0], k[1][1], k[0][2], k[1][2]
+    where = f"Camera: intrinsics of view {view}"
+    if not all(math.isfinite(value) for row in k for value in row) or k[2] != [0.0, 0.0, 1.0] or k[1][0] != 0.0:
+        raise CaptureError(f"{where} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k}")
+    if fx <= 0 or fy <= 0:
+        raise CaptureError(
+            f"{where}: focal lengths must be positive, got fx={fx:g}, fy={fy:g}; a simulator's negative focal length "
+            "means flipped axes: flip the image or the axes first"
+        )
+    height, width = size
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        raise CaptureError(
+            f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image; "
+            "do these intrinsics belong to another resolution? Rescale them with Camera.resized"
+        )

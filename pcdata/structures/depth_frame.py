@@ -1,0 +1,112 @@
+"""The capture: depth images with their cameras, before they become points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.checks import check_tensors
+from pcdata.errors import CaptureError, ShapeError
+from pcdata.functional import rigid
+from pcdata.structures.camera import Camera
+
+CAMERA_FRAME = "camera"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthFrame:
+    """V >= 1 views of one image size, taken at one moment.
+
+    Depth is the z coordinate in metres; 0 means "no reading". NaN, infinite and negative depth is refused here: the
+    reader cleans or rejects it, so no later step meets it.
+    """
+
+    depth: Tensor  # (V, H, W) float32 metres, 0 = no reading
+    camera: Camera  # V cameras of size (H, W)
+    colors: Tensor | None = None  # (V, H, W, 3) uint8 RGB
+    labels: Tensor | None = None  # (V, H, W) int64, -1 = none
+    confidence: Tensor | None = None  # (V, H, W) uint8
+    mask: Tensor | None = None  # (V, H, W) bool, True = inside the region of interest
+    world_from_camera: Tensor | None = None  # (V, 4, 4) float64 rigid
+    frame_id: str | None = None  # the frame that world_from_camera leads to, e.g. "base"
+    capture_index: int = 0  # position in the sequence
+    sample_id: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON-able facts: files, unit, sensor
+
+    def __post_init__(self) -> None:
+        where = f"DepthFrame {self.sample_id!r}" if self.sample_id else "DepthFrame"
+        check_tensors(
+            where,
+            {
+                "depth": self.depth,
+                "colors": self.colors,
+                "labels": self.labels,
+                "confidence": self.confidence,
+                "mask": self.mask,
+                "world_from_camera": self.world_from_camera,
+            },
+            {
+                "depth": "V H W : float32",
+                "colors": "V H W 3 : uint8",
+                "labels": "V H W : int64",
+                "confidence": "V H W : uint8",
+                "mask": "V H W : bool",
+            },
+        )
+        if bool((self.depth < 0).any()):
+            raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
+        if self.camera.num_views != self.num_views or self.camera.size != self.size:
+            raise ShapeError(
+                f"{where}: depth has {self.num_views} views of {self.size} but the camera describes "
+                f"{self.camera.num_views} views of {self.camera.size}"
+            )
+        if (self.world_from_camera is None) != (self.frame_id is None):
+            raise CaptureError(f"{where}: give world_from_camera and the frame_id it leads to together, or neither")
+        if self.world_from_camera is not None:
+            if tuple(self.world_from_camera.shape) != (self.num_views, 4, 4):
+                raise ShapeError(
+                    f"{where}: world_from_camera must be ({self.num_views}, 4, 4), "
+                    f"got {tuple(self.world_from_camera.shape)}"
+                )
+            if self.frame_id == CAMERA_FRAME:
+                raise CaptureError(f"{where}: frame_id names where the poses lead to; {CAMERA_FRAME!r} is the start")
+            rigid.check_rigid(f"{where}: world_from_camera", self.world_from_camera)
+
+    @property
+    def num_views(self) -> int:
+        """The number of views V."""
+        return self.depth.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image size as (height, width)."""
+        return self.depth.shape[1], self.depth.shape[2]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the depth lies."""
+        return self.depth.device
+
+    def view(self, index: int) -> DepthFrame:
+        """Return one view as a frame of its own."""
+        keep = slice(index, index + 1)
+        images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
+        return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]
+
+    def to(self, device: torch.device | str) -> DepthFrame:
+        """Move all tensors to a device."""
+        images = {name: None if image is None else image.to(device) for name, image in self._tensors().items()}
+        return replace(self, camera=self.camera.to(device), **images)  # type: ignore[arg-type]
+
+    def _tensors(self) -> dict[str, Tensor | None]:
+        names = ("depth", "colors", "labels", "confidence", "mask", "world_from_camera")
+        return {name: getattr(self, name) for name in names}
+
+    def __repr__(self) -> str:
+        height, width = self.size
+        carried = [name for name, tensor in self._tensors().items() if tensor is not None]
+        return f"DepthFrame({self.sample_id!r}, {self.num_views} views of {width}x{height}: {', '.join(carried)})"

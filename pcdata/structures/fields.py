@@ -1,0 +1,22 @@
+"""The kinds of per-point fields: what a motion or an average does to each."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Kind(str, Enum):
+    """How a per-point field behaves when the cloud is moved or averaged."""
+
+    POSITION = "position"  # (N, 3) float: moved by the 4x4; averaged
+    DIRECTION = "direction"  # (N, 3) float: moved by the inverse transpose, renormalised; averaged and renormalised
+    INVARIANT = "invariant"  # anything: not moved; floats averaged, integers voted, never averaged
+
+
+CORE_KINDS = {
+    "points": Kind.POSITION,
+    "colors": Kind.INVARIANT,
+    "normals": Kind.DIRECTION,
+    "labels": Kind.INVARIANT,
+    "source_index": Kind.INVARIANT,
+}

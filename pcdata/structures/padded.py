@@ -1,0 +1,52 @@
+"""Clouds as rectangular tensors, the shape most networks take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PaddedClouds:
+    """B clouds padded to one length M; ``mask`` says which rows are real. Made by :meth:`PointCloud.padded`."""
+
+    points: Tensor  # (B, M, 3) float32, 0 where padded
+    mask: Tensor  # (B, M) bool, True = a real point
+    colors: Tensor | None = None  # (B, M, 3) float32
+    normals: Tensor | None = None  # (B, M, 3) float32
+    labels: Tensor | None = None  # (B, M) int64, -1 where padded
+    source_index: Tensor | None = None  # (B, M) int64, -1 where padded
+    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (B, M, ...)
+    frame_id: str
+    unit: str
+    source_from_cloud: Tensor  # (B, 4, 4) float64
+    meta: Sequence[Mapping[str, Any]] = ()
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PaddedClouds:
+        """Move all tensors to a device."""
+        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> PaddedClouds:
+        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
+        return self._map(lambda tensor: tensor.pin_memory())
+
+    def _map(self, move: Callable[[Tensor], Tensor]) -> PaddedClouds:
+        names = ("points", "mask", "colors", "normals", "labels", "source_index", "source_from_cloud")
+        moved = {name: move(value) for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **moved, extra={name: move(value) for name, value in self.extra.items()})  # type: ignore[arg-type]
+
+    def __repr__(self) -> str:
+        batch, width = self.mask.shape
+        return f"PaddedClouds({batch} x {width} in {self.frame_id!r} [{self.unit}])"
+
+
+def pad_rows(values: Tensor, mask: Tensor) -> Tensor:
+    """Spread packed (N, ...) rows over the True places of (B, M); the rest is 0, or -1 for integers."""
+    filler = -1 if values.dtype in (torch.int16, torch.int32, torch.int64) else 0
+    padded = torch.full((*mask.shape, *values.shape[1:]), filler, dtype=values.dtype, device=values.device)
+    padded[mask] = values
+    return padded

@@ -1,0 +1,345 @@
+"""The one cloud type: B >= 1 packed clouds that know their frame, their unit and their source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.checks import check_ptr_values, check_tensors
+from pcdata.errors import DTypeError, FrameError, ShapeError
+from pcdata.functional import rigid
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
+from pcdata.structures.fields import CORE_KINDS, Kind
+from pcdata.structures.padded import PaddedClouds, pad_rows
+
+METRE = "m"
+NORMALIZED = "normalized"
+
+Step = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PointCloud:
+    """B >= 1 point clouds in one coordinate frame, packed: cloud b is rows ``ptr[b]:ptr[b+1]`` and may be empty.
+
+    Frozen: every method returns a new cloud and shares what did not change. Coordinates are multiplied by a matrix only
+    in :meth:`transformed`, rows are picked only in :meth:`select`, so no field can be left behind.
+    """
+
+    points: Tensor  # (N, 3) float32, metres in frame_id unless unit says "normalized"
+    frame_id: str  # the coordinate frame, e.g. "camera", "base"
+    ptr: Tensor = None  # type: ignore[assignment]  # (B+1,) int64; None = one cloud
+    colors: Tensor | None = None  # (N, 3) float32 RGB in [0, 1]
+    normals: Tensor | None = None  # (N, 3) float32, unit length
+    labels: Tensor | None = None  # (N,) int64 object / segment id, -1 = none
+    source_index: Tensor | None = None  # (N,) int64: flat pixel v*H*W + row*W + column, or row of the source file
+    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (N, ...)
+    kinds: Mapping[str, Kind] = field(default_factory=dict)  # the kind of every extra field
+    viewpoint: Tensor | None = None  # (B, 3) float32 where the sensor stood; per point: extra["viewpoint"]
+    source_from_cloud: Tensor = None  # type: ignore[assignment]  # (B, 4, 4) float64, back to source_frame in metres
+    source_frame: str = ""  # the frame that source_from_cloud leads to; "" = frame_id at construction
+    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) float64 frame_from_source
+    unit: str = METRE  # "m", or "normalized" after a normalisation
+    meta: Sequence[Mapping[str, Any]] = ()  # per cloud, JSON-able: what was found (planes, counts, sample id)
+    history: Sequence[Sequence[Step]] = ()  # per cloud, JSON-able: what was done, in order
+
+    def __post_init__(self) -> None:
+        self._fill_defaults()
+        self._check()
+
+    # -- construction ----------------------------------------------------------------------------------------------
+
+    def _fill_defaults(self) -> None:
+        fill = object.__setattr__  # the class is frozen
+        if self.ptr is None:
+            fill(self, "ptr", torch.tensor([0, len(self.points)], device=self.points.device))
+        num_clouds = len(self.ptr) - 1
+        if self.source_from_cloud is None:
+            fill(self, "source_from_cloud", torch.eye(4, dtype=torch.float64).repeat(num_clouds, 1, 1).to(self.device))
+        fill(self, "source_frame", self.source_frame or self.frame_id)
+        fill(self, "meta", tuple(self.meta) or ({},) * num_clouds)
+        fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
+        fill(self, "kinds", {name: Kind(kind) for name, kind in self.kinds.items()})
+
+    def _check(self) -> None:
+        values = {
+            "points": self.points,
+            "ptr": self.ptr,
+            "colors": self.colors,
+            "normals": self.normals,
+            "labels": self.labels,
+            "source_index": self.source_index,
+            "viewpoint": self.viewpoint,
+            "source_from_cloud": self.source_from_cloud,
+        }
+        specs = {
+            "points": "N 3",
+            "colors": "N 3",
+            "normals": "N 3",
+            "labels": "N : int64",
+            "source_index": "N : int64",
+            "viewpoint": "B 3",
+            "source_from_cloud": "B 4 4 : float64",
+            "ptr": "ptr N B",
+        }
+        # Shapes only: values are read where data enters (readers, ops), so that a step on a GPU does not wait here.
+        sizes = check_tensors("PointCloud", values, specs, check_values=False)
+        if self.ptr.device.type == "cpu":
+            check_ptr_values("PointCloud", "ptr", self.ptr, sizes["N"])
+        self._check_extra(sizes["N"])
+        for name, matrix in self.frames.items():
+            if tuple(matrix.shape) != (self.num_clouds, 4, 4):
+                raise ShapeError(f"PointCloud: frames[{name!r}] must be ({self.num_clouds}, 4, 4), {matrix.shape}")
+        for name in ("meta", "history"):
+            if len(getattr(self, name)) != self.num_clouds:
+                raise ShapeError(
+                    f"PointCloud: {name} needs an entry per cloud, {self.num_clouds}, got {len(getattr(self, name))}"
+                )
+        if self.unit not in (METRE, NORMALIZED):
+            raise FrameError(f"PointCloud: unit must be {METRE!r} or {NORMALIZED!r}, got {self.unit!r}")
+
+    def _check_extra(self, num_points: int) -> None:
+        if set(self.extra) != set(self.kinds):
+            raise DTypeError(
+                f"PointCloud: every extra field needs a kind and only those: fields {sorted(self.extra)}, "
+                f"kinds {sorted(self.kinds)}"
+            )
+        for name, value in self.extra.items():
+            if name in CORE_KINDS or not name.isidentifier():
+                raise DTypeError(f"PointCloud: {name!r} cannot name an extra field")
+            if value.shape[:1] != (num_points,):
+                raise ShapeError(f"PointCloud: extra[{name!r}] has {tuple(value.shape)[:1]} rows, not {num_points}")
+            if self.kinds[name] is not Kind.INVARIANT and (
+                value.shape != (num_points, 3) or not value.is_floating_point()
+            ):
+                raise ShapeError(f"PointCloud: extra[{name!r}] is a {self.kinds[name].value}: it must be float (N, 3)")
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+
+    @property
+    def num_clouds(self) -> int:
+        """The number of clouds B."""
+        return len(self.ptr) - 1
+
+    @property
+    def num_points(self) -> int:
+        """The number of points N of all clouds together."""
+        return len(self.points)
+
+    @property
+    def counts(self) -> Tensor:
+        """(B,) int64 points per cloud."""
+        return counts_from_ptr(self.ptr)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the points lie."""
+        return self.points.device
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return every per-point field that is present, by name; extra fields included."""
+        core = {name: getattr(self, name) for name in CORE_KINDS}
+        return {name: value for name, value in core.items() if value is not None} | dict(self.extra)
+
+    def kind(self, name: str) -> Kind:
+        """Return the kind of a per-point field."""
+        return CORE_KINDS[name] if name in CORE_KINDS else self.kinds[name]
+
+    def viewpoint_per_point(self) -> Tensor | None:
+        """(N, 3): where the sensor stood that saw each point, or None when unknown."""
+        if "viewpoint" in self.extra:
+            return self.extra["viewpoint"]
+        return None if self.viewpoint is None else self.viewpoint[cloud_of_rows(self.ptr)]
+
+    # -- changing --------------------------------------------------------------------------------------------------
+
+    def with_fields(self, **values: Tensor | None) -> PointCloud:
+        """Replace, add or (None) drop per-point fields of unchanged rows; new extra fields need :meth:`with_extra`."""
+        core = {name: value for name, value in values.items() if name in CORE_KINDS}
+        extra = dict(self.extra)
+        for name in values.keys() - core.keys():
+            value = values[name]
+            if name not in extra:
+                raise FrameError(f"PointCloud.with_fields: no field {name!r}; add it with with_extra(name, value, kind)")
+            if value is None:
+                del extra[name]
+            else:
+                extra[name] = value
+        kinds = {name: kind for name, kind in self.kinds.items() if name in extra}
+        return replace(self, **core, extra=extra, kinds=kinds)  # type: ignore[arg-type]
+
+    def with_extra(self, name: str, value: Tensor, kind: Kind | str) -> PointCloud:
+        """Add or replace one extra per-point field of the given kind."""
+        return replace(self, extra={**self.extra, name: value}, kinds={**self.kinds, name: Kind(kind)})
+
+    def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
+        """Merge one mapping of JSON-able findings into the meta of each cloud."""
+        return replace(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+
+    def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
+        """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
+
+        Rows of a cloud must stay within that cloud.
+        """
+        return self._rebuilt({name: value[index] for name, value in self.fields().items()}, ptr=ptr)
+
+    def _rebuilt(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
+        """Replace all per-point fields at once, and any other attributes."""
+        core = {name: value for name, value in rows.items() if name in CORE_KINDS}
+        extra = {name: value for name, value in rows.items() if name not in CORE_KINDS}
+        return replace(self, **core, extra=extra, **others)
+
+    def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:
+        """Move every positional and directional field by one affine (B, 4, 4) matrix per cloud.
+
+        ``source_from_cloud`` absorbs the inverse, so it still leads back to the source.
+
+        Args:
+            matrix: new_from_old, (B, 4, 4) float64.
+            frame_id: the frame the cloud is in afterwards; None = the frame keeps its name.
+            unit: the unit afterwards; None = unchanged.
+        """
+        matrix = matrix.to(device=self.device, dtype=torch.float64)
+        if tuple(matrix.shape) != (self.num_clouds, 4, 4):
+            raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
+        moved: dict[str, Tensor] = {}
+        for name, value in self.fields().items():
+            kind = self.kind(name)
+            if kind is Kind.POSITION:
+                value = rigid.transform_points(value, self.ptr, matrix)
+            elif kind is Kind.DIRECTION:
+                value = rigid.transform_directions(value, self.ptr, matrix)
+            moved[name] = value
+        viewpoint = self.viewpoint
+        if viewpoint is not None:
+            per_cloud = torch.arange(self.num_clouds + 1, device=self.device)
+            viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
+        return self._rebuilt(
+            moved,
+            viewpoint=viewpoint,
+            source_from_cloud=self.source_from_cloud @ torch.linalg.inv(matrix),
+            frame_id=self.frame_id if frame_id is None else frame_id,
+            unit=self.unit if unit is None else unit,
+        )
+
+    def in_source_frame(self) -> PointCloud:
+        """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""
+        return self.transformed(self.source_from_cloud, frame_id=self.source_frame, unit=METRE)
+
+    # -- batching --------------------------------------------------------------------------------------------------
+
+    def unbatch(self) -> list[PointCloud]:
+        """Split into B single clouds (views of the same memory)."""
+        bounds = self.ptr.tolist()
+        return [self._slice(b, bounds[b], bounds[b + 1]) for b in range(self.num_clouds)]
+
+    def _slice(self, b: int, start: int, stop: int) -> PointCloud:
+        rows = {name: value[start:stop] for name, value in self.fields().items()}
+        return self._rebuilt(
+            rows,
+            ptr=torch.tensor([0, stop - start], device=self.device),
+            viewpoint=None if self.viewpoint is None else self.viewpoint[b : b + 1],
+            source_from_cloud=self.source_from_cloud[b : b + 1],
+            frames={name: matrix[b : b + 1] for name, matrix in self.frames.items()},
+            meta=self.meta[b : b + 1],
+            history=self.history[b : b + 1],
+        )
+
+    @staticmethod
+    def cat(clouds: Sequence[PointCloud]) -> PointCloud:
+        """Pack clouds (or batches) one after another into one batch.
+
+        Raises:
+            FrameError: the clouds differ in frame, source frame or unit.
+            ShapeError: the clouds carry different fields, or there are none.
+        """
+        if not clouds:
+            raise ShapeError("PointCloud.cat: needs at least one cloud")
+        first = clouds[0]
+        for position, other in enumerate(clouds[1:], start=1):
+            _check_joinable(first, other, position)
+        rows = {name: torch.cat([cloud.fields()[name] for cloud in clouds]) for name in first.fields()}
+        viewpoints = [cloud.viewpoint for cloud in clouds]
+        known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
+        return first._rebuilt(
+            rows,
+            ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
+            viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
+            source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
+            frames={name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in known},
+            meta=tuple(entry for cloud in clouds for entry in cloud.meta),
+            history=tuple(steps for cloud in clouds for steps in cloud.history),
+        )
+
+    def padded(self, num_points: int | None = None) -> PaddedClouds:
+        """Return (B, num_points, ...) tensors and the mask of real rows; padding is zero, and -1 for integers.
+
+        Args:
+            num_points: None = the largest count of the batch.
+
+        Raises:
+            ShapeError: a cloud is longer than ``num_points``.
+        """
+        counts = self.counts
+        longest = int(counts.max())
+        width = longest if num_points is None else num_points
+        if longest > width:
+            raise ShapeError(f"PointCloud.padded: a cloud has {longest} points, more than num_points={width}")
+        mask = torch.arange(width, device=self.device)[None, :] < counts[:, None]
+        rows = {name: pad_rows(value, mask) for name, value in self.fields().items()}
+        return PaddedClouds(
+            mask=mask,
+            frame_id=self.frame_id,
+            unit=self.unit,
+            source_from_cloud=self.source_from_cloud,
+            meta=self.meta,
+            **{name: rows.pop(name) for name in CORE_KINDS if name in rows},
+            extra=rows,
+        )
+
+    # -- moving between devices and processes ----------------------------------------------------------------------
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PointCloud:
+        """Move all tensors to a device."""
+        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> PointCloud:
+        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
+        return self._map(lambda tensor: tensor.pin_memory())
+
+    def _map(self, move: Any) -> PointCloud:
+        rows = {name: move(value) for name, value in self.fields().items()}
+        return self._rebuilt(
+            rows,
+            ptr=move(self.ptr),
+            viewpoint=None if self.viewpoint is None else move(self.viewpoint),
+            source_from_cloud=move(self.source_from_cloud),
+            frames={name: move(matrix) for name, matrix in self.frames.items()},
+        )
+
+    def __len__(self) -> int:
+        return self.num_clouds
+
+    def __repr__(self) -> str:
+        counts = self.counts.tolist()
+        sizes = f"{counts[0]} points" if len(counts) == 1 else f"{len(counts)} clouds of {min(counts)}-{max(counts)}"
+        carried = ", ".join(name for name in self.fields() if name != "points")
+        return f"PointCloud({sizes} in {self.frame_id!r} [{self.unit}]{': ' + carried if carried else ''})"
+
+
+def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:
+    for name in ("frame_id", "unit", "source_frame"):
+        if getattr(first, name) != getattr(other, name):
+            raise FrameError(
+                f"PointCloud.cat: cloud {position} has {name} {getattr(other, name)!r} but cloud 0 has "
+                f"{getattr(first, name)!r}; bring both to one frame (ToFrame) first"
+            )
+    if set(first.fields()) != set(other.fields()) or first.kinds != other.kinds:
+        different = set(first.fields()) ^ set(other.fields()) or "kinds"
+        raise ShapeError(f"PointCloud.cat: cloud {position} and cloud 0 carry different fields: {different}")
+    if (first.viewpoint is None) != (other.viewpoint is None):
+        raise ShapeError(f"PointCloud.cat: only one of cloud 0 and cloud {position} has a viewpoint")

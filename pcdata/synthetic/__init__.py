@@ -1,0 +1,23 @@
+"""A small tabletop world, ray-cast analytically: depth, colour, labels, normals and poses with known truth."""
+
+from pcdata.synthetic.noise import SensorNoise
+from pcdata.synthetic.shapes import Box, Cylinder, Shape, Sphere
+from pcdata.synthetic.source import SyntheticSource, tabletop_frames
+from pcdata.synthetic.tabletop import BASE_FRAME, Tabletop, TabletopTruth, tabletop
+from pcdata.synthetic.viewpoints import Miscalibration, look_at
+
+__all__ = [
+    "BASE_FRAME",
+    "Box",
+    "Cylinder",
+    "Miscalibration",
+    "SensorNoise",
+    "Shape",
+    "Sphere",
+    "SyntheticSource",
+    "Tabletop",
+    "TabletopTruth",
+    "look_at",
+    "tabletop",
+    "tabletop_frames",
+]

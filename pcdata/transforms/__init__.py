@@ -1,0 +1,51 @@
+"""Transforms: configured steps from captures to clouds, composed into pipelines."""
+
+from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
+from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
+from pcdata.transforms.crop import CropWorkspace
+from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
+from pcdata.transforms.frames import MergeViews, ToFrame
+from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
+from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
+from pcdata.transforms.normals import EstimateNormals
+from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
+from pcdata.transforms.planes import RemovePlane, planes_in_cloud
+
+__all__ = [
+    "REGISTRY",
+    "Center",
+    "ClusterObjects",
+    "Compose",
+    "CropWorkspace",
+    "Deproject",
+    "EstimateNormals",
+    "FarthestPointSample",
+    "MaskDepth",
+    "MergeViews",
+    "NormalizeUnitSphere",
+    "NormalizeWorkspace",
+    "PipelineOrderWarning",
+    "RandomApply",
+    "RandomColorJitter",
+    "RandomFlip",
+    "RandomJitter",
+    "RandomPointCount",
+    "RandomPointDropout",
+    "RandomRotation",
+    "RandomSample",
+    "RandomScale",
+    "RandomTranslation",
+    "RemovePlane",
+    "RemoveRadiusOutliers",
+    "RemoveStatisticalOutliers",
+    "SelectTransform",
+    "SpatialTransform",
+    "SplitObjects",
+    "ToFrame",
+    "Transform",
+    "VoxelDownsample",
+    "planes_in_cloud",
+]

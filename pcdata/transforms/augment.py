@@ -1,0 +1,108 @@
+"""Random motions, one 4x4 per cloud: RandomRotation, RandomTranslation, RandomScale, RandomFlip."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import torch
+from annotated_types import Interval
+from torch import Tensor
+
+from pcdata.errors import ConfigError
+from pcdata.functional import rigid
+from pcdata.functional.ragged import segment_mean
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Params, SpatialTransform
+from pcdata.transforms.fields import Fraction, NonNegative, Positive, Vec3
+
+About = Literal["origin", "centroid"]
+
+
+class RandomRotation(SpatialTransform):
+    """Rotate every cloud about an axis by a random angle, or by a random rotation."""
+
+    is_random = True
+
+    axis: Vec3 | None = (0.0, 0.0, 1.0)  # None = any rotation, uniform over all orientations
+    degrees: Annotated[float, Interval(ge=0, le=180)] = 180.0  # angles are drawn from [-degrees, degrees)
+    about: About = "origin"  # the fixed point
+
+    def check_fields(self) -> None:
+        """Require a direction."""
+        if self.axis is not None and not any(self.axis):
+            raise ConfigError("RandomRotation: axis must not be zero")
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw one rotation per cloud."""
+        if self.axis is None:
+            quaternion = streams.normal(4)  # a normalised Gaussian quaternion is uniform over rotations
+            rotation = rigid.rotation_from_quaternion(quaternion)
+        else:
+            limit = torch.deg2rad(torch.tensor(self.degrees, dtype=torch.float64)).item()
+            angle = streams.uniform(-limit, limit)
+            axis = torch.nn.functional.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0)
+            rotation = rigid.rotation_about_axis(axis.expand(len(angle), 3), angle)
+        return {"matrix": _about(self.about, data, rotation)}
+
+
+class RandomTranslation(SpatialTransform):
+    """Shift every cloud by a random offset, drawn per axis from [-max_offset, max_offset)."""
+
+    is_random = True
+
+    max_offset: NonNegative | Vec3 = 0.02  # in the cloud's unit; one number, or one per axis
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw one offset per cloud."""
+        limit = torch.tensor(self.max_offset, dtype=torch.float64).abs()
+        offset = streams.uniform(-1.0, 1.0, 3) * limit
+        return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64), offset)}
+
+
+class RandomScale(SpatialTransform):
+    """Scale every cloud by a random factor; the unit stays, so objects really become larger or smaller."""
+
+    is_random = True
+
+    low: Positive = 0.9
+    high: Positive = 1.1
+    about: About = "origin"
+    per_axis: bool = False  # a factor for every axis instead of one for all
+
+    def check_fields(self) -> None:
+        """Require low <= high."""
+        if self.low > self.high:
+            raise ConfigError(f"RandomScale: low {self.low} exceeds high {self.high}")
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw one factor, or three, per cloud."""
+        factors = streams.uniform(self.low, self.high, 3 if self.per_axis else 1)
+        return {"matrix": _about(self.about, data, torch.diag_embed(factors.expand(-1, 3)))}
+
+
+class RandomFlip(SpatialTransform):
+    """Mirror every cloud along each axis with a probability.
+
+    A mirrored scene has mirrored objects: poses (grasps) cannot follow, and ``rigid.map_poses`` refuses them.
+    """
+
+    is_random = True
+
+    probability: tuple[Fraction, Fraction, Fraction] = (0.5, 0.0, 0.0)  # for x, y, z
+    about: About = "origin"
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw the signs per cloud."""
+        flipped = streams.uniform(0.0, 1.0, 3) < torch.tensor(self.probability, dtype=torch.float64)
+        signs = torch.where(flipped, -1.0, 1.0).double()
+        return {"matrix": _about(self.about, data, torch.diag_embed(signs))}
+
+
+def _about(point: About, data: PointCloud, linear: Tensor) -> Tensor:
+    """Return (B, 4, 4) that apply (B, 3, 3) about the origin or about each cloud's mean."""
+    if point == "origin":
+        return rigid.from_rotation_translation(linear, linear.new_zeros(3))
+    center = segment_mean(data.points, data.ptr).to(linear.device)
+    shift = center - (linear @ center[:, :, None]).squeeze(-1)
+    return rigid.from_rotation_translation(linear, shift)

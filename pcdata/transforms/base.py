@@ -1,0 +1,325 @@
+"""Transform: a module that first decides, then does.
+
+To write one, subclass :class:`SpatialTransform` (a 4x4 per cloud), :class:`SelectTransform` (which rows stay), or
+:class:`Transform` itself; declare the fields as annotations. Construction is keyword-only and validated; repr, YAML,
+fingerprint and pickling come from the fields; every instance joins the contract suite through its class name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, get_type_hints
+
+import numpy as np
+import torch
+from torch import Generator, Tensor, nn
+from typing_extensions import dataclass_transform
+
+from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note, near_matches
+from pcdata.rng import Streams
+from pcdata.structures import METRE, DepthFrame, PointCloud
+
+Data = DepthFrame | PointCloud
+Params = dict[str, Tensor]
+GeneratorLike = Generator | Sequence[Generator]
+
+REGISTRY: dict[str, type[Transform]] = {}
+
+
+@dataclass_transform(kw_only_default=True)
+class Transform(nn.Module):
+    """A configured step from captures or clouds to clouds; the same for one cloud, a batch, CPU and GPU."""
+
+    is_random: ClassVar[bool] = False  # draws from the generator
+    needs_metres: ClassVar[bool] = False  # its fields are lengths: refuse normalised clouds
+    runs_statistics: ClassVar[bool] = False  # its cost and its answer depend on the rest of the scene
+    takes: ClassVar[type] = PointCloud
+    gives: ClassVar[type] = PointCloud
+    version: ClassVar[int] = 1  # raised when the same fields give another result
+
+    def __init_subclass__(cls, *, abstract: bool = False, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(eq=False, repr=False, kw_only=True)(cls)
+        if not abstract:
+            if cls.__name__ in REGISTRY and REGISTRY[cls.__name__].__module__ != cls.__module__:
+                raise ConfigError(f"a transform called {cls.__name__} is registered already; choose another name")
+            REGISTRY[cls.__name__] = cls
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Transform:
+        """Prepare the module before the generated ``__init__`` assigns fields (some hold other transforms)."""
+        self: Transform = super().__new__(cls)
+        nn.Module.__init__(self)
+        return self
+
+    def __post_init__(self) -> None:
+        for name, value in validated_fields(type(self), self.config_fields()).items():
+            setattr(self, name, value)
+        self.check_fields()
+
+    # -- what a subclass writes ------------------------------------------------------------------------------------
+
+    def check_fields(self) -> None:
+        """Check rules that bind several fields; raise :class:`ConfigError`."""
+
+    def make_params(self, data: Any, streams: Streams | None) -> Params:
+        """Decide: all that is random or derived from the data, leading dimension B; ``streams`` is None if not random."""
+        return {}
+
+    def apply(self, data: Any, params: Params) -> Any:
+        """Do: pure given the params; never draws from the generator, never changes its input."""
+        raise NotImplementedError
+
+    def frame_needed(self) -> str | None:
+        """The coordinate frame that the fields are written in, or None when any will do."""
+        return None
+
+    def frame_given(self) -> str | None:
+        """The coordinate frame of the result, or None when it is the input's."""
+        return None
+
+    # -- what everybody calls --------------------------------------------------------------------------------------
+
+    def forward(self, data: Any, *, generator: GeneratorLike | None = None) -> Any:
+        """Run the step and record it in the history of every cloud.
+
+        Args:
+            data: a ``DepthFrame`` or ``PointCloud``, as the step takes.
+            generator: required by random steps: one CPU generator, or one per cloud.
+        """
+        try:
+            self._check_input(data)
+            streams = Streams.of(self._generator(generator), num_clouds(data)) if self.is_random else None
+            params = self.make_params(data, streams)
+            result = self.apply(data, params)
+            return self._record(data, result, params)
+        except Exception as error:
+            add_note(error, f"in {self!r} on {data!r}")
+            raise
+
+    def config_fields(self) -> dict[str, Any]:
+        """Return the fields by name, as they were given."""
+        return {name: getattr(self, name) for name in field_names(type(self))}
+
+    def to_config(self) -> dict[str, dict[str, Any]]:
+        """Return ``{name: fields}`` with plain values, the form that YAML holds."""
+        return {type(self).__name__: {name: _plain(value) for name, value in self.config_fields().items()}}
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of names, versions and fields: equal for equal behaviour."""
+        text = json.dumps(self._identity(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _identity(self) -> Any:
+        fields = {name: _identify(value) for name, value in self.config_fields().items()}
+        return [type(self).__name__, self.version, fields]
+
+    def __repr__(self) -> str:
+        defaults = {f.name: f.default for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        told = {name: value for name, value in self.config_fields().items() if value != defaults.get(name)}
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in told.items())})"
+
+    # -- the frame around make_params and apply --------------------------------------------------------------------
+
+    def _generator(self, generator: GeneratorLike | None) -> GeneratorLike:
+        if generator is None:
+            raise ConfigError(
+                f"{type(self).__name__} is random and needs generator=...: pass torch.Generator().manual_seed(seed), "
+                "or put the step into a dataset, which keys one to every sample"
+            )
+        return generator
+
+    def _check_input(self, data: Any) -> None:
+        name = type(self).__name__
+        if not isinstance(data, self.takes):
+            hint = "; put Deproject before it" if isinstance(data, DepthFrame) else ""
+            raise DTypeError(f"{name} takes a {self.takes.__name__}, got {type(data).__name__}{hint}")
+        if not isinstance(data, PointCloud):
+            return
+        needed = self.frame_needed()
+        if needed is not None and data.frame_id != needed:
+            raise FrameError(
+                f"{name}: its fields are given in frame {needed!r} but the cloud is in {data.frame_id!r}; "
+                f"add ToFrame(frame={needed!r}) before it"
+            )
+        if self.needs_metres and data.unit != METRE:
+            raise UnitError(
+                f"{name}: its fields are lengths in metres but the cloud is {data.unit}; put it before the normalisation"
+            )
+
+    def _record(self, data: Any, result: Any, params: Params) -> Any:
+        if isinstance(result, DepthFrame):
+            steps = [*result.provenance.get("history", ()), self._step({}, {})]
+            return dataclasses.replace(result, provenance={**result.provenance, "history": steps})
+        before = data.counts.tolist() if isinstance(data, PointCloud) else None
+        after = result.counts.tolist()
+        history = []
+        for b, count in enumerate(after):
+            facts: dict[str, Any] = {"points": count}
+            if before is not None and len(before) == len(after):
+                facts = {"points_before": before[b], "points": count}
+                if before[b] > 0 and count == 0:
+                    raise TooFewPointsError(
+                        f"{type(self).__name__}: nothing is left of cloud {b}{sample_name(result, b)}: "
+                        f"0 of {before[b]} points; check its fields against the cloud's extent and frame"
+                    )
+            elif count == 0:
+                raise TooFewPointsError(f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points")
+            history.append((*result.history[b], self._step(facts, _small(params, b, len(after)))))
+        return dataclasses.replace(result, history=tuple(history))
+
+    def _step(self, facts: dict[str, Any], params: dict[str, Any]) -> dict[str, Any]:
+        (name, fields), *_ = self.to_config().items()
+        return {"step": name, "version": self.version, "fields": fields, "params": params, **facts}
+
+
+class SpatialTransform(Transform, abstract=True):
+    """A step that moves every cloud by one 4x4: write ``make_params`` returning ``{"matrix": (B, 4, 4)}``."""
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Move the cloud; the frame and the unit follow :meth:`frame_given` and :meth:`unit_given`."""
+        frame_id = self.result_frame(data)
+        return data.transformed(params["matrix"], frame_id=frame_id, unit=self.unit_given())
+
+    def result_frame(self, data: PointCloud) -> str | None:
+        """The frame of the result, given the input; None keeps the name."""
+        return self.frame_given()
+
+    def unit_given(self) -> str | None:
+        """The unit of the result; None keeps it."""
+        return None
+
+
+class SelectTransform(Transform, abstract=True):
+    """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Return ``index`` (M,) int64 rows to keep and the ``ptr`` (B+1,) that cuts them into clouds."""
+        raise NotImplementedError
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Decide which rows stay."""
+        index, ptr = self.pick(data, streams)
+        return {"index": index, "ptr": ptr}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Pick the rows of every field."""
+        return data.select(params["index"], params["ptr"])
+
+
+def num_clouds(data: Data) -> int:
+    """The number of independent clouds: B of a cloud, 1 of a capture."""
+    return data.num_clouds if isinstance(data, PointCloud) else 1
+
+
+def sample_name(cloud: PointCloud, b: int) -> str:
+    """Return `` (sample 'id')`` for messages, or nothing when the cloud has no sample id."""
+    sample = cloud.meta[b].get("sample_id")
+    return f" (sample {sample!r})" if sample else ""
+
+
+def slice_params(params: Params, b: int) -> Params:
+    """Return the params of cloud ``b`` alone; every value has leading dimension B."""
+    return {name: value[b : b + 1] for name, value in params.items()}
+
+
+def field_names(cls: type[Transform]) -> list[str]:
+    """Return the names of the declared fields, in order."""
+    return [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+
+
+@functools.lru_cache(maxsize=None)
+def field_types(cls: type[Transform]) -> dict[str, Any]:
+    """Return the declared fields' types with their limits."""
+    hints = get_type_hints(cls, include_extras=True)
+    return {name: hints[name] for name in field_names(cls)}
+
+
+@functools.lru_cache(maxsize=None)
+def _field_model(cls: type[Transform]) -> Any:
+    import pydantic  # imported late: only needed once a transform is made
+
+    config = pydantic.ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
+    fields: Any = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if field.default is not dataclasses.MISSING:
+            default = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        else:
+            default = ...
+        fields[field.name] = (field_types(cls)[field.name], default)
+    return pydantic.create_model(cls.__name__, __config__=config, **fields)
+
+
+def field_faults(cls: type[Transform], fields: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:
+    """Return every fault of these fields as (path, message); empty when they are valid."""
+    import pydantic
+
+    try:
+        _field_model(cls)(**fields)
+    except pydantic.ValidationError as error:
+        return [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
+    return []
+
+
+def validated_fields(cls: type[Transform], fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields converted to their declared types.
+
+    Raises:
+        ConfigError: listing every fault.
+    """
+    given = {name: _as_plain_numbers(value) for name, value in fields.items()}
+    faults = field_faults(cls, given)
+    if faults:
+        raise ConfigError("\n".join(f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults))
+    model = _field_model(cls)(**given)
+    return {name: getattr(model, name) for name in field_names(cls)}
+
+
+def _fault_message(cls: type[Transform], fault: Any) -> str:
+    if fault["type"] == "extra_forbidden":
+        name = str(fault["loc"][0])
+        known = field_names(cls)
+        return f"no such field{near_matches(name, known) or f'; {cls.__name__} has {known}'}"
+    given = "" if fault["type"] == "missing" else f" (got {fault['input']!r})"
+    return f"{fault['msg']}{given}"
+
+
+def _as_plain_numbers(value: Any) -> Any:
+    return value.tolist() if isinstance(value, (Tensor, np.ndarray, np.generic)) else value
+
+
+def _plain(value: Any) -> Any:
+    """Turn a field into what YAML and JSON hold."""
+    if isinstance(value, Transform):
+        return value.to_config()
+    if isinstance(value, (list, tuple, nn.ModuleList)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _identify(value: Any) -> Any:
+    """Turn a field into what the fingerprint hashes: like :func:`_plain`, with versions."""
+    if isinstance(value, Transform):
+        return value._identity()
+    if isinstance(value, (list, tuple, nn.ModuleList)):
+        return [_identify(item) for item in value]
+    return value
+
+
+def _small(params: Params, b: int, num: int) -> dict[str, Any]:
+    """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise."""
+    kept = {}
+    for name, value in params.items():
+        if isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16 and name != "ptr":
+            kept[name] = value[b].tolist()
+    return kept
+
+
+def rows_of_mask(mask: Tensor) -> Tensor:
+    """Return the (M,) int64 rows where a (N,) bool mask holds."""
+    return torch.nonzero(mask).squeeze(1)

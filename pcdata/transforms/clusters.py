@@ -1,0 +1,92 @@
+"""Objects: ClusterObjects labels them, SplitObjects makes a cloud of each."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+
+from pcdata.errors import ConfigError, DTypeError
+from pcdata.functional.clusters import dbscan
+from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Params, Transform, rows_of_mask
+from pcdata.transforms.fields import Count, Metres
+
+
+class ClusterObjects(Transform):
+    """Label density clusters (DBSCAN) as objects and keep those of a plausible size.
+
+    Labels become 0..K-1 per cloud in the order of their lowest core point; any labels the cloud had are replaced.
+    ``meta["objects"]`` lists label and point count.
+    """
+
+    needs_metres = True
+    runs_statistics = True
+
+    eps: Metres = 0.02  # points closer than this are neighbours
+    min_points: Count = 50  # neighbours, the point itself included, that make a core point
+    min_size: Count = 100  # smaller clusters are not objects
+    max_size: Count = 50_000  # larger clusters are not objects
+    keep: Literal["objects", "all"] = "objects"  # "all": keep the whole scene, with -1 where no object is
+
+    def check_fields(self) -> None:
+        """Require min_size <= max_size."""
+        if self.min_size > self.max_size:
+            raise ConfigError(f"ClusterObjects: min_size {self.min_size} exceeds max_size {self.max_size}")
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Cluster, then renumber the clusters of plausible size."""
+        raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points)
+        cloud = cloud_of_rows(data.ptr)
+        member = raw >= 0
+        # One id per (cloud, cluster), ascending by cloud then label, as unique sorts them.
+        pairs = torch.stack([cloud[member], raw[member]], dim=1)
+        unique, inverse, counts = torch.unique(pairs, dim=0, return_inverse=True, return_counts=True)
+        accepted = (counts >= self.min_size) & (counts <= self.max_size)
+        running = accepted.cumsum(0)
+        before_cloud = torch.searchsorted(unique[:, 0].contiguous(), unique[:, 0].contiguous())
+        taken_before = torch.cat([running.new_zeros(1), running])[before_cloud]
+        number = torch.where(accepted, running - 1 - taken_before, -1)
+        labels = torch.full_like(raw, -1)
+        labels[member] = number[inverse]
+        return {"labels": labels}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Write the labels and drop the rest unless the whole scene is kept."""
+        labels = params["labels"]
+        labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data))
+        if self.keep == "all":
+            return labelled
+        return labelled.select(rows_of_mask(labels >= 0), ptr_after_mask(labels >= 0, data.ptr))
+
+
+class SplitObjects(Transform):
+    """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped."""
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Split each cloud by its labels; ``meta["object"]`` keeps the label."""
+        if data.labels is None:
+            raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")
+        parts = []
+        for cloud in data.unbatch():
+            assert cloud.labels is not None
+            for label in torch.unique(cloud.labels[cloud.labels >= 0]).tolist():
+                rows = rows_of_mask(cloud.labels == label)
+                ptr = torch.tensor([0, len(rows)], device=cloud.device)
+                parts.append(cloud.select(rows, ptr).with_meta([{"object": label}]))
+        if not parts:
+            return data.select(torch.zeros(0, dtype=torch.int64, device=data.device), torch.zeros_like(data.ptr))
+        return PointCloud.cat(parts)
+
+
+def _objects(labels: torch.Tensor, data: PointCloud) -> list[dict[str, Any]]:
+    entries = []
+    bounds = data.ptr.tolist()
+    for start, stop in zip(bounds, bounds[1:]):
+        own = labels[start:stop]
+        unique, counts = torch.unique(own[own >= 0], return_counts=True)
+        found = [{"label": label, "points": count} for label, count in zip(unique.tolist(), counts.tolist())]
+        entries.append({"objects": found})
+    return entries

@@ -1,0 +1,158 @@
+"""Compose and RandomApply: transforms made of transforms."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torch import Generator, nn
+
+from pcdata.errors import ConfigError
+from pcdata.rng import Streams, seeded
+from pcdata.structures import METRE, PointCloud
+from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds
+from pcdata.transforms.fields import Fraction
+
+
+class PipelineOrderWarning(UserWarning):
+    """A pipeline is valid but its order costs time or quality."""
+
+
+class Compose(Transform):
+    """Run steps one after another; check at construction that neighbours fit.
+
+    Raises:
+        ConfigError: a step cannot take what the step before it gives (capture or cloud, frame, unit).
+    """
+
+    steps: Sequence[Transform]
+
+
+    def __init__(self, steps: Sequence[Transform]) -> None:
+        self.steps = list(steps)
+        self.__post_init__()
+
+    def check_fields(self) -> None:
+        """Check the chain and make the steps submodules."""
+        flat = list(_flatten(self.steps))
+        _check_chain(flat)
+        _warn_statistics_before_crop(flat)
+        steps = self.__dict__.pop("steps")
+        self.steps = nn.ModuleList(steps)  # type: ignore[assignment]
+        self.is_random = any(step.is_random for step in steps)  # type: ignore[misc]
+        self.takes = steps[0].takes if steps else PointCloud  # type: ignore[misc]
+        self.gives = steps[-1].gives if steps else PointCloud  # type: ignore[misc]
+
+    def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
+        """Run every step; the steps record themselves, the chain adds nothing."""
+        for _, data in self.step_through(data, generator=generator):
+            pass
+        return data
+
+    def step_through(
+        self, data: Data, *, generator: GeneratorLike | None = None
+    ) -> Iterator[tuple[Transform, Any]]:
+        """Yield ``(step, data)`` after every step, for looking inside."""
+        if self.is_random:
+            generator = self._generator(generator)
+        for step in self.steps:
+            if step.is_random:
+                # One stream per cloud, split off once: random steps in a row draw from the same streams, so that
+                # running only the random suffix on a cached prefix gives the same draws.
+                generator = _streams_for(generator, num_clouds(data))
+            data = step(data, generator=generator if step.is_random else None)
+            yield step, data
+
+    def split(self) -> tuple[Compose, Compose]:
+        """Return the longest deterministic prefix, which a cache may hold, and the rest."""
+        steps = list(self.steps)
+        first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
+        return Compose(steps[:first]), Compose(steps[first:])
+
+    def to_config_list(self) -> list[dict[str, Any]]:
+        """Return the steps as a list of ``{name: fields}``."""
+        return [step.to_config() for step in self.steps]
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __repr__(self) -> str:
+        return f"Compose([{', '.join(map(repr, self.steps))}])"
+
+
+class RandomApply(Transform):
+    """Apply a transform to each cloud with a probability."""
+
+    is_random = True
+
+    transform: Transform
+    probability: Fraction = 0.5
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
+        chosen = streams.uniform(0.0, 1.0) < self.probability
+        return {"chosen": chosen, "seed": streams.seeds()}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Run the inner transform on the chosen clouds and pack all again."""
+        clouds = data.unbatch()
+        for b, (chosen, seed) in enumerate(zip(params["chosen"].tolist(), params["seed"].tolist(), strict=True)):
+            if chosen:
+                clouds[b] = self.transform(clouds[b], generator=[seeded(seed)])
+        return PointCloud.cat(clouds)
+
+
+def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Generator]:
+    assert generator is not None
+    if isinstance(generator, Generator):
+        return Streams.of(generator, count).generators
+    if len(generator) == count:
+        return generator
+    # Views were merged or split: the first stream carries on.
+    return generator[:1] if count == 1 else Streams.of(generator[0], count).generators
+
+
+def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
+    for step in steps:
+        if isinstance(step, Compose):
+            yield from _flatten(list(step.steps))
+        elif isinstance(step, RandomApply):
+            yield from _flatten([step.transform])
+        else:
+            yield step
+
+
+def _check_chain(steps: Sequence[Transform]) -> None:
+    frame: str | None = None
+    unit = METRE
+    for position, (before, after) in enumerate(zip(steps, steps[1:]), start=1):
+        if not issubclass(before.gives, after.takes):
+            raise ConfigError(
+                f"Compose: step {position + 1}, {type(after).__name__}, takes a {after.takes.__name__} but step "
+                f"{position}, {type(before).__name__}, gives a {before.gives.__name__}"
+                + ("; put Deproject between them" if before.gives is not PointCloud else "")
+            )
+    for position, step in enumerate(steps, start=1):
+        where = f"Compose: step {position}, {type(step).__name__},"
+        needed = step.frame_needed()
+        if frame is not None and needed is not None and needed != frame:
+            raise ConfigError(f"{where} works in frame {needed!r} but the cloud is in {frame!r} there")
+        if step.needs_metres and unit != METRE:
+            raise ConfigError(f"{where} works in metres but the cloud is normalised there; put it earlier")
+        frame = step.frame_given() or needed or frame
+        unit = getattr(step, "unit_given", lambda: None)() or unit
+
+
+def _warn_statistics_before_crop(steps: Sequence[Transform]) -> None:
+    names = [type(step).__name__ for step in steps]
+    early = [i for i, step in enumerate(steps) if step.runs_statistics]
+    if early and "CropWorkspace" in names[early[0] :]:
+        warnings.warn(
+            f"{names[early[0]]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "
+            "alone find more of its outliers",
+            PipelineOrderWarning,
+            stacklevel=4,
+        )
+
+

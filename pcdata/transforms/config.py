@@ -1,0 +1,124 @@
+"""Pipelines as YAML: a list of ``{TransformName: fields}``, both ways.
+
+Only registered names are known; nothing is imported and nothing is run. Every fault in a file is reported at once, as
+``file:line:column``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pcdata.errors import ConfigError, near_matches
+from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
+from pcdata.transforms.compose import Compose
+from pcdata.transforms.yaml_nodes import YamlDocument, node_at
+
+
+def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:
+    """Build a pipeline from a YAML list of steps.
+
+    Raises:
+        ConfigError: every fault, as ``name:line:column: what``.
+    """
+    document = YamlDocument(text, name)
+    steps = steps_from_node(document, document.root, "a pipeline")
+    document.raise_faults()
+    return Compose(steps)
+
+
+def pipeline_to_yaml(pipeline: Compose) -> str:
+    """Write a pipeline as YAML that :func:`pipeline_from_yaml` reads back to an equal one."""
+    return yaml.safe_dump(pipeline.to_config_list(), sort_keys=False, default_flow_style=None, width=110)
+
+
+def pipeline_from_config(steps: Sequence[Mapping[str, Any] | str]) -> Compose:
+    """Build a pipeline from plain data, the form that :meth:`Compose.to_config_list` returns."""
+    return pipeline_from_yaml(yaml.safe_dump(list(steps), sort_keys=False), name="<config>")
+
+
+def load_pipeline(path: str | Path) -> Compose:
+    """Build a pipeline from a YAML file that holds a list of steps."""
+    return pipeline_from_yaml(read_config(path), name=str(path))
+
+
+def read_config(path: str | Path) -> str:
+    """Read a configuration file's text.
+
+    Raises:
+        ConfigError: the file is missing, not a file, or not UTF-8.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot read this configuration: {error}") from error
+
+
+def steps_from_node(document: YamlDocument, node: yaml.Node | None, what: str) -> list[Transform]:
+    """Build every step of a list; faults are noted in the document and the faulty steps left out."""
+    built = [_step_from_node(document, item) for item in document.sequence(node, what)]
+    return [step for step in built if step is not None]
+
+
+def _step_from_node(document: YamlDocument, node: yaml.Node) -> Transform | None:
+    """Build one step written as ``Name`` or ``{Name: fields}``."""
+    if isinstance(node, yaml.ScalarNode):
+        name, name_node, fields_node = str(node.value), node, None
+    else:
+        entries = document.mapping(node, "a step")
+        if len(entries) != 1:
+            document.fault(node, f"a step is one name with its fields, got {len(entries)} names: {sorted(entries)}")
+            return None
+        ((name, (name_node, fields_node)),) = entries.items()
+    cls = REGISTRY.get(name)
+    if cls is None:
+        hint = near_matches(name, REGISTRY) or f"; known: {', '.join(sorted(REGISTRY))}"
+        document.fault(name_node, f"unknown transform {name!r}{hint}")
+        return None
+    return _build(document, cls, name_node, fields_node)
+
+
+def _build(
+    document: YamlDocument, cls: type[Transform], name_node: yaml.Node, fields_node: yaml.Node | None
+) -> Transform | None:
+    before = len(document.faults)
+    entries = document.mapping(fields_node, cls.__name__)
+    fields = {key: _field_value(document, cls, key, value) for key, (_, value) in entries.items()}
+    if len(document.faults) > before:
+        return None
+    for path, message in field_faults(cls, fields):
+        place = ".".join(map(str, (cls.__name__, *path)))
+        document.fault(_place(entries, fields_node, name_node, path), f"{place}: {message}")
+    if len(document.faults) > before:
+        return None
+    try:
+        return cls(**fields)
+    except ConfigError as error:  # rules that bind several fields
+        document.fault(name_node, str(error))
+        return None
+
+
+def _field_value(document: YamlDocument, cls: type[Transform], key: str, node: yaml.Node) -> Any:
+    """Read one field; fields that hold transforms are steps themselves."""
+    declared = field_types(cls).get(key) if key in field_names(cls) else None
+    if declared is Transform:
+        return _step_from_node(document, node)
+    if declared == Sequence[Transform]:
+        return steps_from_node(document, node, f"{cls.__name__}.{key}")
+    return document.plain(node)
+
+
+def _place(
+    entries: Mapping[str, tuple[yaml.Node, yaml.Node]],
+    fields_node: yaml.Node | None,
+    name_node: yaml.Node,
+    path: tuple[int | str, ...],
+) -> yaml.Node:
+    """Point at the value where there is one, at an unknown field's name, else at the step."""
+    if not path or str(path[0]) not in entries:
+        return fields_node if fields_node is not None and fields_node.value else name_node
+    key, value = entries[str(path[0])]
+    return key if len(path) == 1 and isinstance(value, yaml.MappingNode) else node_at(value, path[1:])

@@ -1,0 +1,54 @@
+"""CropWorkspace: keep the points inside a box given in a named frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import ConfigError, PcdataError
+from pcdata.functional import rigid
+from pcdata.functional.ragged import ptr_after_mask
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import SelectTransform, rows_of_mask
+from pcdata.transforms.fields import Matrix4, Name, Vec3
+
+
+class CropWorkspace(SelectTransform):
+    """Keep the points inside a box, its faces included.
+
+    The box is axis-aligned in ``frame``; with ``frame_from_box`` it is axis-aligned in its own coordinates and stands
+    in the frame at that pose (an oriented box).
+    """
+
+    needs_metres = True
+
+    frame: Name  # the frame that the box is given in
+    lower: Vec3  # metres, smallest x, y, z
+    upper: Vec3  # metres, largest x, y, z
+    frame_from_box: Matrix4 | None = None  # rigid pose of an oriented box; None = aligned with the frame
+
+    def check_fields(self) -> None:
+        """Require lower < upper and a rigid pose."""
+        if not all(low < high for low, high in zip(self.lower, self.upper)):
+            raise ConfigError(f"CropWorkspace: lower must be below upper on every axis, got {self.lower}, {self.upper}")
+        if self.frame_from_box is not None:
+            try:
+                rigid.check_rigid("CropWorkspace.frame_from_box", torch.tensor(self.frame_from_box))
+            except PcdataError as error:
+                raise ConfigError(str(error)) from error
+
+    def frame_needed(self) -> str:
+        """The frame of the box."""
+        return self.frame
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Pick the rows inside."""
+        points = cloud.points
+        if self.frame_from_box is not None:
+            pose = torch.tensor(self.frame_from_box, dtype=torch.float64, device=cloud.device)
+            box_from_frame = rigid.invert_rigid(pose).repeat(cloud.num_clouds, 1, 1)
+            points = rigid.transform_points(points, cloud.ptr, box_from_frame)
+        lower, upper = points.new_tensor(self.lower), points.new_tensor(self.upper)
+        inside = ((points >= lower) & (points <= upper)).all(dim=1)
+        return rows_of_mask(inside), ptr_after_mask(inside, cloud.ptr)

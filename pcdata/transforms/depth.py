@@ -1,0 +1,112 @@
+"""From depth images to points: MaskDepth, Deproject."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from pcdata.errors import CaptureError, ConfigError
+from pcdata.functional.depth import deproject_depth
+from pcdata.functional.ragged import cloud_of_rows
+from pcdata.rng import Streams
+from pcdata.structures import CAMERA_FRAME, DepthFrame, Kind, PointCloud
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.fields import Metres
+
+
+class MaskDepth(Transform):
+    """Set depth to "no reading" outside a range, outside the frame's mask, or on unwanted labels."""
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    near: Metres | None = None  # readings closer than this are dropped
+    far: Metres | None = None  # readings beyond this are dropped
+    use_mask: bool = True  # drop pixels outside frame.mask where the capture has one
+    require_mask: bool = False  # refuse a capture without a mask
+    drop_labels: Sequence[int] = ()  # drop pixels with these labels
+
+    def check_fields(self) -> None:
+        """Require near < far."""
+        if self.near is not None and self.far is not None and self.near >= self.far:
+            raise ConfigError(f"MaskDepth: near must be below far, got near={self.near}, far={self.far}")
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Return the frame with the dropped pixels at 0."""
+        keep = data.depth > 0
+        if self.near is not None:
+            keep &= data.depth >= self.near
+        if self.far is not None:
+            keep &= data.depth <= self.far
+        if data.mask is None and self.require_mask:
+            raise CaptureError(f"MaskDepth: the capture {data.sample_id!r} has no mask; add one or set require_mask: false")
+        if data.mask is not None and self.use_mask:
+            keep &= data.mask
+        if self.drop_labels:
+            if data.labels is None:
+                raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
+            keep &= ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+        return replace(data, depth=torch.where(keep, data.depth, 0.0))
+
+
+class Deproject(Transform):
+    """Turn every depth reading into a point: one cloud per view, each in its own camera's frame.
+
+    Colours become float RGB in [0, 1]; labels and confidence follow; ``source_index`` is the flat pixel index over all
+    views, and the viewpoint is the camera centre. Poses of the capture are kept in ``frames`` for ``ToFrame``.
+    """
+
+    takes = DepthFrame
+    gives = PointCloud
+
+    def frame_given(self) -> str:
+        """Deprojected points are in the camera's frame."""
+        return CAMERA_FRAME
+
+    def make_params(self, data: DepthFrame, streams: Streams | None) -> Params:
+        """Nothing to decide."""
+        return {}
+
+    def apply(self, data: DepthFrame, params: Params) -> PointCloud:
+        """Deproject all views in one call."""
+        camera = data.camera.to(data.device)
+        points, ptr, pixel_index = deproject_depth(data.depth, camera.intrinsics, distortion=camera.distortion)
+        source_index = cloud_of_rows(ptr) * (data.size[0] * data.size[1]) + pixel_index
+        identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
+        frames = {CAMERA_FRAME: identity}
+        if data.world_from_camera is not None and data.frame_id is not None:
+            frames[data.frame_id] = data.world_from_camera
+        extra = {} if data.confidence is None else {"confidence": data.confidence.flatten()[source_index]}
+        history = tuple(data.provenance.get("history", ()))
+        return PointCloud(
+            points=points,
+            ptr=ptr,
+            frame_id=CAMERA_FRAME,
+            colors=None if data.colors is None else data.colors.reshape(-1, 3)[source_index].float() / 255,
+            labels=None if data.labels is None else data.labels.flatten()[source_index],
+            source_index=source_index,
+            extra=extra,
+            kinds={name: Kind.INVARIANT for name in extra},
+            viewpoint=torch.zeros(data.num_views, 3, device=data.device),
+            frames=frames,
+            meta=[_view_meta(data, view) for view in range(data.num_views)],
+            history=(history,) * data.num_views,
+        )
+
+
+def _view_meta(frame: DepthFrame, view: int) -> dict[str, Any]:
+    """Keep what is needed to trace a cloud to its capture and to deproject it again."""
+    camera = frame.camera.view(view).to_dict()
+    pose = None if frame.world_from_camera is None else frame.world_from_camera[view].tolist()
+    provenance = {name: value for name, value in frame.provenance.items() if name != "history"}
+    return {
+        "sample_id": frame.sample_id,
+        "capture_index": frame.capture_index,
+        "cameras": [{**camera, "view": view, "world_from_camera": pose, "world_frame": frame.frame_id}],
+        "provenance": provenance,
+    }
+
+

@@ -1,0 +1,170 @@
+"""Fewer points: VoxelDownsample, FarthestPointSample, RandomSample, RandomPointCount."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import ConfigError, TooFewPointsError
+from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.sampling import farthest_point_sample
+from pcdata.functional.voxels import (
+    find_voxel_size,
+    voxel_downsample,
+    voxel_majority,
+    voxel_mean,
+    voxel_mean_direction,
+)
+from pcdata.rng import Streams, seeded
+from pcdata.structures import Kind, PointCloud
+from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
+from pcdata.transforms.fields import Count, Fraction, IfShort, Metres
+
+
+class VoxelDownsample(Transform):
+    """Average the points of every occupied voxel (Open3D's grid), every field by its kind.
+
+    Positions, colours and other floats are averaged, directions averaged and renormalised, labels and other integers
+    decided by vote (the lowest wins a tie); ``source_index`` is that of the first point in the voxel. Give the voxel
+    size, or the count to reach: then every cloud gets the largest size that leaves at least so many points.
+    """
+
+    voxel_size: Metres | None = None  # edge length, in the cloud's unit
+    num_points: Count | None = None  # wanted count instead of a size
+
+    def check_fields(self) -> None:
+        """Require exactly one of the two."""
+        if (self.voxel_size is None) == (self.num_points is None):
+            raise ConfigError("VoxelDownsample: give either voxel_size or num_points")
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Decide the voxel size of every cloud."""
+        if self.num_points is not None:
+            return {"voxel_size": find_voxel_size(data.points, data.ptr, num_points=self.num_points)}
+        return {"voxel_size": torch.full((data.num_clouds,), self.voxel_size, dtype=torch.float64, device=data.device)}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Reduce every field voxel by voxel."""
+        means, ptr, inverse = voxel_downsample(data.points, data.ptr, voxel_size=params["voxel_size"])
+        count = len(means)
+        first = torch.full((count,), data.num_points, device=data.device)
+        first.scatter_reduce_(0, inverse, torch.arange(data.num_points, device=data.device), "amin")
+        rows = {name: _reduce(value, data.kind(name), inverse, count) for name, value in data.fields().items()}
+        rows["points"] = means
+        if data.source_index is not None:
+            rows["source_index"] = data.source_index[first]
+        kept = data.select(first, ptr)
+        return kept.with_fields(**rows)
+
+
+class _Sample(SelectTransform, abstract=True):
+    """A sampler with a fixed count and a stated answer to "too few points"."""
+
+    num_points: Count
+    if_short: IfShort = "error"  # repeat / tile: duplicate points; zeros: zero rows; keep: give fewer
+
+    def wanted_counts(self, cloud: PointCloud, streams: Streams | None) -> list[int]:
+        """The wanted count of every cloud."""
+        return [self.num_points] * cloud.num_clouds
+
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
+        """For every cloud, ``counts[b]`` of its rows in sampling order; it has at least so many."""
+        raise NotImplementedError
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Sample, then fill up short clouds as ``if_short`` says; -1 marks a zero row."""
+        wanted = self.wanted_counts(cloud, streams)
+        available = cloud.counts.tolist()
+        for b, (want, have) in enumerate(zip(wanted, available, strict=True)):
+            if have < want and (self.if_short == "error" or (have == 0 and self.if_short != "keep")):
+                raise TooFewPointsError(
+                    f"{type(self).__name__}: cloud {b}{sample_name(cloud, b)} has {have} points, fewer than the "
+                    f"{want} asked; ask for fewer" + ("" if have == 0 else ", or choose if_short")
+                )
+        seeds = [0] * cloud.num_clouds if streams is None else streams.seeds().tolist()
+        sampled = self.sample(cloud, [min(pair) for pair in zip(wanted, available, strict=True)], seeds)
+        filled = [self._fill_up(*case) for case in zip(sampled, wanted, seeds, strict=True)]
+        return torch.cat(filled), ptr_from_counts([len(rows) for rows in filled], device=cloud.device)
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Select the rows and blank those marked -1."""
+        blank = params["index"] < 0
+        chosen = data.select(params["index"].clamp(min=0), params["ptr"])
+        if self.if_short != "zeros":
+            return chosen
+        return chosen.with_fields(**{name: _blanked(value, blank) for name, value in chosen.fields().items()})
+
+    def _fill_up(self, rows: Tensor, wanted: int, seed: int) -> Tensor:
+        missing = wanted - len(rows)
+        if missing <= 0 or self.if_short == "keep":
+            return rows
+        if self.if_short == "zeros":
+            return torch.cat([rows, rows.new_full((missing,), -1)])
+        if self.if_short == "repeat" and self.is_random:
+            # Another stream than the one that drew the sample itself.
+            duplicates = torch.randint(len(rows), (missing,), generator=seeded(seed ^ 1))
+            return torch.cat([rows, rows[duplicates.to(rows.device)]])
+        return rows.repeat(-(-wanted // len(rows)))[:wanted]
+
+
+class FarthestPointSample(_Sample):
+    """Sample exactly ``num_points`` points, each the farthest from those before it; starts at the first point.
+
+    With ``if_short`` repeat or tile, a short cloud's points come again in sampling order.
+    """
+
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
+        """Sample all clouds in one call."""
+        asked = torch.tensor(counts, device=cloud.device)
+        index, ptr = farthest_point_sample(cloud.points, cloud.ptr, num_samples=asked)
+        return list(torch.tensor_split(index, ptr[1:-1].cpu()))
+
+
+class RandomSample(_Sample):
+    """Sample ``num_points`` points at random without replacement.
+
+    Cheap, and what several official loaders do; it keeps the density of the sensor, so close surfaces get most points
+    and thin or far objects may get none. FarthestPointSample covers evenly. A short cloud is filled up with random
+    duplicates (``if_short: repeat``) or with the same permutation again (``tile``).
+    """
+
+    is_random = True
+
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
+        """Take the head of a random permutation of each cloud."""
+        starts, available = cloud.ptr.tolist(), cloud.counts.tolist()
+        return [
+            start + torch.randperm(have, generator=seeded(seed))[:count].to(cloud.device)
+            for start, have, count, seed in zip(starts, available, counts, seeds, strict=False)
+        ]
+
+
+class RandomPointCount(RandomSample):
+    """Sample a random number of points, within ``spread`` of ``num_points``: a model must not count on the count."""
+
+    spread: Fraction = 0.2
+
+    def wanted_counts(self, cloud: PointCloud, streams: Streams | None) -> list[int]:
+        """Draw the count of every cloud."""
+        assert streams is not None
+        factor = streams.uniform(1.0 - self.spread, 1.0 + self.spread)
+        counts: list[int] = (factor * self.num_points).round().clamp(min=1).long().tolist()
+        return counts
+
+
+def _reduce(values: Tensor, kind: Kind, inverse: Tensor, count: int) -> Tensor:
+    """Reduce one field voxel by voxel, by its kind and dtype."""
+    if kind is Kind.DIRECTION:
+        return voxel_mean_direction(values, inverse, count)
+    columns = values.reshape(len(values), -1)
+    if values.is_floating_point():
+        reduced = voxel_mean(columns, inverse, count)
+    else:
+        votes = [voxel_majority(column.long(), inverse, count) for column in columns.unbind(1)]
+        reduced = torch.stack(votes, dim=1).to(values.dtype)
+    return reduced.reshape(count, *values.shape[1:])
+
+
+def _blanked(values: Tensor, blank: Tensor) -> Tensor:
+    filler = -1 if values.dtype in (torch.int16, torch.int32, torch.int64) else 0
+    return torch.where(blank.reshape(-1, *[1] * (values.ndim - 1)), torch.full_like(values, filler), values)

@@ -1,0 +1,20 @@
+"""The types that transforms' fields are made of: plain, JSON-able values with their limits."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Interval, MinLen
+
+Metres = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+Fraction = Annotated[float, Interval(ge=0, le=1)]
+Count = Annotated[int, Ge(1)]
+Name = Annotated[str, MinLen(1)]
+Vec3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]  # row-major, acts on column vectors
+
+# What a sampler does with a cloud that has fewer points than asked.
+IfShort = Literal["error", "repeat", "tile", "zeros", "keep"]

@@ -1,0 +1,121 @@
+"""Coordinate frames: ToFrame, MergeViews."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+from typing import Any
+
+import torch
+
+from pcdata.errors import ConfigError, FrameError, PcdataError
+from pcdata.functional import rigid
+from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.rng import Streams
+from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
+from pcdata.transforms.base import Params, SpatialTransform, Transform
+from pcdata.transforms.fields import Matrix4, Name
+
+
+class ToFrame(SpatialTransform):
+    """Bring clouds into a named coordinate frame, by the capture's own poses or by a matrix from a calibration."""
+
+    needs_metres = True
+
+    frame: Name  # the frame to go to
+    matrix: Matrix4 | None = None  # rigid frame_from_start, rows of 4; None = the pose that came with the capture
+    start: Name | None = None  # the frame that the matrix starts from; given with it
+
+    def check_fields(self) -> None:
+        """Require matrix and start together, and a rigid matrix."""
+        if (self.matrix is None) != (self.start is None):
+            raise ConfigError("ToFrame: give matrix and the frame it starts from (start) together, or neither")
+        if self.matrix is not None:
+            try:
+                rigid.check_rigid("ToFrame.matrix", torch.tensor(self.matrix, dtype=torch.float64))
+            except PcdataError as error:
+                raise ConfigError(str(error)) from error
+
+    def frame_needed(self) -> str | None:
+        """With a matrix, the frame it starts from."""
+        return self.start
+
+    def frame_given(self) -> str:
+        """The frame to go to."""
+        return self.frame
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Find the matrix from the cloud's frame to the wanted one."""
+        if self.matrix is not None:
+            return {"matrix": torch.tensor(self.matrix, dtype=torch.float64).repeat(data.num_clouds, 1, 1)}
+        for name in (self.frame, data.frame_id):
+            if name not in data.frames:
+                raise FrameError(
+                    f"ToFrame: no pose leads from {data.frame_id!r} to {self.frame!r}: the cloud knows the frames "
+                    f"{sorted(data.frames)}; give the capture poses, or ToFrame a matrix and its start"
+                )
+        current = data.frames[data.frame_id]
+        return {"matrix": data.frames[self.frame] @ torch.linalg.inv(current)}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Move the cloud and remember where the new frame lies."""
+        moved = super().apply(data, params)
+        if self.frame in data.frames or data.frame_id not in data.frames:
+            return moved
+        learned = params["matrix"].to(data.device) @ data.frames[data.frame_id]
+        return replace(moved, frames={**data.frames, self.frame: learned})
+
+
+class MergeViews(Transform):
+    """Join the views of each capture, which ToFrame brought into one frame, into one cloud.
+
+    Neighbouring clouds of the batch with the same sample id are one capture. The frame they share becomes the source
+    frame; every point keeps its ``view`` and the ``viewpoint`` it was seen from.
+    """
+
+    needs_metres = True
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Decide which clouds belong together: ``first_cloud`` (B',) of every capture."""
+        sizes = [len(list(group)) for _, group in groupby(entry.get("sample_id") for entry in data.meta)]
+        return {"group_ptr": ptr_from_counts(sizes)}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Drop the boundaries between the views of a capture."""
+        bounds = params["group_ptr"].tolist()
+        views = torch.diff(params["group_ptr"])
+        if data.frame_id == CAMERA_FRAME and int(views.max()) > 1:
+            raise FrameError(
+                f"MergeViews: the views are still in {CAMERA_FRAME!r}, each in its own camera's frame; "
+                "add ToFrame(frame=...) before it"
+            )
+        if any(entry.get("planes") for entry in data.meta) and int(views.max()) > 1:
+            raise FrameError("MergeViews: planes were found view by view; put RemovePlane after MergeViews")
+        device = data.device
+        view_of_cloud = torch.cat([torch.arange(int(size), device=device) for size in views])
+        seen_from = data.viewpoint_per_point()
+        merged = data.with_extra("view", view_of_cloud[cloud_of_rows(data.ptr)], Kind.INVARIANT)
+        if seen_from is not None:
+            merged = merged.with_extra("viewpoint", seen_from, Kind.POSITION)
+        groups = len(views)
+        identity = torch.eye(4, dtype=torch.float64, device=device).repeat(groups, 1, 1)
+        return replace(
+            merged,
+            ptr=data.ptr[params["group_ptr"].to(device)],
+            viewpoint=None,
+            source_from_cloud=identity,
+            source_frame=data.frame_id,
+            frames={data.frame_id: identity},
+            unit=METRE,
+            meta=[_merged_meta(data, start, stop) for start, stop in zip(bounds, bounds[1:])],
+            history=[data.history[start] for start in bounds[:-1]],
+        )
+
+
+def _merged_meta(data: PointCloud, start: int, stop: int) -> dict[str, Any]:
+    counts = data.counts.tolist()
+    cameras = [camera for entry in data.meta[start:stop] for camera in entry.get("cameras", [])]
+    merged = {**data.meta[start], "points_per_view": counts[start:stop]}
+    return {**merged, "cameras": cameras} if cameras else merged
+
+

@@ -1,0 +1,121 @@
+"""Random changes that are not motions: RandomJitter, RandomPointDropout, RandomColorJitter."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import ConfigError, DTypeError
+from pcdata.functional.ragged import ptr_from_counts
+from pcdata.rng import Streams, seeded
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Params, SelectTransform, Transform
+from pcdata.transforms.fields import Fraction, NonNegative, Positive
+
+
+class RandomJitter(Transform):
+    """Add independent Gaussian noise to every point, in the cloud's unit; ``source_from_cloud`` does not undo it."""
+
+    is_random = True
+
+    sigma: NonNegative = 0.001  # standard deviation per axis
+    clip: Positive | None = 0.005  # the largest change per axis; None = unlimited
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw a seed per cloud: with it the noise can be drawn again exactly."""
+        return {"seed": streams.seeds()}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Add the noise that belongs to the seeds."""
+        drawn = [
+            torch.randn((count, 3), generator=seeded(seed))
+            for count, seed in zip(data.counts.tolist(), params["seed"].tolist(), strict=True)
+        ]
+        noise = torch.cat(drawn) * self.sigma
+        if self.clip is not None:
+            noise = noise.clamp(-self.clip, self.clip)
+        return data.with_fields(points=data.points + noise.to(data.device))
+
+
+class RandomPointDropout(SelectTransform):
+    """Drop a random fraction of every cloud's points, keeping their order; at least one point stays."""
+
+    is_random = True
+
+    low: Fraction = 0.05
+    high: Fraction = 0.10
+
+    def check_fields(self) -> None:
+        """Require low <= high."""
+        if self.low > self.high:
+            raise ConfigError(f"RandomPointDropout: low {self.low} exceeds high {self.high}")
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Draw the fraction, then which points."""
+        assert streams is not None
+        fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
+        bounds = cloud.ptr.tolist()
+        kept = []
+        for b, (start, stop) in enumerate(zip(bounds, bounds[1:])):
+            count = stop - start
+            num_kept = max(count - round(count * fractions[b]), min(count, 1))
+            order = torch.randperm(count, generator=seeded(seeds[b]))[:num_kept]
+            kept.append(start + order.sort().values)
+        index = torch.cat(kept).to(cloud.device)
+        return index, ptr_from_counts([len(rows) for rows in kept], device=cloud.device)
+
+
+class RandomColorJitter(Transform):
+    """Change brightness, contrast, saturation and hue of every cloud's colours at random, in that order.
+
+    Each factor is drawn once per cloud from [1 - x, 1 + x), the hue shift from [-hue, hue) turns; as torchvision's
+    ColorJitter. The adjustments are kornia's.
+    """
+
+    is_random = True
+
+    brightness: Fraction = 0.2
+    contrast: Fraction = 0.2
+    saturation: Fraction = 0.2
+    hue: Fraction = 0.05
+
+    def check_fields(self) -> None:
+        """Half a turn of hue reaches every hue."""
+        if self.hue > 0.5:
+            raise ConfigError(f"RandomColorJitter: hue is in turns, at most 0.5, got {self.hue}")
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+        """Draw four numbers per cloud."""
+        limits = torch.tensor([self.brightness, self.contrast, self.saturation, self.hue], dtype=torch.float64)
+        middle = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64)
+        return {"factors": middle + streams.uniform(-1.0, 1.0, 4) * limits}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Adjust each cloud as an image of one column."""
+        if data.colors is None:
+            raise DTypeError("RandomColorJitter: the cloud has no colours")
+        bounds = data.ptr.tolist()
+        parts = [
+            _adjust(data.colors[start:stop], params["factors"][b])
+            for b, (start, stop) in enumerate(zip(bounds, bounds[1:]))
+        ]
+        return data.with_fields(colors=torch.cat(parts))
+
+
+def _adjust(colors: Tensor, factors: Tensor) -> Tensor:
+    from kornia.enhance import (  # imported late: kornia is slow to load and only this step needs it
+        adjust_brightness_accumulative,
+        adjust_contrast_with_mean_subtraction,
+        adjust_hue,
+        adjust_saturation,
+    )
+
+    if not len(colors):
+        return colors
+    brightness, contrast, saturation, hue = factors.to(colors.device, torch.float32)
+    image = colors.T[None, :, :, None]
+    image = adjust_brightness_accumulative(image, brightness)
+    image = adjust_contrast_with_mean_subtraction(image, contrast)
+    image = adjust_saturation(image, saturation)
+    image = adjust_hue(image, hue * (2 * torch.pi))
+    return image[0, :, :, 0].T.contiguous().clamp(0, 1)

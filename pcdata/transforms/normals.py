@@ -1,0 +1,43 @@
+"""EstimateNormals: surface normals that face the camera which saw each point."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pcdata.errors import FrameError
+from pcdata.functional.normals import estimate_normals, orient_normals
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.fields import Count, Metres
+
+
+class EstimateNormals(Transform):
+    """Fit a plane to the nearest neighbours within a radius; replaces any normals the cloud had.
+
+    After merging, every point's normal faces the camera that saw that point.
+    """
+
+    needs_metres = True
+    runs_statistics = True
+
+    radius: Metres = 0.02
+    max_neighbors: Count = 30  # the nearest within the radius, the point itself among them
+    orient: Literal["viewpoint", "none"] = "viewpoint"  # "none": the sign is arbitrary but repeatable
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Estimate from the points of each cloud alone."""
+        normals = estimate_normals(data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors)
+        if self.orient == "viewpoint":
+            viewpoint = data.viewpoint_per_point()
+            if viewpoint is None:
+                raise FrameError(
+                    "EstimateNormals: the cloud has no viewpoint to face; set PointCloud.viewpoint to where the sensor "
+                    "stood, or choose orient: none"
+                )
+            normals = orient_normals(data.points, normals, viewpoint)
+        return {"normals": normals}
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Write the normals."""
+        return data.with_fields(normals=params["normals"])

@@ -1,0 +1,45 @@
+"""Outlier removal: RemoveStatisticalOutliers, RemoveRadiusOutliers."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
+from pcdata.functional.ragged import ptr_after_mask
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import SelectTransform, rows_of_mask
+from pcdata.transforms.fields import Count, Metres, Positive
+
+
+class RemoveStatisticalOutliers(SelectTransform):
+    """Drop points whose mean distance to their nearest neighbours is unusual for their cloud (Open3D's rule)."""
+
+    runs_statistics = True
+
+    num_neighbors: Count = 20  # nearest neighbours, the point itself among them
+    std_ratio: Positive = 2.0  # standard deviations above the cloud's mean that are still usual
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Pick the usual rows."""
+        outlier = statistical_outlier_mask(
+            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio
+        )
+        return rows_of_mask(~outlier), ptr_after_mask(~outlier, cloud.ptr)
+
+
+class RemoveRadiusOutliers(SelectTransform):
+    """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
+
+    needs_metres = True
+    runs_statistics = True
+
+    min_neighbors: Count = 5
+    radius: Metres = 0.01
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Pick the rows with company."""
+        outlier = radius_outlier_mask(
+            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius
+        )
+        return rows_of_mask(~outlier), ptr_after_mask(~outlier, cloud.ptr)

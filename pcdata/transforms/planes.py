@@ -1,0 +1,108 @@
+"""RemovePlane: find the dominant plane, usually the table, and remove it."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import torch
+from annotated_types import Interval
+from torch import Tensor
+
+from pcdata.errors import ConfigError
+from pcdata.functional import rigid
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, segment_sum
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Params, SelectTransform, rows_of_mask
+from pcdata.transforms.fields import Count, Metres, Name, Vec3
+
+
+class RemovePlane(SelectTransform):
+    """Remove the plane with the most inliers, found by RANSAC and refined by least squares.
+
+    The plane joins ``meta["planes"]`` of every cloud, in the source frame, so later steps cannot make it stale;
+    :func:`planes_in_cloud` gives it in the cloud's present coordinates.
+    """
+
+    needs_metres = True
+    runs_statistics = True
+
+    distance: Metres = 0.01  # inliers are closer to the plane than this
+    num_hypotheses: Count = 1000
+    seed: int = 0  # of the hypotheses: the same cloud always gives the same plane
+    keep: Literal["both", "above"] = "both"  # "above": also drop what lies beyond the plane, seen along its normal
+    up: Vec3 | None = None  # the normal's rough direction in `frame`; None = any, facing the origin of the frame
+    frame: Name | None = None  # the frame that `up` is given in; given with it
+    max_tilt: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = None  # radians between normal and up at most
+
+    def check_fields(self) -> None:
+        """Require up and frame together, and up for max_tilt."""
+        if (self.up is None) != (self.frame is None):
+            raise ConfigError("RemovePlane: give up and the frame it is in together, or neither")
+        if self.max_tilt is not None and self.up is None:
+            raise ConfigError("RemovePlane: max_tilt is measured from up; give up and frame too")
+
+    def frame_needed(self) -> str | None:
+        """The frame of ``up``."""
+        return self.frame
+
+    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+        """Find the plane of every cloud and the rows that stay."""
+        planes, inlier = ransac_plane(
+            data.points,
+            data.ptr,
+            distance=self.distance,
+            num_hypotheses=self.num_hypotheses,
+            seed=self.seed,
+            up=self.up,
+            max_tilt=self.max_tilt,
+        )
+        keep = ~inlier
+        if self.keep == "above":
+            plane = planes.double()[cloud_of_rows(data.ptr)]
+            keep &= (plane[:, :3] * data.points).sum(1) + plane[:, 3] > 0
+        return {
+            "index": rows_of_mask(keep),
+            "ptr": ptr_after_mask(keep, data.ptr),
+            "planes": planes,
+            "num_inliers": segment_sum(inlier.long(), data.ptr),
+        }
+
+    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+        """Keep the rows and store the planes in the source frame."""
+        entries: list[dict[str, Any]] = []
+        source_planes = _map_planes(params["planes"], torch.linalg.inv(data.source_from_cloud))
+        for b, plane in enumerate(source_planes.tolist()):
+            found: dict[str, Any] = {
+                "normal": plane[:3],
+                "offset": plane[3],
+                "frame": data.source_frame,
+                "num_inliers": int(params["num_inliers"][b]),
+            }
+            if self.up is not None:
+                up = torch.tensor(self.up, dtype=torch.float64)
+                found["tilt"] = float(rigid.angle_between(params["planes"][b, :3].cpu(), up))
+            entries.append({"planes": [*data.meta[b].get("planes", []), found]})
+        return super().apply(data, params).with_meta(entries)
+
+
+def planes_in_cloud(cloud: PointCloud, b: int = 0) -> Tensor:
+    """Return (P, 4) float64 planes (unit normal, offset) found in cloud ``b``, in its present coordinates.
+
+    A point p is on the plane where ``normal @ p + offset == 0``.
+    """
+    stored = [[*plane["normal"], plane["offset"]] for plane in cloud.meta[b].get("planes", [])]
+    planes = torch.tensor(stored, dtype=torch.float64).reshape(-1, 4)
+    matrix = cloud.source_from_cloud[b].cpu()
+    return _map_planes(planes, matrix.expand(len(planes), 4, 4))
+
+
+def _map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
+    """Rewrite (P, 4) planes in new coordinates: a plane is a row vector, so it moves by the inverse matrix."""
+    moved = torch.einsum("pi,pij->pj", planes.double(), old_from_new)
+    return moved / moved[:, :3].norm(dim=1, keepdim=True)
+
+
+__all__ = ["RemovePlane", "planes_in_cloud"]

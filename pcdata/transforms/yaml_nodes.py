@@ -1,0 +1,121 @@
+"""YAML with a memory of where every value stood, so that errors can say file:line:column."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import yaml
+
+from pcdata.errors import ConfigError
+
+_MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
+
+
+class YamlDocument:
+    """One parsed file and the faults found in it so far; all are reported at once."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self.name = name
+        self.faults: list[tuple[yaml.Mark | None, str]] = []
+        if len(text) > _MAX_CHARACTERS:
+            raise ConfigError(f"{name}: a configuration of {len(text)} characters is not one; the limit is {_MAX_CHARACTERS}")
+        try:
+            # Aliases let a small file expand without bound, and no configuration needs them.
+            alias = next((token for token in yaml.scan(text, yaml.SafeLoader) if isinstance(token, yaml.AliasToken)), None)
+            self.root: yaml.Node | None = None if alias else yaml.compose(text, yaml.SafeLoader)
+        except yaml.MarkedYAMLError as error:
+            self.fault_at(error.problem_mark, f"not valid YAML: {error.problem}")
+            self.raise_faults()
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{name}: not valid YAML: {error}") from error
+        if alias is not None:
+            self.fault_at(alias.start_mark, "YAML aliases (*name) are not allowed; write the value out")
+            self.raise_faults()
+
+    def fault(self, node: yaml.Node | None, message: str) -> None:
+        """Note a fault at a node."""
+        self.fault_at(node.start_mark if node is not None else None, message)
+
+    def fault_at(self, mark: yaml.Mark | None, message: str) -> None:
+        """Note a fault at a place in the file."""
+        self.faults.append((mark, message))
+
+    def raise_faults(self) -> None:
+        """Raise one ConfigError with every fault in file order, if there are any."""
+        if not self.faults:
+            return
+        ordered = sorted(self.faults, key=lambda fault: (fault[0].line, fault[0].column) if fault[0] else (-1, -1))
+        raise ConfigError("\n".join(f"{self._place(mark)}: {message}" for mark, message in ordered))
+
+    def _place(self, mark: yaml.Mark | None) -> str:
+        return f"{self.name}:{mark.line + 1}:{mark.column + 1}" if mark else self.name
+
+    def mapping(self, node: yaml.Node | None, what: str) -> dict[str, tuple[yaml.Node, yaml.Node]]:
+        """Read a mapping as key -> (key node, value node); an empty node is an empty mapping; faults are noted."""
+        if node is None or _is_null(node):
+            return {}
+        if not isinstance(node, yaml.MappingNode):
+            self.fault(node, f"{what} must be a mapping of names to values, not {_kind(node)}")
+            return {}
+        found: dict[str, tuple[yaml.Node, yaml.Node]] = {}
+        for key, value in node.value:
+            name = str(key.value)
+            if name in found:
+                self.fault(key, f"{what}: {name!r} is given twice")
+            found[name] = (key, value)
+        return found
+
+    def sequence(self, node: yaml.Node | None, what: str) -> list[yaml.Node]:
+        """Read a list; an empty node is an empty list; faults are noted."""
+        if node is None or _is_null(node):
+            return []
+        if not isinstance(node, yaml.SequenceNode):
+            self.fault(node, f"{what} must be a list, each entry starting with '- ', not {_kind(node)}")
+            return []
+        return list(node.value)
+
+    def plain(self, node: yaml.Node) -> Any:
+        """Return the node's value as plain Python data; duplicate keys are noted as faults."""
+        for mapping in _mappings(node):
+            self.mapping(mapping, "mapping")
+        try:
+            return yaml.SafeLoader("").construct_object(node, deep=True)
+        except yaml.MarkedYAMLError as error:
+            self.fault_at(error.problem_mark, f"cannot read this value: {error.problem}")
+            return None
+
+
+def node_at(node: yaml.Node, path: Sequence[int | str]) -> yaml.Node:
+    """Follow keys and positions as far as they lead and return the node there."""
+    for part in path:
+        if isinstance(node, yaml.MappingNode):
+            children = {str(key.value): value for key, value in node.value}
+            if str(part) not in children:
+                break
+            node = children[str(part)]
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            node = node.value[part]
+        else:
+            break
+    return node
+
+
+def _is_null(node: yaml.Node) -> bool:
+    return node.tag == "tag:yaml.org,2002:null"
+
+
+def _kind(node: yaml.Node) -> str:
+    if isinstance(node, yaml.ScalarNode):
+        return f"the single value {node.value!r}"
+    return "a list" if isinstance(node, yaml.SequenceNode) else "a mapping"
+
+
+def _mappings(node: yaml.Node) -> Iterator[yaml.MappingNode]:
+    if isinstance(node, yaml.MappingNode):
+        yield node
+        for _, value in node.value:
+            yield from _mappings(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            yield from _mappings(item)
