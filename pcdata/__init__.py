@@ -24,6 +24,7 @@ _HOMES = {
         "MergeViews",
         "NormalizeUnitSphere",
         "NormalizeWorkspace",
+        "Pipeline",
         "RandomApply",
         "RandomColorJitter",
         "RandomFlip",
@@ -47,7 +48,7 @@ _HOMES = {
     "pcdata.build": ["build_dataset", "load_config"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "models", "report", "structures", "synthetic", "transforms"]
+_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "report", "structures", "synthetic", "transforms"]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors, parse_spec
-from pcdata.errors import BackendError, near_matches
+from pcdata.errors import BackendError, DTypeError, near_matches
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -58,12 +58,21 @@ def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         name = reference.__name__
         # Row pointers come last, when the number of rows is known.
         ordered = dict(sorted(specs.items(), key=lambda item: parse_spec(item[1]).is_ptr))
+        # Row pointers may be None wherever they stand: that means one cloud.
+        required = [
+            key
+            for key, text in ordered.items()
+            if signature.parameters[key].default is inspect.Parameter.empty and not parse_spec(text).is_ptr
+        ]
 
         @functools.wraps(reference)
         def public(*args: P.args, **kwargs: P.kwargs) -> R:
             bound = signature.bind(*args, **kwargs)
             bound.apply_defaults()
             arguments = bound.arguments
+            for key in required:
+                if arguments[key] is None:
+                    raise DTypeError(f"{name}: {key} must be a torch.Tensor, not None")
             _fill_row_pointers(arguments, ordered)
             check_tensors(name, arguments, ordered)
             backend = arguments.pop("backend", "auto")

@@ -1,0 +1,6 @@
+"""Offline builds: a configuration and a source in, a dataset on disk out."""
+
+from pcdata.build.builder import BuildReport, BuiltSample, build_dataset
+from pcdata.build.config import BuildConfig, config_from_yaml, load_config
+
+__all__ = ["BuildConfig", "BuildReport", "BuiltSample", "build_dataset", "config_from_yaml", "load_config"]

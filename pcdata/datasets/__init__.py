@@ -1,0 +1,16 @@
+"""Datasets of clouds and the collate functions that feed a DataLoader."""
+
+from pcdata.datasets.cached import CachedCloudDataset
+from pcdata.datasets.clouds import CaptureSource, CloudDataset
+from pcdata.datasets.collate import collate_fixed, collate_packed, collate_padded
+from pcdata.datasets.samples import SampleDataset
+
+__all__ = [
+    "CachedCloudDataset",
+    "CaptureSource",
+    "CloudDataset",
+    "SampleDataset",
+    "collate_fixed",
+    "collate_packed",
+    "collate_padded",
+]

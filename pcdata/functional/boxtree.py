@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask, ptr_from_counts
 
 LEAF_SIZE = 16
 FAN_OUT = 8
@@ -93,22 +93,19 @@ class BoxTree:
     coordinates: Tensor
     row: Tensor  # (L+1, 16) int64, N in empty slots: sorts after every real point
     num_points: int
-    complete: bool  # no duplicate was dropped, so the leaves hold every point
+    kept: Tensor  # (N,) bool in Morton order, False for a dropped duplicate
+    ptr: Tensor  # (B+1,) int64, the kept points of every cloud
 
     @classmethod
-    def build(cls, points: Tensor, ptr: Tensor, *, max_copies: int) -> BoxTree:
-        """Build the tree of (N,3) points.
+    def build(cls, points: Tensor, ptr: Tensor, order: Tensor, *, max_copies: int) -> BoxTree:
+        """Build the tree of (N,3) points, given their rows in Morton order.
 
         Of points with equal coordinates only the ``max_copies`` lowest rows are kept: under the order (distance, row)
         no further copy can be among the nearest ``max_copies``, and thousands of equal points (zeros left by missing
         depth) would otherwise cost quadratic time.
         """
-        order = spatial_order(points, ptr)
         kept = _first_copies(points[order], ptr, max_copies)
-        complete = bool(kept.all())
-        if not complete:
-            kept_counts = torch.zeros_like(ptr[1:]).index_add_(0, cloud_of_rows(ptr), kept.long())
-            order, ptr = order[kept], ptr_from_counts(kept_counts)
+        order, ptr = order[kept], ptr_after_mask(kept, ptr)
         leaves = Leaves.of(points, ptr, order)
         levels = [leaves.level]
         while int(counts_from_ptr(levels[-1].groups.ptr).max()) > 1:
@@ -116,7 +113,7 @@ class BoxTree:
         filled = torch.where(leaves.real[..., None], leaves.points, torch.inf)
         coordinates = torch.cat([filled, filled.new_full((1, LEAF_SIZE, 3), torch.inf)]).permute(2, 0, 1).contiguous()
         row = torch.cat([torch.where(leaves.real, leaves.row, len(points)), order.new_full((1, LEAF_SIZE), len(points))])
-        return cls(leaves, levels, coordinates, row, len(points), complete)
+        return cls(leaves, levels, coordinates, row, len(points), kept, ptr)
 
     @property
     def leaf_ptr(self) -> Tensor:
@@ -133,14 +130,22 @@ def box_gap(low: Tensor, high: Tensor, other_low: Tensor, other_high: Tensor) ->
     return sum_of_squares(torch.maximum(low - other_high, other_low - high).clamp_(min=0))
 
 
-def spatial_order(points: Tensor, ptr: Tensor) -> Tensor:
-    """Return (N,) int64 rows that put each cloud of (N,3) points in Morton order; equal points stay in row order.
+def expand_ranges(first: Tensor, count: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
+    """Replace each range of rows by one (owner, row) pair per row, in order."""
+    total = torch.cumsum(count, 0)
+    source = torch.repeat_interleave(torch.arange(len(first), device=first.device), count)
+    rank = torch.arange(len(source), device=first.device) - (total - count)[source]
+    return owner[source], first[source] + rank
+
+
+def spatial_order(points: Tensor, cloud: Tensor) -> Tensor:
+    """Return (N,) int64 rows that put (N,3) points in order of (N,) cloud, then Morton code; equal ones stay in order.
 
     A run of more than a leaf of equal codes that are not equal points is coded again in its own cube, so one stray
     point a kilometre away does not blur the order of the rest.
     """
-    order = torch.arange(len(points), device=points.device)
-    place, segment = order.clone(), cloud_of_rows(ptr)
+    segment, order = torch.sort(cloud, stable=True)
+    place = torch.arange(len(points), device=points.device)
     while len(place):
         _, segment = torch.unique_consecutive(segment, return_inverse=True)
         code = _morton_code(points[order[place]], segment)

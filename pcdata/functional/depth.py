@@ -137,8 +137,8 @@ def check_intrinsics(where: str, intrinsics: Tensor) -> None:
             raise CaptureError(f"{found} must have K[1,0] = 0, got {row1[0]:g}; is there a rotation in the matrix?")
         if row0[0] <= 0.0 or row1[1] <= 0.0:
             raise CaptureError(
-                f"{found} must have positive focal lengths, got fx={row0[0]:g}, fy={row1[1]:g}; PyRep and RLBench write "
-                "negative ones: negate both and turn the camera by 180 degrees about its z axis "
+                f"{found} must have positive focal lengths, got fx={row0[0]:g}, fy={row1[1]:g}; PyRep and "
+                "RLBench write negative ones: negate both and turn the camera by 180 degrees about its z axis "
                 "(world_from_camera @ diag(-1, -1, 1, 1))"
             )
 
@@ -170,8 +170,8 @@ def _check_rays(where: str, rays: Tensor, needed: Tensor) -> None:
     lost = needed & rays[..., 0].isnan()
     if bool(lost.any()):
         raise CaptureError(
-            f"{where}: the lens model cannot be inverted at {int(lost.sum())} pixels that have a reading (they lie beyond "
-            "the radius where it folds back); check the order of the coefficients, or set those pixels to 0"
+            f"{where}: the lens model cannot be inverted at {int(lost.sum())} pixels that have a reading (they lie "
+            "beyond the radius where it folds back); check the order of the coefficients, or set those pixels to 0"
         )
 
 

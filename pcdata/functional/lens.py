@@ -103,7 +103,7 @@ def undistort_normalized(
 
 
 def fold_radius(distortion: Tensor) -> Tensor:
-    """Return (V,) float64: the normalised radius where each view's radial model stops growing, infinity if it never does.
+    """Return (V,) float64: the normalised radius at which each view's radial model stops growing, or infinity.
 
     It is the first zero of d(r N/D)/dr, or the first pole; with t = r^2 both are polynomials in t.
     """

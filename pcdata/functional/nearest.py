@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pcdata.functional.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, spatial_order
+from pcdata.functional.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
 from pcdata.functional.ragged import cloud_of_rows
 
 _GROUPS_PER_CHUNK = 512
@@ -48,16 +48,15 @@ def nearest_chunks(
     A query that is one of the points counts itself. The radius test is ``d2 < float32(radius) * float32(radius)``.
     """
     points = points.detach()
-    tree = BoxTree.build(points, ptr, max_copies=k)
-    if queries is None and tree.complete:
-        leaves, nearest_leaf = tree.leaves, torch.arange(len(tree.leaves), device=points.device)
-    else:
-        queries, queries_ptr = (points, ptr) if queries is None or queries_ptr is None else (queries, queries_ptr)
-        queries = queries.detach()
-        leaves = Leaves.of(queries, queries_ptr, spatial_order(queries, queries_ptr))
-        nearest_leaf = _descend(tree, leaves)
-    search = _Search(tree, leaves, nearest_leaf, k, largest_squared(radius, points.device))
-    yield from search.run()
+    leaves: Leaves | None = None
+    if queries is None or queries_ptr is None:
+        queries, queries_ptr = points, ptr
+        tree = BoxTree.build(points, ptr, spatial_order(points, cloud_of_rows(ptr)), max_copies=k)
+        if bool(tree.kept.all()):  # the queries are the leaves themselves
+            leaves, home = tree.leaves, torch.arange(len(tree.leaves), device=ptr.device)[:, None].expand(-1, LEAF_SIZE)
+    if leaves is None:
+        tree, leaves, home = _build_together(points, ptr, queries.detach(), queries_ptr, max_copies=k)
+    yield from _Search(tree, leaves, home, k, largest_squared(radius, points.device)).run()
 
 
 def largest_squared(radius: float | None, device: torch.device) -> Tensor:
@@ -68,24 +67,26 @@ def largest_squared(radius: float | None, device: torch.device) -> Tensor:
     return torch.nextafter(limit * limit, torch.zeros_like(limit))
 
 
-def _descend(tree: BoxTree, leaves: Leaves) -> Tensor:
-    """Return for each group of queries one leaf near its centre (greedy descent), -1 where its cloud has no points."""
-    centre = (leaves.level.low + leaves.level.high) * 0.5
-    node, alive = _roots(tree, leaves)
-    node = node.clamp(min=0)
-    if len(tree.leaves) == 0:
-        return torch.full_like(node, -1)
-    for depth in range(len(tree.levels) - 1, 0, -1):
-        level, below = tree.levels[depth], tree.levels[depth - 1]
-        slots, real = level.groups.table()
-        children, is_child = slots[node], real[node]
-        low, high = below.low[children], below.high[children]
-        gap = box_gap(centre[:, None], centre[:, None], low, high)
-        # Boxes overlap: among those that hold the centre, the one centred nearest is the likeliest to be dense there.
-        offset = (low + high) * 0.5 - centre[:, None]
-        score = torch.where(is_child, gap * 1e3 + (offset * offset).sum(-1), torch.inf)
-        node = children.gather(1, score.argmin(1, keepdim=True)).squeeze(1)
-    return torch.where(alive, node, -1)
+def _build_together(
+    points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor, *, max_copies: int
+) -> tuple[BoxTree, Leaves, Tensor]:
+    """Sort points and queries along one curve; return the tree, the grouped queries and the leaf each query falls in.
+
+    The leaf is (G, 16), -1 where the cloud has no points.
+    """
+    cloud = torch.cat([cloud_of_rows(ptr), cloud_of_rows(queries_ptr)])
+    order = spatial_order(torch.cat([points, queries]), cloud)
+    is_point = order < len(points)
+    tree = BoxTree.build(points, ptr, order[is_point], max_copies=max_copies)
+    leaves = Leaves.of(queries, queries_ptr, order[~is_point] - len(points))
+    seen = torch.zeros_like(order)
+    seen[is_point] = tree.kept.long()
+    place = torch.cumsum(seen, 0)[~is_point] - 1  # the last point before each query on the curve
+    cloud = cloud_of_rows(queries_ptr)
+    first, end = tree.ptr[cloud], tree.ptr[cloud + 1]
+    home = tree.leaf_ptr[cloud] + torch.minimum(place.clamp(min=0), end - 1).sub_(first).clamp_(min=0) // LEAF_SIZE
+    home = torch.where(first < end, home, -1)
+    return tree, leaves, home[leaves.level.groups.table()[0]]
 
 
 def _roots(tree: BoxTree, leaves: Leaves) -> tuple[Tensor, Tensor]:
@@ -100,7 +101,7 @@ def _roots(tree: BoxTree, leaves: Leaves) -> tuple[Tensor, Tensor]:
 class _Search:
     tree: BoxTree
     leaves: Leaves  # the queries, grouped
-    nearest_leaf: Tensor  # (G,) a leaf of points near each group, -1 for none
+    home: Tensor  # (G, 16) a leaf of points near each query, -1 for none
     k: int
     limit: Tensor  # () float32, neighbours have d2 <= limit
 
@@ -118,15 +119,15 @@ class _Search:
         return max(3, -(-self.k // LEAF_SIZE) + 2)
 
     def _first_bound(self, groups: Tensor, window: int) -> Tensor:
-        """Return (g, 16): each query's k-th squared distance among the leaves around its group, inf below k points."""
-        leaf = self.nearest_leaf[groups]
+        """Return (g, 16): each query's k-th squared distance among the leaves around its own, inf below k points."""
+        home = self.home[groups]
         ptr = self.tree.leaf_ptr
-        cloud = torch.searchsorted(ptr, leaf, right=True) - 1
-        begin, end = ptr[cloud.clamp(min=0)], ptr[(cloud + 1).clamp(min=0)]
-        first = torch.maximum(torch.minimum(leaf - window // 2, end - window), begin)
-        around = first[:, None] + torch.arange(window, device=leaf.device)
-        around = torch.where((around < end[:, None]) & (leaf[:, None] >= 0), around, len(self.tree.leaves))
-        squared = self._squared(self.leaves.points[groups], around[:, None, :])
+        cloud = cloud_of_rows(self.leaves.level.groups.ptr)[groups, None]
+        begin, end = ptr[cloud], ptr[cloud + 1]
+        first = torch.maximum(torch.minimum(home - window // 2, end - window), begin)
+        around = first[..., None] + torch.arange(window, device=home.device)
+        around = torch.where(around < end[..., None], around, len(self.tree.leaves))
+        squared = self._squared(self.leaves.points[groups], around)
         if self.k > squared.shape[-1]:
             return torch.full_like(squared[..., 0], torch.inf)
         return squared.topk(self.k, largest=False, sorted=False).values.amax(-1)
@@ -151,7 +152,7 @@ class _Search:
             near = box_gap(low[group], high[group], level.low[node], level.high[node]) <= group_bound[group]
             group, node = group[near], node[near]
             if depth:
-                group, node = _expand(level.groups.first[node], level.groups.count[node], group)
+                group, node = expand_ranges(level.groups.first[node], level.groups.count[node], group)
             if len(group) > _MAX_PAIRS and len(groups) > 1:
                 # A bound too loose for so many groups at once: walk again with half of them, never with more memory.
                 half = len(groups) // 2
@@ -209,14 +210,6 @@ class _Search:
             squared = torch.nn.functional.pad(squared, (0, self.k - k), value=torch.inf)
             index = torch.nn.functional.pad(index, (0, self.k - k), value=self.tree.num_points)
         return Neighbors(row, squared, index)
-
-
-def _expand(first: Tensor, count: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
-    """Replace each (owner, node) pair by one pair per child of the node."""
-    total = torch.cumsum(count, 0)
-    parent = torch.repeat_interleave(torch.arange(len(first), device=first.device), count)
-    rank = torch.arange(len(parent), device=first.device) - (total - count)[parent]
-    return owner[parent], first[parent] + rank
 
 
 def _widths(largest: int) -> list[int]:

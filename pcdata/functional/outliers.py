@@ -13,7 +13,7 @@ from pcdata.dispatch import op
 from pcdata.functional.cells import Cells
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.parameters import check_grid, require_count, require_length
+from pcdata.functional.parameters import check_grid, require_count, require_length, require_positive
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask, segment_sum
 
 
@@ -45,7 +45,7 @@ def statistical_outlier_mask(
     where = "statistical_outlier_mask"
     assert ptr is not None  # @op fills it
     require_count(where, "num_neighbors", num_neighbors)
-    require_length(where, "std_ratio", std_ratio)
+    require_positive(where, "std_ratio", std_ratio)
     check_grid(where, grid, points, ptr)
     mean = torch.zeros(len(points), dtype=torch.float64, device=points.device)
     for near in nearest_chunks(points, ptr, num_neighbors):
@@ -96,6 +96,8 @@ def radius_outlier_mask(
     # All points of a cell are within the radius of each other: a full cell needs no distances.
     outlier = Cells.within(where, points, ptr, radius).crowd() <= min_neighbors
     undecided = outlier.nonzero().squeeze(1)
+    if len(undecided) == 0:
+        return outlier
     searches = nearest_chunks(
         points,
         ptr,

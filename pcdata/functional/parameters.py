@@ -27,6 +27,14 @@ def require_length(where: str, name: str, value: float) -> None:
         raise ConfigError(f"{where}: {name} must be a length in the unit of the points, 1e-22 to 1e19, got {value}")
 
 
+def require_positive(where: str, name: str, value: float) -> None:
+    """Require a finite number above 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DTypeError(f"{where}: {name} must be a number, not {type(value).__name__}")
+    if not math.isfinite(value) or value <= 0:
+        raise ConfigError(f"{where}: {name} must be finite and more than 0, got {value}")
+
+
 def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) -> None:
     """Require that an image grid, when given, describes exactly these points: a kernel will trust it.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.rigid import angle_between
 from pcdata.rng import seeded
 
@@ -23,6 +24,7 @@ _FLAT_STEPS = 8.0
 
 
 @op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
 def ransac_plane(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -36,19 +38,23 @@ def ransac_plane(
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Find each cloud's plane with the most points nearer than ``distance`` (strictly, as Open3D).
 
-    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every one of ``num_hypotheses`` planes through three
-    distinct random points is scored on all points (no early stop); ties go to the earliest hypothesis. The winner is then
-    refitted to its inliers by least squares until the inliers no longer change (at most 20 rounds).
+    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored on all points (no early
+    stop); ties go to the earliest. The winner is then refitted to its inliers by least squares until the inliers no
+    longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
     The normal points along ``up`` when given, else towards the origin, where the sensor is (d >= 0).
 
     Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
         distance: in the unit of the points.
+        num_hypotheses: planes to try, each through three distinct random points.
         seed: of the triples; one for every cloud, so that a batch equals its clouds alone, or one per cloud.
         up: (3,) or one per cloud (B, 3); any length.
         max_tilt: radians; only planes whose normal is within this angle of up or -up compete. A refinement that would
             leave this cone is not taken.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
 
     Raises:
         TooFewPointsError: a cloud has fewer than 3 points.
@@ -202,7 +208,7 @@ def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
 
 
 def _face(plane: Tensor, up: Tensor | None) -> Tensor:
-    """Turn the normal along ``up``, or towards the origin; a plane that leaves both open gets its first component > 0."""
+    """Turn the normal along ``up``, else towards the origin; where both are open, its first component is positive."""
     along_up = 0.0 if up is None else float(plane[:3] @ up)
     deciding = [along_up, float(plane[3]), *plane[:3].tolist()]
     return -plane if next(value for value in deciding if value != 0.0) < 0 else plane
@@ -227,10 +233,8 @@ def _flat_height(largest: Tensor) -> Tensor:
 def _check_parameters(
     distance: float, num_hypotheses: int, max_tilt: float | None, up: Tensor | Sequence[float] | None
 ) -> None:
-    if not (math.isfinite(distance) and distance > 0):
-        raise ConfigError(f"ransac_plane: distance must be positive, got {distance}")
-    if num_hypotheses < 1:
-        raise ConfigError(f"ransac_plane: num_hypotheses must be at least 1, got {num_hypotheses}")
+    require_length("ransac_plane", "distance", distance)
+    require_count("ransac_plane", "num_hypotheses", num_hypotheses)
     if max_tilt is not None and up is None:
         raise ConfigError(
             "ransac_plane: max_tilt is an angle from up, but up was not given; pass up=(0, 0, 1) or the like"

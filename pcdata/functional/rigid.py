@@ -41,8 +41,15 @@ def rotation_about_axis(axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return (..., 3, 3) float64 rotations from (..., 4) quaternions in (x, y, z, w) order, normalised first."""
-    x, y, z, w = (quaternion.double() / quaternion.double().norm(dim=-1, keepdim=True)).unbind(-1)
+    """Return (..., 3, 3) float64 rotations from (..., 4) quaternions in (x, y, z, w) order, normalised first.
+
+    Raises:
+        PoseError: a quaternion of length 0, or not finite.
+    """
+    length = quaternion.double().norm(dim=-1, keepdim=True)
+    if not bool(((length > 0) & torch.isfinite(length)).all()):
+        raise PoseError("rotation_from_quaternion: a quaternion has length 0 or is not finite; it stands for no rotation")
+    x, y, z, w = (quaternion.double() / length).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),

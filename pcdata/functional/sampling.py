@@ -17,6 +17,7 @@ _TILE = 1024
 
 
 @op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
 def farthest_point_sample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -26,11 +27,14 @@ def farthest_point_sample(
 ) -> tuple[Tensor, Tensor]:  # index (M,) int64 rows of points, ptr (B+1,)
     """Pick points one by one, each the farthest from those already picked, starting at each cloud's first point.
 
-    Exact, in picking order, and always distinct rows: repeats of a point are taken only when nothing else is left, lowest
-    row first. Ties go to the lowest row. Squared distance is ((dx*dx) + (dy*dy)) + (dz*dz) in float32.
+    Exact, in picking order, and always distinct rows: repeats of a point are taken only when nothing else is left,
+    lowest row first. Ties go to the lowest row. Squared distance is ((dx*dx) + (dy*dy)) + (dz*dz) in float32.
 
     Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
         num_samples: one count for every cloud, or one per cloud (B,).
+        backend: which body to run; see :mod:`pcdata.dispatch`.
 
     Raises:
         TooFewPointsError: a cloud has fewer points than asked for.
@@ -54,8 +58,8 @@ def random_sample_index(
 ) -> tuple[Tensor, Tensor]:  # index (M,) int64 rows, ptr (B+1,)
     """Pick rows of each cloud uniformly at random, in random order, without repeats unless ``replace``.
 
-    Without replacement it is the start of one permutation per cloud, so more samples extend fewer. Drawn on the CPU from
-    each cloud's own seed: the same rows alone or in a batch, and on any device.
+    Without replacement it is the start of one permutation per cloud, so more samples extend fewer. Drawn on the CPU
+    from each cloud's own seed: the same rows alone or in a batch, and on any device.
 
     Raises:
         TooFewPointsError: a cloud has fewer rows than asked for (with ``replace``: none at all).

@@ -16,6 +16,7 @@ from torch import Tensor
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
 from pcdata.functional.groups import group_count, group_first, group_sum
+from pcdata.functional.parameters import require_count
 from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
 
 # Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
@@ -28,6 +29,7 @@ _SIZE_TOLERANCE = 1e-6
 
 
 @op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
 def voxel_downsample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -38,11 +40,14 @@ def voxel_downsample(
     """Replace the points of each voxel by their mean; ``inverse[i]`` is the row of ``means`` that point i went into.
 
     Voxels are ordered by the lowest row they contain. The mean is
-    ``origin + (voxel + mean offset) * voxel_size`` with offsets summed in fixed point (2^-31 of a voxel), so neither the
-    order of the points nor the device changes a bit of it.
+    ``origin + (voxel + mean offset) * voxel_size`` with offsets summed in fixed point (2^-31 of a voxel), so neither
+    the order of the points nor the device changes a bit of it.
 
     Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
         voxel_size: edge length in the unit of the points; one, or one per cloud (B,).
+        backend: which body to run; see :mod:`pcdata.dispatch`.
 
     Raises:
         ConfigError: a voxel size that is not positive.
@@ -62,6 +67,7 @@ def voxel_downsample(
 
 
 @op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
 def find_voxel_size(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -76,10 +82,10 @@ def find_voxel_size(
 
     Raises:
         TooFewPointsError: a cloud has fewer than ``num_points`` distinct points.
+        ConfigError: ``num_points`` is less than 1.
     """
     assert ptr is not None
-    if num_points < 1:
-        raise ConfigError(f"find_voxel_size: num_points must be at least 1, got {num_points}")
+    require_count("find_voxel_size", "num_points", num_points)
     bounds = ptr.tolist()
     sizes = [_search_size(points[a:b], num_points, cloud) for cloud, (a, b) in enumerate(pairwise(bounds))]
     return torch.tensor(sizes, dtype=torch.float64, device=points.device)
@@ -154,7 +160,7 @@ def _search_size(points: Tensor, num_points: int, cloud: int) -> float:
         raise TooFewPointsError(
             f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {distinct} distinct ones"
         )
-    extent = float((points.amax(0) - points.amin(0)).double().max())
+    extent = float((points.amax(0).double() - points.amin(0)).max())
     too_large = 3.0 * extent or 1.0  # everything lies in one voxel
     if num_points == 1:
         return too_large
@@ -197,8 +203,8 @@ def _scale_to_grid(points: Tensor, ptr: Tensor, sizes: Tensor) -> tuple[Tensor, 
     if len(points) and float(scaled.max()) >= _MAX_VOXELS_PER_AXIS:
         worst = int(cloud[scaled.amax(1).argmax()])
         raise UnitError(
-            f"voxel_downsample: cloud {worst} spans {float(scaled.max()):.3g} voxels of {float(sizes[worst]):g}, more than "
-            "2^53; is the voxel size in the unit of the points, and are there stray points?"
+            f"voxel_downsample: cloud {worst} spans {float(scaled.max()):.3g} voxels of {float(sizes[worst]):g}, more "
+            "than 2^53; is the voxel size in the unit of the points, and are there stray points?"
         )
     return cloud, origin, scaled
 
@@ -222,7 +228,7 @@ def _rank(values: Tensor) -> tuple[Tensor, int]:
 
 
 def _group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
-    """Number equal keys in the order they first appear; return (N,) group of each row and (G,) first row of each group."""
+    """Number equal keys by first appearance; return the group of each row (N,) and the first row of each group (G,)."""
     group, num_groups = _rank(key)
     first, order = group_first(group, num_groups).sort()
     position = torch.empty_like(order)

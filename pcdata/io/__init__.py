@@ -1,0 +1,37 @@
+"""Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
+
+from pcdata.io.calibration import (
+    Calibration,
+    read_calibration,
+    read_intrinsics,
+    read_pose,
+    write_calibration,
+    write_pose,
+)
+from pcdata.io.detect import LAYOUTS, open_source
+from pcdata.io.images import read_color, read_depth, read_labels, read_mask, write_color, write_depth
+from pcdata.io.pcd import read_pcd, write_pcd
+from pcdata.io.ply import read_ply, write_ply
+from pcdata.io.source import Source
+
+__all__ = [
+    "LAYOUTS",
+    "Calibration",
+    "Source",
+    "open_source",
+    "read_calibration",
+    "read_color",
+    "read_depth",
+    "read_intrinsics",
+    "read_labels",
+    "read_mask",
+    "read_pcd",
+    "read_ply",
+    "read_pose",
+    "write_calibration",
+    "write_color",
+    "write_depth",
+    "write_pcd",
+    "write_ply",
+    "write_pose",
+]

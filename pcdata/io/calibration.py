@@ -43,7 +43,9 @@ class Calibration:
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a JSON file such as::
+    """Read the intrinsics of one camera from a JSON file.
+
+    Such as::
 
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
@@ -84,7 +86,7 @@ def write_calibration(path: str | os.PathLike[str], calibration: Calibration) ->
     camera = calibration.camera
     k = camera.intrinsics[0].tolist()
     if camera.num_views != 1 or k[0][1] != 0.0:
-        raise CaptureError(f"{where}: the file describes one camera without skew, got {camera!r}; write one file per view")
+        raise CaptureError(f"{where}: the file describes one camera without skew, got {camera!r}; write one per view")
     data: dict[str, Any] = {"width": camera.size[1], "height": camera.size[0]}
     data |= {"fx": k[0][0], "fy": k[1][1], "cx": k[0][2], "cy": k[1][2]}
     if camera.distortion is not None:
@@ -131,7 +133,7 @@ def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
         except (OSError, ValueError, EOFError, SyntaxError, TypeError) as error:
             raise CaptureError(f"{where}: not a readable .npy file of numbers: {error}") from error
         if not isinstance(matrix, np.ndarray) or matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu":
-            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {getattr(matrix, 'shape', matrix)}")
+            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {np.shape(matrix)}")
         pose = torch.from_numpy(matrix.astype(np.float64))
     else:
         values = _numbers(where, read_text(where, path))

@@ -55,7 +55,7 @@ def to_cloud(
     rows = slice(None) if keep.all() else keep
     points = _metres(where, arrays.xyz[rows], metres_per_unit)
     unit = 1.0 if metres_per_unit is None else metres_per_unit
-    extra = {}
+    extra: dict[str, torch.Tensor] = {}
     for name, values in arrays.extra.items():
         name = _free_name(name, extra)
         extra[name] = _tensor(f"{where}: field {name!r}", values[rows])
@@ -89,9 +89,12 @@ def from_cloud(where: str, cloud: PointCloud) -> CloudArrays:
     moving = [name for name, kind in cloud.kinds.items() if kind is not Kind.INVARIANT]
     if moving:
         raise CaptureError(
-            f"{where}: the file cannot say that {', '.join(moving)} move with the cloud, so a later step would leave them "
-            "behind; drop them with with_fields(name=None), or keep the cloud in a cache"
+            f"{where}: the file cannot say that {', '.join(moving)} move with the cloud, so a later step would leave "
+            "them behind; drop them with with_fields(name=None), or keep the cloud in a cache"
         )
+    foreign = [name for name in cloud.extra if not name.isascii()]
+    if foreign:
+        raise CaptureError(f"{where}: field names must be ASCII in a file, got {', '.join(foreign)}; rename them")
     core = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals}
     check_tensors(where, core, dict.fromkeys(core, "N 3"))
     rgb = None
@@ -166,7 +169,7 @@ def _whole(where: str, labels: NDArray[Any]) -> NDArray[np.int64]:
     if labels.ndim != 1:
         raise CaptureError(f"{where}: a label must be one number per point, got {labels.shape[1]}")
     if labels.dtype.kind == "f" and not (np.isfinite(labels).all() and (labels == np.rint(labels)).all()):
-        raise CaptureError(f"{where}: labels must be whole numbers, but some are not; rename the field if it is a score")
+        raise CaptureError(f"{where}: labels must be whole numbers, but some are not; rename the field if a score")
     if labels.dtype.kind != "i" and len(labels) and not labels.max() < 2**63:
         raise CaptureError(f"{where}: labels reach {labels.max()}, above what int64 holds")
     return labels.astype(np.int64)
@@ -182,8 +185,12 @@ def _tensor(where: str, values: NDArray[Any]) -> torch.Tensor:
 
 
 def _array(where: str, value: torch.Tensor) -> NDArray[Any]:
-    if value.ndim > 2 or value.dtype in (torch.bfloat16, torch.float16) or value.is_complex():
-        raise DTypeError(f"{where}: a file holds (N,) or (N, C) integers or floats of 32 or 64 bits, got {value.dtype}")
+    odd_type = value.dtype in (torch.bfloat16, torch.float16) or value.is_complex()
+    if odd_type or value.ndim > 2 or 0 in value.shape[1:]:
+        raise DTypeError(
+            f"{where}: a file holds (N,) or (N, C) integers or floats of 32 or 64 bits, "
+            f"got {value.dtype} {tuple(value.shape)}"
+        )
     array: NDArray[Any] = value.detach().cpu().numpy()
     return array.astype(np.uint8) if array.dtype == bool else array
 

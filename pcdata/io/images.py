@@ -94,10 +94,10 @@ def _read_raw_depth(where: str, path: Path) -> NDArray[Any]:
         return pixels
     if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit grey PNG as 32-bit integers
         return pixels.astype(np.uint16)
-    found = {"L": "8-bit grey", "P": "palette", "1": "1-bit", "RGB": "colour", "RGBA": "colour with alpha"}.get(mode, mode)
+    words = {"L": "8-bit grey", "P": "palette", "1": "1-bit", "RGB": "colour", "RGBA": "colour with alpha"}
     raise CaptureError(
-        f"{where}: a depth image must be 16-bit grey, but this is a {found} image; is it a picture of the depth made for "
-        "viewing? Its values are no lengths: export the raw 16-bit depth"
+        f"{where}: a depth image must be 16-bit grey, but this is a {words.get(mode, mode)} image; is it a picture of "
+        "the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
     )
 
 
@@ -111,7 +111,7 @@ def _read_npy(where: str, path: Path) -> NDArray[Any]:
         raise CaptureError(f"{where}: depth must be one image (H, W), got shape {array.shape}; save one file per view")
     _check_pixels(where, array.shape[1], array.shape[0])
     if array.dtype.newbyteorder("=") not in (np.uint16, np.float32, np.float64):
-        raise CaptureError(f"{where}: depth must be uint16, float32 or float64, got {array.dtype}; convert it explicitly")
+        raise CaptureError(f"{where}: depth must be uint16, float32 or float64, got {array.dtype}; convert it")
     return np.array(array, dtype=array.dtype.newbyteorder("="))
 
 
@@ -280,8 +280,8 @@ def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDAr
             head = stream.read(26)
         with Image.open(path, formats=formats) as image:
             _check_pixels(where, *image.size)
-            if getattr(image, "n_frames", 1) != 1:
-                raise CaptureError(f"{where}: must hold one image, but holds {image.n_frames}; save one file each")
+            if (number := getattr(image, "n_frames", 1)) != 1:
+                raise CaptureError(f"{where}: must hold one image, but holds {number}; save one file each")
             image.load()
             pixels = np.asarray(image)
             mode, is_png = image.mode, image.format == _PNG

@@ -1,7 +1,7 @@
 """LZF, the compression inside ``binary_compressed`` PCD files.
 
-A stream is a row of tokens. A control byte c < 32 is followed by c+1 literal bytes; otherwise its upper three bits are a
-length (7 = add the next byte) plus 2, and its lower five with the byte after them an offset minus 1 back into the output.
+A stream is a row of tokens. A control byte c < 32 is followed by c+1 literal bytes; otherwise its upper three bits are
+a length (7 = add the next byte) plus 2, and its lower five with the byte after them an offset back into the output.
 
 The work is done by liblzf, which every h5py build carries as the HDF5 filter "lzf": the stream is put into (or taken
 from) the only chunk of a data set in memory. That is 15 times faster than the loop in Python, and bounds-checked in C.
@@ -25,8 +25,8 @@ _GUARD = 16  # bytes
 def decompress(stream: bytes, size: int) -> NDArray[np.uint8]:
     """Return the ``size`` bytes that an LZF stream stands for.
 
-    HDF5 says nothing of a stream that yields too few or too many bytes. So a literal token of random bytes is put behind
-    the stream: it lies at the very end of the output exactly when all that precedes it yields ``size`` bytes.
+    HDF5 says nothing of a stream that yields too few or too many bytes. So a literal token of random bytes is put
+    behind the stream: it lies at the very end of the output exactly when all that precedes it yields ``size`` bytes.
 
     Raises:
         CaptureError: the stream is damaged, or does not yield exactly ``size`` bytes.

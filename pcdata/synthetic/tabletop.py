@@ -99,7 +99,7 @@ def tabletop(
 
     Args:
         seed: names the scene.
-        num_objects: boxes, cylinders and spheres in turn; about 25 fit.
+        num_objects: boxes, cylinders and spheres mixed; 30 fit.
         num_views: how many cameras; ignored where ``world_from_camera`` is given.
         noise: a sensor model, "stereo" for its defaults, "none" or None for exact depth.
         size: (height, width) in pixels; ignored where ``camera`` is given.

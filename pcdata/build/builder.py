@@ -1,0 +1,185 @@
+"""Build a dataset: run the deterministic steps once on every capture and store the result, all or nothing."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+import pcdata
+from pcdata.build.config import BuildConfig
+from pcdata.build.loading_script import loading_script
+from pcdata.errors import CacheError, CaptureError, add_note
+from pcdata.io.folder import write_capture
+from pcdata.io.manifest import Manifest, Sample, key_of
+from pcdata.io.record import record_from_cloud
+from pcdata.io.stores import STORES
+from pcdata.structures import DepthFrame, PointCloud
+
+Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
+
+
+class Source(Protocol):
+    """Where captures come from; :func:`pcdata.open_source` returns one."""
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids."""
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one capture."""
+
+
+@dataclass(frozen=True)
+class BuiltSample:
+    """What happened to one capture."""
+
+    id: str
+    entered_at: str  # the first pipeline section that ran: "depth" or "cloud"
+    counts: list[tuple[str, int]]  # step name -> points after it, over all clouds of the sample
+    seconds: float
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What a build did."""
+
+    folder: Path
+    samples: list[BuiltSample] = field(default_factory=list)
+
+
+def build_dataset(
+    config: BuildConfig,
+    source: Source,
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> BuildReport:
+    """Store every capture of a source as the pipeline's deterministic steps leave it.
+
+    The dataset appears under its name only when it is complete: everything is written to a hidden neighbour first, and
+    a failure removes that and leaves what was there before.
+
+    Args:
+        config: pipeline, storage and loader settings; see :func:`pcdata.load_config`.
+        source: the captures; see :func:`pcdata.open_source`.
+        folder: where the dataset goes.
+        overwrite: replace a dataset that is there already; anything else is never replaced.
+        progress: called after every capture.
+
+    Raises:
+        CacheError: the folder exists, or cannot be written.
+        PcdataError: a capture or a step failed; the note names the sample, the step and its input.
+    """
+    folder = Path(folder)
+    _check_target(folder, overwrite)
+    if not source.ids:
+        raise CaptureError(f"{source!r} has no captures to build from")
+    report = BuildReport(folder)
+    with _complete_or_nothing(folder) as partial:
+        samples = _write_samples(config, source, partial, report, progress)
+        manifest = Manifest(
+            format=config.output.format,
+            compression=config.output.compression,
+            fingerprint=config.pipeline.fingerprint(),
+            pipeline=config.pipeline.to_config(),
+            samples=samples,
+            versions={
+                "pcdata": pcdata.__version__,
+                "torch": str(torch.__version__),
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+        )
+        (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
+        (partial / "load.py").write_text(loading_script(config.loader), encoding="utf-8")
+        manifest.write(partial)
+    return report
+
+
+def _write_samples(
+    config: BuildConfig, source: Source, partial: Path, report: BuildReport, progress: Progress | None
+) -> list[Sample]:
+    store = STORES[config.output.format](partial, config.output.compression)
+    prefix = config.pipeline.deterministic_prefix()
+    written = []
+    try:
+        for position, sample_id in enumerate(source.ids):
+            started = time.perf_counter()
+            try:
+                capture = source.load(sample_id)
+                cloud = _with_sample_id(prefix(capture), sample_id)
+                record = record_from_cloud(cloud)
+                key = key_of(sample_id)
+                store.write(key, record)
+                if config.output.keep_raw:
+                    _keep_raw(capture, partial / "raw" / key)
+            except Exception as error:
+                add_note(error, f"sample {sample_id!r} of {source!r}")
+                raise
+            written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
+            report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))
+            if progress is not None:
+                progress(position + 1, len(source.ids), sample_id)
+    finally:
+        store.close()
+    return written
+
+
+def _with_sample_id(cloud: PointCloud, sample_id: str) -> PointCloud:
+    return cloud.with_meta([{"sample_id": sample_id}] * cloud.num_clouds)
+
+
+def _keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:
+    if not isinstance(capture, DepthFrame):
+        raise CaptureError("output.keep_raw is on, but this source gives clouds: there is no depth image to keep")
+    write_capture(capture, folder)
+
+
+def _built_sample(sample_id: str, capture: Any, cloud: PointCloud, seconds: float) -> BuiltSample:
+    counts: dict[int, tuple[str, int]] = {}
+    for history in cloud.history:
+        for position, step in enumerate(history):
+            if "points" in step:
+                before = counts.get(position, (step["step"], 0))[1]
+                counts[position] = (step["step"], before + step["points"])
+    entered = "depth" if isinstance(capture, DepthFrame) else "cloud"
+    return BuiltSample(sample_id, entered, [counts[position] for position in sorted(counts)], seconds)
+
+
+def _check_target(folder: Path, overwrite: bool) -> None:
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not overwrite:
+        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting")
+    Manifest.read(folder)  # only a dataset may be overwritten, never somebody's files
+
+
+@contextmanager
+def _complete_or_nothing(folder: Path) -> Iterator[Path]:
+    """Give a hidden neighbour to write into; rename it into place at the end, remove it on any failure."""
+    partial = folder.with_name(f".{folder.name}.partial-{platform.node()}-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise CacheError(f"{folder}: cannot write there: {error}") from error
+    try:
+        yield partial
+        retired = folder.with_name(f".{folder.name}.retired-{platform.node()}-{os.getpid()}")
+        if folder.exists():
+            os.replace(folder, retired)
+        os.replace(partial, folder)
+        shutil.rmtree(retired, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise

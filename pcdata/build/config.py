@@ -1,0 +1,98 @@
+"""The build configuration: pipeline sections, and how the result is stored and loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from annotated_types import Ge
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pcdata.errors import near_matches
+from pcdata.io.stores import COMPRESSIONS, Compression, Format
+from pcdata.transforms.config import read_config
+from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
+from pcdata.transforms.yaml_nodes import YamlDocument, node_at
+
+Collate = Literal["packed", "padded", "fixed"]
+
+
+class Output(BaseModel):
+    """How clouds are stored."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Format = "hdf5"
+    compression: Compression = "none"  # lzf (hdf5) or gzip; reads are 2-4 times faster without
+    keep_raw: bool = False  # also deliver depth, colour and calibration beside the clouds
+
+
+class Loader(BaseModel):
+    """What the loading script written into the dataset does."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    batch_size: Annotated[int, Ge(1)] = 8
+    num_workers: Annotated[int, Ge(0)] = 2
+    collate: Collate = "packed"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """A parsed configuration file."""
+
+    pipeline: Pipeline
+    output: Output
+    loader: Loader
+
+
+_SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
+
+
+def load_config(path: str | Path) -> BuildConfig:
+    """Read a YAML file with the sections depth, cloud, augment, output and loader, each optional.
+
+    Raises:
+        ConfigError: every fault, as ``file:line:column: what``.
+    """
+    return config_from_yaml(read_config(path), name=str(path))
+
+
+def config_from_yaml(text: str, *, name: str = "<yaml>") -> BuildConfig:
+    """Parse the text of a configuration; see :func:`load_config`."""
+    document = YamlDocument(text, name)
+    entries = document.mapping(document.root, "a configuration")
+    known = [*SECTIONS, *_SETTINGS]
+    for section, (key, _) in entries.items():
+        if section not in known:
+            document.fault(key, f"unknown section {section!r}{near_matches(section, known) or f'; known: {known}'}")
+    settings = {
+        section: _settings(document, model, entries[section][1] if section in entries else None)
+        for section, model in _SETTINGS.items()
+    }
+    output = settings["output"]
+    if output is not None and output.compression not in COMPRESSIONS[output.format]:
+        known_here = ", ".join(COMPRESSIONS[output.format])
+        document.fault(entries["output"][1], f"format {output.format} knows compression {known_here}, not {output.compression}")
+    pipeline = pipeline_from_document(document, entries)
+    return BuildConfig(pipeline, settings["output"], settings["loader"])
+
+
+def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | None) -> Any:
+    entries = document.mapping(node, model.__name__.lower())
+    values = {key: document.plain(value) for key, (_, value) in entries.items()}
+    try:
+        return model(**values)
+    except ValidationError as error:
+        for fault in error.errors():
+            name = str(fault["loc"][0])
+            if fault["type"] == "extra_forbidden":
+                hint = near_matches(name, model.model_fields) or f"; known: {', '.join(model.model_fields)}"
+                document.fault(entries[name][0], f"{model.__name__.lower()}.{name}: no such setting{hint}")
+            else:
+                place = node_at(entries[name][1], fault["loc"][1:]) if name in entries else node
+                document.fault(place, f"{model.__name__.lower()}.{name}: {fault['msg']} (got {fault['input']!r})")
+        return None

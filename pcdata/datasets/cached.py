@@ -1,0 +1,67 @@
+"""CachedCloudDataset: clouds that a build stored, with the random rest of the pipeline on the fly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pcdata.datasets.samples import SampleDataset
+from pcdata.errors import CacheError
+from pcdata.io.manifest import Manifest
+from pcdata.io.record import cloud_from_record
+from pcdata.io.stores import STORES
+from pcdata.structures import PointCloud
+from pcdata.transforms import Transform
+from pcdata.transforms.pipeline import Pipeline
+
+
+class CachedCloudDataset(SampleDataset):
+    """Read a dataset that ``pcdata build`` wrote.
+
+    The stored clouds are the longest deterministic prefix of the pipeline; the random suffix runs on each sample as it
+    is read.
+
+    Args:
+        folder: the dataset's folder.
+        pipeline: the pipeline you expect; a cache made by other deterministic steps is refused. None = trust the
+            cache's own.
+        augment: what runs on the stored clouds: "stored" = the random suffix of the pipeline, None = nothing, or any
+            transform.
+        seed: of all random draws, together with the epoch and the sample id.
+
+    Raises:
+        CacheError: damaged, hostile or incomplete files, or another pipeline's cache.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        pipeline: Pipeline | None = None,
+        augment: Transform | Literal["stored"] | None = "stored",
+        seed: int = 0,
+    ) -> None:
+        self.folder = Path(folder)
+        self.manifest = Manifest.read(folder)
+        stored = Pipeline.from_config(self.manifest.pipeline)
+        wanted = stored if pipeline is None else pipeline
+        if wanted.fingerprint() != self.manifest.fingerprint:
+            raise CacheError(
+                f"{folder}: the cache was made by other deterministic steps than the ones given "
+                f"(fingerprint {self.manifest.fingerprint[:12]}, expected {wanted.fingerprint()[:12]}): "
+                f"{wanted.difference(stored)}; rebuild it with this pipeline, or load it with its own"
+            )
+        self.pipeline = wanted
+        transform = wanted.random_suffix() if isinstance(augment, str) else augment
+        super().__init__([sample.id for sample in self.manifest.samples], transform, seed)
+        self._store = STORES[self.manifest.format](self.folder)
+
+    def _load(self, index: int) -> PointCloud:
+        sample = self.manifest.samples[index]
+        record = self._store.read(sample.key)
+        if record.digest() != sample.digest:
+            raise CacheError(f"{self.folder}: sample {sample.id!r} differs from what was written; rebuild the dataset")
+        return cloud_from_record(record)
+
+    def __repr__(self) -> str:
+        return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples, {self.manifest.format})"

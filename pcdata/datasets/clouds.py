@@ -1,0 +1,40 @@
+"""CloudDataset: captures, processed on the fly."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from pcdata.datasets.samples import SampleDataset
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms import Transform
+
+
+class CaptureSource(Protocol):
+    """Anything with ids that loads a capture or a cloud by id; :func:`pcdata.open_source` returns one."""
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids, unique and in a fixed order."""
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one sample."""
+
+
+class CloudDataset(SampleDataset):
+    """Load captures from a source and run a transform on each, every time it is asked for.
+
+    Args:
+        source: where captures come from.
+        transform: from what the source gives to a ``PointCloud``; may be random.
+        seed: of all random draws, together with the epoch and the sample id.
+    """
+
+    def __init__(self, source: CaptureSource, transform: Transform | None = None, *, seed: int = 0) -> None:
+        super().__init__(source.ids, transform, seed)
+        self.source = source
+
+    def _load(self, index: int) -> DepthFrame | PointCloud:
+        return self.source.load(self.ids[index])
+
+    def __repr__(self) -> str:
+        return f"CloudDataset({self.source!r}, {len(self)} samples)"

@@ -1,0 +1,59 @@
+"""What every dataset of clouds shares: ids, epochs, and draws that belong to the sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch.utils.data import Dataset
+
+from pcdata.errors import ConfigError, DTypeError, add_note
+from pcdata.rng import generator_for
+from pcdata.structures import PointCloud
+from pcdata.transforms import Transform
+
+
+class SampleDataset(Dataset[PointCloud]):
+    """Samples by index; random steps draw from (seed, epoch, sample id) alone.
+
+    So the same sample comes out of the main process, or of any worker of any number of workers.
+    """
+
+    def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int) -> None:
+        if len(set(ids)) != len(ids):
+            raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
+        self.ids = list(ids)
+        self.transform = transform
+        self.seed = seed
+        # Shared memory: workers that live through several epochs see the change too.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that random draws are keyed by."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Change the random draws; call it before each epoch, also with persistent workers."""
+        self._epoch.fill_(epoch)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> PointCloud:
+        sample_id = self.ids[index]
+        try:
+            data = self._load(index)
+            if self.transform is not None:
+                data = self.transform(data, generator=generator_for(self.seed, self.epoch, sample_id))
+            if not isinstance(data, PointCloud):
+                raise DTypeError(f"the dataset gives a {type(data).__name__}; its transform must end in a PointCloud")
+            return data
+        except Exception as error:
+            add_note(error, f"sample {sample_id!r} of {self!r}")
+            raise
+
+    def _load(self, index: int) -> Any:
+        """Load the sample before the transform."""
+        raise NotImplementedError

@@ -1,0 +1,179 @@
+"""DBSCAN on ragged batches in linear memory, label for label as Open3D gives them.
+
+Source: Ester et al., A density-based algorithm for discovering clusters, KDD 1996; cells as in Gunawan, A faster
+algorithm for DBSCAN, 2013: core points of one cell are one cluster, so only cells need joining.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import op
+from pcdata.functional.boxtree import box_gap, expand_ranges, sum_of_squares
+from pcdata.functional.cells import Cells
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.nearest import largest_squared, nearest_chunks
+from pcdata.functional.parameters import check_grid, require_count, require_length
+from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, ptr_from_counts
+
+_SAMPLES = 4  # points per cell in the quick test; 16 distances join nearly all neighbouring cells
+_PAIRS_PER_CHUNK = 1 << 15
+_ROWS_PER_CHUNK = 1 << 18
+
+
+@op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
+def dbscan(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    eps: float = 0.02,
+    min_points: int = 50,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> Tensor:  # (N,) int64 label, -1 = noise
+    """Cluster each cloud by density; labels start at 0 in every cloud.
+
+    A core point has at least ``min_points`` points, itself included, with d < eps (strict, as
+    ``d2 < float32(eps) * float32(eps)``). Core points with d < eps share a cluster; clusters are numbered by their
+    lowest core row. A border point takes the lowest label among the core points in its reach; all else is noise.
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers of the points.
+        eps: in the unit of the points.
+        min_points: neighbours that make a core point, itself included.
+        grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+        ConfigError: min_points is less than 1, eps is not a positive length, or it is too small for the extent of a
+            cloud (see :class:`pcdata.functional.cells.Cells`).
+    """
+    assert ptr is not None  # @op fills it
+    require_count("dbscan", "min_points", min_points)
+    require_length("dbscan", "eps", eps)
+    check_grid("dbscan", grid, points, ptr)
+    core = _core_mask(points, ptr, float(eps), min_points)
+    label = torch.full_like(core, -1, dtype=torch.int64)
+    core_rows, core_ptr = core.nonzero().squeeze(1), ptr_after_mask(core, ptr)
+    if len(core_rows) == 0:
+        return label
+    cells = Cells.within("dbscan", points[core_rows], core_ptr, eps)
+    component = _join(cells, points[core_rows], float(eps))[cells.cell]
+    label[core_rows] = _number(component, core_rows, ptr)
+    return _label_borders(label, points, ptr, core, float(eps), min_points)
+
+
+def _core_mask(points: Tensor, ptr: Tensor, eps: float, min_points: int) -> Tensor:
+    """Return (N,) bool: at least ``min_points`` points within eps; a crowded cell needs no distances."""
+    core = Cells.within("dbscan", points, ptr, eps).crowd() >= min_points
+    rows = (~core).nonzero().squeeze(1)
+    if len(rows):
+        queries = {"queries": points[rows], "queries_ptr": ptr_after_mask(~core, ptr)}
+        for near in nearest_chunks(points, ptr, min_points, radius=eps, **queries):
+            core[rows[near.query]] = near.found.all(1)
+    return core
+
+
+def _label_borders(label: Tensor, points: Tensor, ptr: Tensor, core: Tensor, eps: float, min_points: int) -> Tensor:
+    """Give points that are not core the lowest label of the core points in reach: they have fewer than min_points."""
+    rows = (~core).nonzero().squeeze(1)
+    if len(rows) == 0:
+        return label
+    none = len(label)  # above every label
+    offered = torch.cat([torch.where(core, label, none), label.new_full((1,), none)])
+    queries = {"queries": points[rows], "queries_ptr": ptr_after_mask(~core, ptr)}
+    for near in nearest_chunks(points, ptr, min_points, radius=eps, **queries):
+        lowest = offered[near.index].amin(1)
+        label[rows[near.query]] = torch.where(lowest == none, -1, lowest)
+    return label
+
+
+def _number(component: Tensor, rows: Tensor, ptr: Tensor) -> Tensor:
+    """Return labels 0, 1, ... per cloud for components of rows, in the order of their lowest row."""
+    lowest = torch.full_like(component, ptr[-1].item()).scatter_reduce_(0, component, rows, "amin")
+    starts, cluster = torch.unique(lowest[component], return_inverse=True)
+    return cluster - torch.searchsorted(starts, ptr[cloud_of_rows(ptr)[rows]])
+
+
+def _join(cells: Cells, points: Tensor, eps: float) -> Tensor:
+    """Return (C,) int64: cells whose points are linked by steps d < eps share a number."""
+    limit = largest_squared(eps, points.device)
+    order = torch.argsort(cells.cell, stable=True)
+    members, start = points[order], ptr_from_counts(cells.count)
+    index = cells.cell[order][:, None].expand(-1, 3)
+    low = points.new_full((len(cells), 3), torch.inf).scatter_reduce_(0, index, members, "amin")
+    high = points.new_full((len(cells), 3), -torch.inf).scatter_reduce_(0, index, members, "amax")
+    slot = torch.arange(_SAMPLES, device=points.device)
+    sample = members[start[:-1, None] + cells.count[:, None] * slot // _SAMPLES]  # repeats in a small cell
+
+    parent = torch.arange(len(cells), device=points.device)
+    open_pairs = []
+    for pairs in cells.neighbor_pairs():
+        for a, b in zip(pairs[0].split(_PAIRS_PER_CHUNK), pairs[1].split(_PAIRS_PER_CHUNK)):
+            apart = parent[a] != parent[b]
+            a, b = a[apart], b[apart]
+            near = box_gap(low[a], high[a], low[b], high[b]) <= limit
+            a, b = a[near], b[near]
+            squared = sum_of_squares(sample[a][:, :, None] - sample[b][:, None, :])
+            linked = (squared <= limit).flatten(1).any(1)
+            parent = _merge(parent, a[linked], b[linked])
+            tested_all = (cells.count[a] <= _SAMPLES) & (cells.count[b] <= _SAMPLES)
+            open_pairs.append(torch.stack([a, b])[:, ~linked & ~tested_all])
+    for a, b in _chunks_by_size(torch.cat(open_pairs, 1), cells.count):
+        apart = parent[a] != parent[b]
+        a, b = a[apart], b[apart]
+        if len(a) == 0:
+            continue
+        linked = _any_within(members, start, low, high, a, b, eps)
+        parent = _merge(parent, a[linked], b[linked])
+    return parent
+
+
+def _any_within(
+    members: Tensor, start: Tensor, low: Tensor, high: Tensor, a: Tensor, b: Tensor, eps: float
+) -> Tensor:
+    """Return (P,) bool: some point of cell a[i] has d < eps to some point of cell b[i]."""
+    limit = largest_squared(eps, members.device)
+    sides = []
+    for mine, other in ((a, b), (b, a)):
+        pair, row = expand_ranges(start[mine], start[mine + 1] - start[mine], torch.arange(len(a), device=a.device))
+        point = members[row]
+        near = box_gap(point, point, low[other[pair]], high[other[pair]]) <= limit
+        counts = torch.bincount(pair[near], minlength=len(a))
+        sides.append((point[near], ptr_from_counts(counts)))
+    linked = torch.zeros(len(a), dtype=torch.bool, device=a.device)
+    (queries, queries_ptr), (targets, targets_ptr) = sides
+    pair_of_query = cloud_of_rows(queries_ptr)
+    # Each pair of cells is one ragged cloud: targets from one cell, queries from the other.
+    for near_points in nearest_chunks(targets, targets_ptr, 1, queries=queries, queries_ptr=queries_ptr, radius=eps):
+        linked[pair_of_query[near_points.query[near_points.found[:, 0]]]] = True
+    return linked
+
+
+def _chunks_by_size(pairs: Tensor, count: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield (2, P) pairs of cells in pieces that hold a bounded number of points."""
+    chunk = torch.cumsum(count[pairs[0]] + count[pairs[1]], 0) // _ROWS_PER_CHUNK
+    for piece in pairs.split(torch.unique_consecutive(chunk, return_counts=True)[1].tolist(), dim=1):
+        yield piece[0], piece[1]
+
+
+def _merge(parent: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Join the components of a[i] and b[i]; ``parent`` (C,) names each one by its lowest member, before and after.
+
+    Source: hooking and pointer jumping, Shiloach & Vishkin, An O(log n) parallel connectivity algorithm, 1982.
+    """
+    while True:
+        one, two = parent[a], parent[b]
+        apart = one != two
+        if not bool(apart.any()):
+            return parent
+        a, b, one, two = a[apart], b[apart], one[apart], two[apart]
+        parent = parent.scatter_reduce(0, torch.maximum(one, two), torch.minimum(one, two), "amin")
+        while not torch.equal(jumped := parent[parent], parent):
+            parent = jumped

@@ -1,0 +1,207 @@
+"""Surface normals from the covariance of the nearest points, without a batched eigensolver.
+
+Source: Hoppe et al., Surface reconstruction from unorganized points, 1992; the neighbourhood and the fallback are those
+of Open3D's ``estimate_normals`` with ``KDTreeSearchParamHybrid``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import op
+from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.nearest import nearest_chunks
+from pcdata.functional.parameters import check_grid, require_count, require_length
+
+
+@op(points="N 3", ptr="ptr N B")
+@torch.no_grad()
+def estimate_normals(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    radius: float = 0.02,
+    max_neighbors: int = 30,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> Tensor:  # (N, 3) float32, unit length
+    """Estimate each point's normal: the direction in which its neighbourhood varies least.
+
+    The neighbourhood is the nearest ``max_neighbors`` points with d < radius, the point itself included; its covariance
+    and eigenvectors are float64. Fewer than three neighbours, or all at one spot, give (0, 0, 1); points on a line give
+    some direction across the line. The sign is only a convention: the last component of (x, y, z) that is not 0 is
+    positive, so z >= 0; use :func:`orient_normals` to face the camera.
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers of the points.
+        radius: in the unit of the points.
+        max_neighbors: nearest points used at most.
+        grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+        ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
+    """
+    assert ptr is not None  # @op fills it
+    require_length("estimate_normals", "radius", radius)
+    require_count("estimate_normals", "max_neighbors", max_neighbors)
+    check_grid("estimate_normals", grid, points, ptr)
+    normals = torch.empty_like(points)
+    wide = points.double()
+    for near in nearest_chunks(points, ptr, max_neighbors, radius=float(radius)):
+        count = near.found.sum(1)
+        # A missing neighbour points at the query itself: offset 0 adds nothing to the sums below.
+        index = torch.where(near.found, near.index, near.query[:, None])
+        # Offsets from the query keep all digits however far the cloud lies from the origin.
+        offset = wide[index] - wide[near.query][:, None]
+        normal = _smallest_eigenvector(*_covariance(offset, count))
+        normal[count < 3] = normal.new_tensor([0.0, 0.0, 1.0])
+        normals[near.query] = _positive_last(normal).float()
+    return normals
+
+
+def orient_normals(
+    points: Tensor,  # (N, 3) float32
+    normals: Tensor,  # (N, 3) float32
+    viewpoint: Tensor,  # (N, 3) per point, or (3,) or (1, 3) for all; same frame as the points
+) -> Tensor:  # (N, 3) float32
+    """Flip each normal that faces away from the viewpoint: normal . (viewpoint - point) < 0, in float64.
+
+    A normal seen exactly edge-on (product 0) is kept as it is.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+    """
+    _check_viewpoint(points, normals, viewpoint)
+    facing = (normals.double() * (viewpoint.double() - points.double())).sum(-1, keepdim=True)
+    return torch.where(facing < 0, -normals, normals)
+
+
+def _check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None:
+    where = "orient_normals"
+    for name, value in (("points", points), ("normals", normals), ("viewpoint", viewpoint)):
+        if not isinstance(value, Tensor) or not value.dtype.is_floating_point:
+            raise DTypeError(f"{where}: {name} must be a float tensor, not {getattr(value, 'dtype', type(value))}")
+        if value.device != points.device:
+            raise DeviceError(f"{where}: {name} is on {value.device} but points is on {points.device}")
+        if not bool(torch.isfinite(value).all()):
+            raise NonFiniteError(f"{where}: {name} has NaN or infinite values; drop those points first")
+    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
+        raise ShapeError(
+            f"{where}: points and normals must both be (N, 3), got {tuple(points.shape)} and {tuple(normals.shape)}"
+        )
+    if tuple(viewpoint.shape) not in {(3,), (1, 3), tuple(points.shape)}:
+        raise ShapeError(
+            f"{where}: viewpoint must be (3,), (1, 3) or one per point {tuple(points.shape)}, "
+            f"got {tuple(viewpoint.shape)}"
+        )
+
+
+Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # xx, xy, xz, yy, yz, zz, each (m,) float64
+
+
+def _covariance(offset: Tensor, count: Tensor) -> Symmetric:
+    """Return the covariances of (m, k, 3) offsets, of which ``count`` (m,) are neighbours and the rest 0."""
+    number = count.clamp(min=1).double()
+    x, y, z = offset.unbind(-1)
+    mean_x, mean_y, mean_z = (axis.sum(1) / number for axis in (x, y, z))
+    xx = (x * x).sum(1) / number - mean_x * mean_x
+    xy = (x * y).sum(1) / number - mean_x * mean_y
+    xz = (x * z).sum(1) / number - mean_x * mean_z
+    yy = (y * y).sum(1) / number - mean_y * mean_y
+    yz = (y * z).sum(1) / number - mean_y * mean_z
+    zz = (z * z).sum(1) / number - mean_z * mean_z
+    return xx, xy, xz, yy, yz, zz
+
+
+def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Tensor, zz: Tensor) -> Tensor:
+    """Return the (m, 3) unit eigenvectors of the smallest eigenvalues of symmetric 3x3 matrices, in closed form.
+
+    The eigenvalue that stands clear of the other two gives its vector by a cross product; the next is found in the
+    plane across it; the third is their cross product. A zero matrix gives (0, 0, 1).
+
+    Source: Eberly, A robust eigensolver for 3x3 symmetric matrices, Geometric Tools, 2014-2023, the non-iterative
+    algorithm.
+    """
+    scale = torch.stack([xx, xy, xz, yy, yz, zz]).abs().amax(0)
+    safe = torch.where(scale > 0, scale, 1.0)
+    matrix = xx, xy, xz, yy, yz, zz = xx / safe, xy / safe, xz / safe, yy / safe, yz / safe, zz / safe
+    mean = (xx + yy + zz) / 3
+    dx, dy, dz = xx - mean, yy - mean, zz - mean
+    spread = ((dx * dx + dy * dy + dz * dz + 2 * (xy * xy + xz * xz + yz * yz)) / 6).sqrt()
+    is_isotropic = spread == 0
+    safe = torch.where(is_isotropic, 1.0, spread)
+    determinant = dx * (dy * dz - yz * yz) - xy * (xy * dz - yz * xz) + xz * (xy * yz - dy * xz)
+    half = (determinant / (safe * safe * safe) / 2).clamp(-1.0, 1.0)
+    angle = half.acos() / 3
+    largest = mean + spread * 2 * angle.cos()
+    smallest = mean + spread * 2 * (angle + 2 * math.pi / 3).cos()
+    middle = 3 * mean - largest - smallest
+
+    clear_is_largest = half >= 0
+    clear = _separate_eigenvector(matrix, torch.where(clear_is_largest, largest, smallest))
+    across = _eigenvector_across(matrix, clear, middle)
+    normal = torch.where(clear_is_largest[:, None], torch.linalg.cross(across, clear), clear)
+    return torch.where(is_isotropic[:, None], normal.new_tensor([0.0, 0.0, 1.0]), normal)
+
+
+def _separate_eigenvector(matrix: Symmetric, value: Tensor) -> Tensor:
+    """Return the unit eigenvector of a simple eigenvalue: the longest cross product of two rows of A - value."""
+    xx, xy, xz, yy, yz, zz = matrix
+    rows = [
+        torch.stack([xx - value, xy, xz], -1),
+        torch.stack([xy, yy - value, yz], -1),
+        torch.stack([xz, yz, zz - value], -1),
+    ]
+    products = torch.stack([torch.linalg.cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))], 1)
+    longest = products.square().sum(-1).argmax(1)
+    return _unit(products[torch.arange(len(longest), device=longest.device), longest])
+
+
+def _eigenvector_across(matrix: Symmetric, clear: Tensor, value: Tensor) -> Tensor:
+    """Return the unit eigenvector of ``value`` in the plane across the unit eigenvector ``clear`` (m, 3)."""
+    u = _perpendicular(clear)
+    v = torch.linalg.cross(clear, u)
+    along_u, along_v = _times(matrix, u), _times(matrix, v)
+    uu, uv, vv = (u * along_u).sum(-1) - value, (u * along_v).sum(-1), (v * along_v).sum(-1) - value
+    # The kernel of [[uu, uv], [uv, vv]] is across its longer row.
+    use_first = uu.abs() >= vv.abs()
+    along, other = torch.where(use_first, uv, vv), torch.where(use_first, uu, uv)
+    length = torch.hypot(along, other)
+    is_double = length == 0  # both directions serve
+    length = torch.where(is_double, 1.0, length)
+    along, other = torch.where(is_double, 1.0, along / length), torch.where(is_double, 0.0, other / length)
+    return along[:, None] * u - other[:, None] * v
+
+
+def _perpendicular(direction: Tensor) -> Tensor:
+    """Return (m, 3) unit vectors across unit vectors, from the two components that cannot both vanish."""
+    x, y, z = direction.unbind(-1)
+    zero = torch.zeros_like(x)
+    use_x = (x.abs() > y.abs())[:, None]
+    return _unit(torch.where(use_x, torch.stack([-z, zero, x], -1), torch.stack([zero, z, -y], -1)))
+
+
+def _times(matrix: Symmetric, vector: Tensor) -> Tensor:
+    xx, xy, xz, yy, yz, zz = matrix
+    x, y, z = vector.unbind(-1)
+    return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], -1)
+
+
+def _unit(vector: Tensor) -> Tensor:
+    length = vector.square().sum(-1, keepdim=True).sqrt()
+    return vector / torch.where(length > 0, length, 1.0)
+
+
+def _positive_last(normal: Tensor) -> Tensor:
+    """Turn each (m, 3) vector so that its last component that is not 0 is positive."""
+    x, y, z = normal.unbind(-1)
+    leading = torch.where(z != 0, z, torch.where(y != 0, y, x))
+    # Adding 0 turns -0 into 0, so equal directions have equal bits.
+    return torch.where((leading < 0)[:, None], -normal, normal) + 0.0

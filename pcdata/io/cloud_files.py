@@ -1,0 +1,64 @@
+"""Clouds that are already files: one ``.pcd`` or ``.ply``, or a folder of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pcdata.errors import CaptureError
+from pcdata.io.pcd import read_pcd
+from pcdata.io.ply import read_ply
+from pcdata.io.source import Source, absolute, visible_files
+from pcdata.structures import CAMERA_FRAME, PointCloud
+
+_READERS = {".pcd": read_pcd, ".ply": read_ply}
+
+
+class CloudFilesSource(Source):
+    """``NAME.pcd`` and ``NAME.ply`` files, each one cloud called NAME; other files in the folder do not matter."""
+
+    kind = "clouds"
+    needs = "one .pcd or .ply file, or a folder with such files in it"
+
+    def __init__(self, path: Path, *, frame_id: str = CAMERA_FRAME, metres_per_unit: float | None = None) -> None:
+        """List the files.
+
+        Args:
+            path: a file or a folder.
+            frame_id: the frame that the coordinates are in; the files do not say.
+            metres_per_unit: None = metres, refused when the numbers look like millimetres.
+
+        Raises:
+            CaptureError: there is no cloud file, or two differ in the suffix alone.
+        """
+        path = absolute(path)
+        self.frame_id, self.metres_per_unit = frame_id, metres_per_unit
+        self._files: dict[str, Path] = {}
+        for file in _cloud_files(path):
+            if file.stem in self._files:
+                raise CaptureError(f"{path}: {self._files[file.stem].name} and {file.name} are both {file.stem!r}")
+            self._files[file.stem] = file
+        super().__init__(path, self._files)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A cloud file, or a folder that holds one."""
+        try:
+            return bool(_cloud_files(path))
+        except CaptureError:
+            return False
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the file of one sample."""
+        return {"cloud": self._files[sample_id]}
+
+    def _load(self, sample_id: str) -> PointCloud:
+        file = self._files[sample_id]
+        read = _READERS[file.suffix.lower()]
+        cloud = read(file, frame_id=self.frame_id, metres_per_unit=self.metres_per_unit)
+        facts = {**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit or 1.0}
+        return cloud.with_meta([{"sample_id": sample_id, "provenance": facts}])
+
+
+def _cloud_files(path: Path) -> list[Path]:
+    candidates = [path] if path.is_file() else visible_files(path)
+    return [file for file in candidates if file.suffix.lower() in _READERS]

@@ -1,0 +1,85 @@
+"""Which capture layout a path has, by exact signs: nothing is guessed."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.io.cloud_files import CloudFilesSource
+from pcdata.io.folder import FolderSource
+from pcdata.io.graspnet import GraspNetSource
+from pcdata.io.seven_scenes import SevenScenesSource
+from pcdata.io.source import Source
+
+LAYOUTS: dict[str, type[Source]] = {
+    layout.kind: layout for layout in (FolderSource, GraspNetSource, SevenScenesSource, CloudFilesSource)
+}
+
+
+def open_source(
+    path: str | os.PathLike[str],
+    *,
+    kind: str | None = None,
+    limit: int | None = None,
+    **options: Any,
+) -> Source:
+    """Open a capture; nothing but names and calibration is read until ``load``.
+
+    Args:
+        path: a folder, or a single ``.pcd`` / ``.ply`` file.
+        kind: the layout, one of :data:`LAYOUTS`; None = found by its signs.
+        limit: keep the first so many samples only.
+        **options: those of the layout's class, e.g. ``metres_per_unit``.
+
+    Raises:
+        CaptureError: nothing is there, no layout or more than one fits, or the capture is incomplete.
+        ConfigError: the kind, the limit or an option is not known.
+    """
+    given = Path(path).expanduser()
+    if not given.exists():
+        raise CaptureError(f"open_source: {given}: no such file or folder; check the path (relative to {Path.cwd()})")
+    if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
+        raise ConfigError(f"open_source: limit must be a whole number of at least 1, or None, got {limit!r}")
+    layout = _detect(given) if kind is None else _named(kind)
+    known = [name for name in inspect.signature(layout).parameters if name != "path"]
+    for option in options:
+        if option not in known:
+            raise ConfigError(
+                f"open_source: the layout {layout.kind!r} has no option {option!r}{near_matches(option, known)}; "
+                f"it has {', '.join(known) or 'none'}"
+            )
+    source = layout(given, **options)
+    return source if limit is None else source.subset(source.ids[:limit])
+
+
+def _named(kind: str) -> type[Source]:
+    if kind not in LAYOUTS:
+        raise ConfigError(f"open_source: no layout {kind!r}{near_matches(kind, LAYOUTS)}; known: {', '.join(LAYOUTS)}")
+    return LAYOUTS[kind]
+
+
+def _detect(path: Path) -> type[Source]:
+    fitting = [layout for layout in LAYOUTS.values() if layout.recognises(path)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        kinds = " and ".join(layout.kind for layout in fitting)
+        raise CaptureError(f"open_source: {path}: looks like {kinds}; say which with kind=")
+    known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
+    raise CaptureError(
+        f"open_source: {path}: no known layout; found {_contents(path)}. The layouts and what each needs:\n{known}"
+    )
+
+
+def _contents(path: Path) -> str:
+    if path.is_file():
+        return f"a {path.suffix or 'nameless'} file"
+    try:
+        names = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in path.iterdir())
+    except OSError as error:
+        return f"a folder that cannot be listed ({error})"
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return (", ".join(names[:8]) or "an empty folder") + more

@@ -1,0 +1,112 @@
+"""The plain layout: one folder per kind of image, one calibration file for all."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from pcdata.errors import CaptureError, UnitError
+from pcdata.io.calibration import read_calibration
+from pcdata.io.frame_files import make_frame
+from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, check_metres_per_unit, read_depth
+from pcdata.io.source import Source, absolute, by_stem, check_partners, sequence_positions
+from pcdata.structures import CAMERA_FRAME, DepthFrame
+
+_CALIBRATIONS = ("intrinsics.json", "camera.json")
+_PARTNERS = {  # role: folder, suffixes
+    "color": ("color", COLOR_SUFFIXES),
+    "labels": ("labels", (".png",)),
+    "mask": ("masks", (".png",)),
+    "pose": ("poses", (".txt", ".npy")),
+}
+
+
+class FolderSource(Source):
+    """``intrinsics.json``, ``depth/NAME.png``, and for all names or none: ``color``, ``labels``, ``masks``, ``poses``."""
+
+    kind = "folder"
+    needs = (
+        "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
+        "masks/NAME.png, poses/NAME.txt (4x4, world from camera)"
+    )
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        metres_per_unit: float | None = None,
+        invalid_values: Collection[int] = (),
+        background_label: int | None = None,
+        frame_id: str | None = None,
+    ) -> None:
+        """Read the calibration and the file names.
+
+        Args:
+            path: the folder.
+            metres_per_unit: length of one stored depth unit, where ``intrinsics.json`` does not state it.
+            invalid_values: stored depth values besides 0 that mean "no reading".
+            background_label: the label in the files that means "no object" and becomes -1; None = keep all.
+            frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
+
+        Raises:
+            CaptureError: the calibration is missing or wrong, or a sample lacks a file that others have.
+            UnitError: the unit is not stated, or stated twice and differently.
+        """
+        path = absolute(path)
+        present = [path / name for name in _CALIBRATIONS if (path / name).is_file()]
+        if len(present) != 1:
+            found = "both" if present else "neither"
+            raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
+        calibration = read_calibration(present[0])
+        self.camera = calibration.camera
+        self.metres_per_unit = _one_unit(present[0], calibration.metres_per_unit, metres_per_unit)
+        if frame_id and calibration.frame_id not in (None, frame_id):
+            stated = calibration.frame_id
+            raise CaptureError(f"{present[0]}: says frame_id {stated!r}, the argument {frame_id!r}; drop one")
+        self.frame_id = frame_id or calibration.frame_id or "world"
+        self.invalid_values = tuple(invalid_values)
+        self.background_label = background_label
+        if not (path / "depth").is_dir():
+            raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
+        self._files = {"depth": by_stem(path / "depth", DEPTH_SUFFIXES)}
+        for role, (folder, suffixes) in _PARTNERS.items():
+            if (path / folder).is_dir():
+                self._files[role] = by_stem(path / folder, suffixes)
+        super().__init__(path, self._files["depth"])
+        check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
+        if "pose" in self._files and self.frame_id == CAMERA_FRAME:
+            raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
+        self._positions = sequence_positions(self._ids)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A calibration file and a folder of depth."""
+        return (path / "depth").is_dir() and any((path / name).is_file() for name in _CALIBRATIONS)
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the files of one sample by role."""
+        return {role: found[sample_id] for role, found in self._files.items()}
+
+    def _load(self, sample_id: str) -> DepthFrame:
+        files = self.files(sample_id)
+        return make_frame(
+            files,
+            depth=read_depth(files["depth"], metres_per_unit=self.metres_per_unit, invalid_values=self.invalid_values),
+            camera=self.camera,
+            sample_id=sample_id,
+            frame_id=self.frame_id,
+            capture_index=self._positions[sample_id],
+            provenance={**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit},
+            background_label=self.background_label,
+        )
+
+
+def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
+    if stated is None and given is None:
+        raise UnitError(
+            f'{file}: the unit of depth must be stated: add "metres_per_unit": 0.001 (for millimetres) to the file, or '
+            "pass metres_per_unit"
+        )
+    if stated is not None and given is not None and stated != given:
+        raise UnitError(f"{file}: says metres_per_unit {stated:g}, the argument {given:g}; correct the wrong one")
+    return check_metres_per_unit(str(file), stated if given is None else given)  # type: ignore[arg-type]

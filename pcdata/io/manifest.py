@@ -1,0 +1,94 @@
+"""``dataset.json``: what a built dataset holds and which pipeline made it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import CacheError
+from pcdata.io.record import parse_info
+from pcdata.io.stores import STORES, Compression, Format
+
+SCHEMA = "pcdata.dataset/1"
+FILE_NAME = "dataset.json"
+
+_MAX_BYTES = 256 * 2**20  # about a million samples
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One stored sample: its id, the key it is stored under, its size and the digest of its record."""
+
+    id: str
+    key: str
+    num_points: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The contents of ``dataset.json``."""
+
+    format: Format
+    compression: Compression
+    fingerprint: str  # of the deterministic steps that made the stored clouds
+    pipeline: Mapping[str, Any]  # section -> list of {transform: fields}
+    samples: Sequence[Sample]
+    versions: Mapping[str, str] = field(default_factory=dict)
+    schema: str = SCHEMA
+
+    def write(self, folder: Path) -> None:
+        """Write the file and force it to disk."""
+        with open(folder / FILE_NAME, "x", encoding="utf-8") as file:
+            json.dump(asdict(self), file, indent=1, allow_nan=False)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Manifest:
+        """Read and check the file.
+
+        Raises:
+            CacheError: missing, damaged, hostile, or of another schema.
+        """
+        path = Path(folder) / FILE_NAME
+        if not path.is_file():
+            raise CacheError(f"{folder}: not a pcdata dataset: it has no {FILE_NAME}; make one with 'pcdata build'")
+        if path.stat().st_size > _MAX_BYTES:
+            raise CacheError(f"{path}: {path.stat().st_size} bytes are too many for a manifest")
+        try:
+            content = parse_info(path.read_bytes())
+            if content.get("schema") != SCHEMA:
+                raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r}; rebuild the dataset")
+            manifest = cls(**{**content, "samples": [Sample(**sample) for sample in content["samples"]]})
+            _check(manifest)
+        except (CacheError, TypeError, KeyError) as error:
+            raise CacheError(f"{path}: {error}") from error
+        return manifest
+
+
+def _check(manifest: Manifest) -> None:
+    if manifest.format not in STORES:
+        raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r}")
+    if len({sample.key for sample in manifest.samples}) != len(manifest.samples):
+        raise CacheError("two samples share a key")
+    for sample in manifest.samples:
+        # Keys become file names: one that could climb out of the folder is refused.
+        if sample.key != key_of(sample.id):
+            raise CacheError(f"sample {sample.id!r} must have the key {key_of(sample.id)!r}, got {sample.key!r}")
+
+
+def key_of(sample_id: str) -> str:
+    """Return a file-name safe, reversible and unique key for a sample id.
+
+    Letters, digits, dot, dash and underscore stay; other bytes become %XX; a leading dot too.
+    """
+    from urllib.parse import quote
+
+    key = quote(str(sample_id), safe="").replace("~", "%7E")
+    return "%2E" + key[1:] if key.startswith(".") else key

@@ -1,0 +1,144 @@
+"""A cloud as named arrays and one JSON text: the form that every file format stores.
+
+Arrays follow the field's customs, so that other tools can read them: ``points``, ``colors`` and ``normals`` are (N, 3)
+float32, colours in [0, 1], and ``labels`` is (N, 1) int32. ``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4)
+world_from_camera repeat what the JSON says of the cameras.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pcdata.errors import CacheError, PcdataError
+from pcdata.structures import PointCloud
+
+SCHEMA = "pcdata.cloud/1"
+
+_POINT_FIELDS = ("points", "colors", "normals", "labels", "source_index")
+_EXTRA, _FRAMES = "extra.", "frames."
+_DERIVED = ("intrinsics", "extrinsics")
+
+
+@dataclass(frozen=True)
+class Record:
+    """Arrays by name, and JSON-able facts."""
+
+    arrays: Mapping[str, np.ndarray]
+    info: Mapping[str, Any]
+
+    def info_text(self) -> str:
+        """The facts as canonical JSON."""
+        return json.dumps(self.info, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+    def digest(self) -> str:
+        """SHA-256 over names, dtypes, shapes and bytes of all arrays and over the facts."""
+        total = hashlib.sha256(self.info_text().encode())
+        for name in sorted(self.arrays):
+            array = np.ascontiguousarray(self.arrays[name])
+            total.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
+            total.update(array.data if array.size else b"")
+        return total.hexdigest()
+
+
+def record_from_cloud(cloud: PointCloud) -> Record:
+    """Write a cloud, or a batch, as a record; everything it knows is kept.
+
+    Raises:
+        CacheError: a label does not fit into int32.
+    """
+    cloud = cloud.to("cpu")
+    arrays = {name: value.numpy() for name in _POINT_FIELDS if (value := getattr(cloud, name)) is not None}
+    if cloud.labels is not None:
+        arrays["labels"] = _labels_as_int32(arrays["labels"])
+    arrays |= {_EXTRA + name: value.numpy() for name, value in cloud.extra.items()}
+    arrays |= {_FRAMES + name: matrix.numpy() for name, matrix in cloud.frames.items()}
+    arrays |= {"ptr": cloud.ptr.numpy(), "source_from_cloud": cloud.source_from_cloud.numpy()}
+    if cloud.viewpoint is not None:
+        arrays["viewpoint"] = cloud.viewpoint.numpy()
+    arrays |= _camera_arrays(cloud)
+    info = {
+        "schema": SCHEMA,
+        "frame_id": cloud.frame_id,
+        "source_frame": cloud.source_frame,
+        "unit": cloud.unit,
+        "kinds": {name: kind.value for name, kind in cloud.kinds.items()},
+        "meta": list(cloud.meta),
+        "history": [list(steps) for steps in cloud.history],
+    }
+    return Record(arrays, info)
+
+
+def cloud_from_record(record: Record) -> PointCloud:
+    """Read a record back as the cloud it was written from.
+
+    Raises:
+        CacheError: the record is not one, or its parts do not fit together.
+    """
+    info = record.info
+    if not isinstance(info, Mapping) or info.get("schema") != SCHEMA:
+        schema = info.get("schema") if isinstance(info, Mapping) else info
+        raise CacheError(f"not a cloud record: schema must be {SCHEMA!r}, got {schema!r}")
+    tensors = {name: _tensor(array) for name, array in record.arrays.items() if name not in _DERIVED}
+    extra = {name.removeprefix(_EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(_EXTRA)}
+    frames = {name.removeprefix(_FRAMES): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)}
+    if "labels" in tensors:
+        tensors["labels"] = tensors["labels"].reshape(-1).long()
+    try:
+        return PointCloud(
+            **tensors,
+            extra=extra,
+            frames=frames,
+            frame_id=info["frame_id"],
+            source_frame=info["source_frame"],
+            unit=info["unit"],
+            kinds=info["kinds"],
+            meta=info["meta"],
+            history=info["history"],
+        )
+    except (PcdataError, TypeError, ValueError, KeyError) as error:
+        raise CacheError(f"the record's parts do not fit together: {error}") from error
+
+
+def parse_info(text: str | bytes) -> dict[str, Any]:
+    """Parse the facts of a record or manifest.
+
+    Raises:
+        CacheError: not a JSON object.
+    """
+    try:
+        info = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CacheError(f"the JSON part cannot be read: {error}") from error
+    if not isinstance(info, dict):
+        raise CacheError(f"the JSON part must be an object, got {type(info).__name__}")
+    return info
+
+
+def _camera_arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
+    cameras = [camera for entry in cloud.meta for camera in entry.get("cameras", [])]
+    if not cameras:
+        return {}
+    intrinsics = {"intrinsics": np.array([camera["intrinsics"][0] for camera in cameras], dtype=np.float64)}
+    poses = [camera["world_from_camera"] for camera in cameras]
+    return intrinsics if None in poses else {**intrinsics, "extrinsics": np.array(poses, dtype=np.float64)}
+
+
+def _labels_as_int32(labels: np.ndarray) -> np.ndarray:
+    limits = np.iinfo(np.int32)
+    if labels.size and (labels.min() < limits.min or labels.max() > limits.max):
+        raise CacheError(f"labels are stored as int32, but they reach {labels.min()}..{labels.max()}; renumber them")
+    return labels.astype(np.int32)[:, None]
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    if array.dtype == object or array.dtype.kind not in "biuf":
+        raise CacheError(f"an array has dtype {array.dtype}, which no cloud field has")
+    return torch.from_numpy(np.ascontiguousarray(array))

@@ -1,0 +1,111 @@
+"""7-Scenes recordings: ``frame-XXXXXX.depth.png``, ``.color.jpg|png``, ``.pose.txt`` in one folder.
+
+Source: Shotton et al., "Scene Coordinate Regression Forests for Camera Relocalization in RGB-D Images", CVPR 2013;
+https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from pathlib import Path
+
+from pcdata.errors import CaptureError
+from pcdata.io.calibration import read_intrinsics
+from pcdata.io.frame_files import make_frame
+from pcdata.io.images import check_metres_per_unit, read_depth
+from pcdata.io.source import Source, absolute, check_partners, visible_files
+from pcdata.structures import Camera, DepthFrame
+
+_FILE = re.compile(r"(?P<id>frame-(?P<number>[0-9]{1,18}))\.(?P<role>depth\.png|color\.png|color\.jpg|pose\.txt)")
+_ROLES = {"depth.png": "depth", "color.png": "color", "color.jpg": "color", "pose.txt": "pose"}
+_INTRINSICS = "camera-intrinsics.txt"
+
+
+class SevenScenesSource(Source):
+    """Hand-held RGB-D frames with camera-to-world poses; 65535 and 0 mean "no reading".
+
+    Colour is that of the data set: only approximately registered to the depth.
+    """
+
+    kind = "seven_scenes"
+    needs = (
+        "frame-XXXXXX.depth.png and camera-intrinsics.txt (3x3); optional frame-XXXXXX.color.jpg|png and "
+        "frame-XXXXXX.pose.txt (4x4, world from camera)"
+    )
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        intrinsics: tuple[float, float, float, float] | None = None,
+        metres_per_unit: float = 0.001,
+        invalid_values: Collection[int] = (65535,),
+        frame_id: str = "world",
+    ) -> None:
+        """Read the file names.
+
+        Args:
+            path: the folder of one sequence.
+            intrinsics: (fx, fy, cx, cy) in pixels, where the folder has no ``camera-intrinsics.txt``; the data set
+                documents (585, 585, 320, 240).
+            metres_per_unit: length of one stored depth unit; the data set documents millimetres.
+            invalid_values: stored depth values besides 0 that mean "no reading".
+            frame_id: the frame that the poses lead to.
+
+        Raises:
+            CaptureError: the intrinsics are missing or given twice, or a frame lacks a file that others have.
+        """
+        path = absolute(path)
+        self.metres_per_unit = check_metres_per_unit(f"seven_scenes source {path}", metres_per_unit)
+        self.invalid_values = tuple(invalid_values)
+        self.frame_id = frame_id
+        self.intrinsics = intrinsics
+        has_file = (path / _INTRINSICS).is_file()
+        if has_file == (intrinsics is not None):
+            raise CaptureError(
+                f"seven_scenes source {path}: needs {_INTRINSICS} or the option intrinsics=(fx, fy, cx, cy), but "
+                f"{'both are given' if has_file else 'neither is there; the data set documents (585, 585, 320, 240)'}"
+            )
+        self._files: dict[str, dict[str, Path]] = {"depth": {}}
+        for file in visible_files(path):
+            if match := _FILE.fullmatch(file.name):
+                found = self._files.setdefault(_ROLES[match["role"]], {})
+                if match["id"] in found:
+                    raise CaptureError(
+                        f"{path}: {found[match['id']].name} and {file.name} are of one frame; remove one"
+                    )
+                found[match["id"]] = file
+        super().__init__(path, self._files["depth"])
+        check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A depth image named as the data set names them."""
+        try:
+            return any(entry.name.endswith(".depth.png") and _FILE.fullmatch(entry.name) for entry in path.iterdir())
+        except OSError:
+            return False
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the files of one sample by role."""
+        return {role: found[sample_id] for role, found in self._files.items()}
+
+    def _load(self, sample_id: str) -> DepthFrame:
+        files = self.files(sample_id)
+        depth = read_depth(files["depth"], metres_per_unit=self.metres_per_unit, invalid_values=self.invalid_values)
+        return make_frame(
+            files,
+            depth=depth,
+            camera=self._camera((depth.shape[0], depth.shape[1])),
+            sample_id=sample_id,
+            frame_id=self.frame_id,
+            capture_index=int(sample_id.removeprefix("frame-")),
+            provenance={**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit},
+        )
+
+    def _camera(self, size: tuple[int, int]) -> Camera:
+        if self.intrinsics is None:
+            return read_intrinsics(self.path / _INTRINSICS, size=size)
+        fx, fy, cx, cy = self.intrinsics
+        return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=size)

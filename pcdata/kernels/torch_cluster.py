@@ -1,0 +1,143 @@
+"""torch-cluster as a backend, on the CPU and where it can keep pcdata's contract; taken only when asked for by name.
+
+It is refused on CUDA: its farthest point sampling starts from squared distances of 5e4, so larger ones tie, and its
+radius search keeps the first neighbours it meets, not the nearest.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+# The operations must be registered before their kernels.
+import pcdata.functional.neighbors
+import pcdata.functional.sampling  # noqa: F401
+from pcdata.dispatch import kernel
+from pcdata.errors import BackendError, ShapeError
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.parameters import require_count, require_length
+from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.sampling import check_available, counts_per_cloud
+
+INSTALL = "pip install ninja && pip install --no-build-isolation torch-cluster"
+
+# Its kd-tree prunes with float32 bounds and squares the radius in float64: search a little wider, then cut exactly.
+_WIDER = 1.001
+
+
+def unavailable() -> str | None:
+    """Return why torch-cluster cannot be used and what to do, or None."""
+    try:
+        _load()
+    except ImportError:
+        return f"torch-cluster is not installed; build it (about 20 minutes) with: {INSTALL}"
+    except OSError as error:
+        # Its compiled part belongs to one torch version and fails to link with any other.
+        return f"torch-cluster does not load with torch {torch.__version__} ({error}); rebuild it with: {INSTALL}"
+    return None
+
+
+@kernel("farthest_point_sample", "torch_cluster")
+@torch.no_grad()
+def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: int | list[int] | Tensor) -> tuple[Tensor, Tensor]:
+    """Sample with ``torch_cluster.fps``, cloud by cloud: it takes a ratio, and writes out of bounds for empty samples.
+
+    Raises:
+        BackendError: on CUDA, or when torch-cluster repeated a point (it does once only duplicates are left).
+    """
+    _require_cpu("farthest_point_sample", points)
+    wanted = counts_per_cloud("farthest_point_sample", num_samples, ptr)
+    check_available("farthest_point_sample", wanted, ptr)
+    starts = ptr.tolist()
+    picked = [
+        start + _sample_cloud(points[start:stop], count, cloud)
+        for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], wanted, strict=False))
+    ]
+    return torch.cat(picked), ptr_from_counts(wanted)
+
+
+@kernel("ball_query", "torch_cluster")
+@torch.no_grad()
+def ball_query(
+    points: Tensor,
+    ptr: Tensor,
+    radius: float,
+    max_neighbors: int,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    grid: ImageGrid | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Search with ``torch_cluster.radius``, asking for *all* neighbours, then keep the nearest by the contract's order.
+
+    Memory grows with the number of pairs within the radius, unlike the reference.
+
+    Raises:
+        BackendError: on CUDA.
+    """
+    _require_cpu("ball_query", points)
+    require_count("ball_query", "max_neighbors", max_neighbors)
+    require_length("ball_query", "radius", radius)
+    if queries is None:
+        if queries_ptr is not None:
+            raise ShapeError("ball_query: queries_ptr was given without queries; pass both, or neither")
+        queries, queries_ptr = points, ptr
+    assert queries_ptr is not None  # @op fills it
+    query, row = _load().radius(
+        points, queries, radius * _WIDER, cloud_of_rows(ptr), cloud_of_rows(queries_ptr), max_num_neighbors=len(points)
+    )
+    squared = _squared_distance(points[row], queries[query])
+    limit = torch.tensor(radius, dtype=torch.float32).square()
+    within = squared < limit
+    return _nearest_per_query(query[within], row[within], squared[within], len(queries), max_neighbors, len(points))
+
+
+def _load() -> ModuleType:
+    import torch_cluster
+
+    return torch_cluster
+
+
+def _require_cpu(name: str, points: Tensor) -> None:
+    if points.device.type != "cpu":
+        raise BackendError(
+            f"{name}: torch-cluster keeps the contract on the CPU only, the points are on {points.device}; "
+            "use backend='auto'"
+        )
+
+
+def _sample_cloud(points: Tensor, count: int, cloud: int) -> Tensor:
+    if count == 0:
+        return torch.empty(0, dtype=torch.int64)
+    # It takes ceil(ratio * n) points in float32; half a point below the count cannot round to a neighbour.
+    index: Tensor = _load().fps(points, ratio=(count - 0.5) / len(points), random_start=False)
+    if len(index) != count or len(index.unique()) != count:
+        raise BackendError(
+            f"farthest_point_sample: torch-cluster returned {len(index.unique())} distinct points of {count} for cloud "
+            f"{cloud}; it repeats points once only duplicates are left, use backend='auto'"
+        )
+    return index
+
+
+def _squared_distance(a: Tensor, b: Tensor) -> Tensor:
+    dx, dy, dz = (a - b).unbind(-1)
+    return dx * dx + dy * dy + dz * dz
+
+
+def _nearest_per_query(
+    query: Tensor, row: Tensor, squared: Tensor, num_queries: int, max_neighbors: int, num_points: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Order pairs by (query, squared distance, row) and lay the first ``max_neighbors`` of each query side by side."""
+    order = torch.arange(len(query))
+    for key in (row, squared, query):  # least significant first; stable sorts keep the order among equals
+        order = order[key[order].argsort(stable=True)]
+    query, row, squared = query[order], row[order], squared[order]
+    found = torch.bincount(query, minlength=num_queries)
+    place = torch.arange(len(query)) - ptr_from_counts(found)[query]
+    kept = place < max_neighbors
+    index = torch.full((num_queries, max_neighbors), num_points)
+    distance = torch.full((num_queries, max_neighbors), torch.inf)
+    index[query[kept], place[kept]] = row[kept]
+    distance[query[kept], place[kept]] = squared[kept].sqrt()
+    return index, distance, found.clamp(max=max_neighbors)

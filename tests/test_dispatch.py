@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import sys
+import types
+
+import pytest
+import torch
+
+from pcdata import dispatch
+from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, ShapeError
+
+
+@pytest.fixture
+def shift(monkeypatch):
+    """A small operation with a kernel in a backend called "fast", registered for one test."""
+    monkeypatch.setattr(dispatch, "OPERATIONS", {})
+    module = types.ModuleType("fast_kernels")
+    module.unavailable = lambda: None
+    monkeypatch.setitem(sys.modules, "fast_kernels", module)
+    absent = types.ModuleType("absent_kernels")
+    absent.unavailable = lambda: "no compiler was found; run: install compiler"
+    monkeypatch.setitem(sys.modules, "absent_kernels", absent)
+    monkeypatch.setattr(dispatch, "BACKEND_MODULES", {"fast": "fast_kernels", "absent": "absent_kernels"})
+    dispatch.why_unavailable.cache_clear()
+
+    @dispatch.op(ptr="ptr N B", points="N 3", queries="Q 3", queries_ptr="ptr Q B")
+    def shift(points, ptr=None, *, by=1.0, queries=None, queries_ptr=None, backend="auto"):
+        """Shift."""
+        return "torch", points + by, ptr, queries_ptr
+
+    @dispatch.kernel("shift", "fast")
+    def fast_shift(points, ptr, by, queries, queries_ptr):
+        return "fast", points + by, ptr, queries_ptr
+
+    yield shift
+    dispatch.why_unavailable.cache_clear()
+
+
+POINTS = torch.zeros(4, 3)
+
+
+def test_auto_falls_back_to_the_reference(shift):
+    assert shift(POINTS)[0] == "torch"
+
+
+def test_auto_takes_the_first_live_backend_that_has_a_kernel(shift, monkeypatch):
+    monkeypatch.setattr(dispatch, "AUTO_ORDER", {"cpu": ("absent", "fast", "torch")})
+    assert shift(POINTS)[0] == "fast"
+    dispatch.OPERATIONS["shift"].kernels.clear()
+    assert shift(POINTS)[0] == "torch"
+
+
+def test_a_named_backend_is_taken_and_gets_every_argument(shift):
+    name, shifted, ptr, _ = shift(POINTS, by=2.0, backend="fast")
+    assert name == "fast"
+    assert torch.equal(shifted, POINTS + 2)
+    assert ptr.tolist() == [0, 4]
+
+
+def test_missing_row_pointers_mean_one_cloud(shift):
+    assert shift(POINTS)[2].tolist() == [0, 4]
+    assert shift(POINTS)[3] is None
+    assert shift(POINTS, queries=torch.zeros(2, 3))[3].tolist() == [0, 2]
+
+
+def test_given_row_pointers_arrive_unchanged(shift):
+    ptr = torch.tensor([0, 1, 4])
+    assert shift(POINTS, ptr)[2] is ptr
+
+
+def test_an_absent_backend_gives_its_reason(shift):
+    with pytest.raises(BackendError, match=r"shift: backend 'absent' is not available: no compiler .*; run: install"):
+        shift(POINTS, backend="absent")
+
+
+def test_an_unknown_backend_names_the_nearest(shift):
+    with pytest.raises(BackendError, match=r"unknown backend 'fasst'.*'auto', 'torch', 'fast'.*did you mean 'fast'\?"):
+        shift(POINTS, backend="fasst")
+
+
+def test_a_backend_without_this_kernel_says_so(shift):
+    dispatch.OPERATIONS["shift"].kernels.clear()
+    with pytest.raises(BackendError, match="backend 'fast' has no kernel for it; use backend='auto'"):
+        shift(POINTS, backend="fast")
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch", "fast"])
+@pytest.mark.parametrize(
+    ("points", "error"),
+    [
+        (torch.zeros(4, 3).double(), DTypeError),
+        (torch.zeros(4, 2), ShapeError),
+        (torch.full((4, 3), torch.nan), NonFiniteError),
+        (None, DTypeError),
+        ([[0.0, 0.0, 0.0]], DTypeError),
+    ],
+)
+def test_the_contract_is_held_before_any_backend(shift, backend, points, error):
+    with pytest.raises(error, match="^shift: points"):
+        shift(points, backend=backend)
+
+
+def test_clouds_of_queries_must_match_clouds_of_points(shift):
+    with pytest.raises(ShapeError, match="queries_ptr has B=2 but ptr has B=1"):
+        shift(POINTS, queries=torch.zeros(2, 3), queries_ptr=torch.tensor([0, 1, 2]))
+
+
+def test_two_devices_are_refused(shift):
+    with pytest.raises(DeviceError, match="queries is on meta but points is on cpu"):
+        shift(POINTS, queries=torch.zeros(2, 3, device="meta"))
+
+
+def test_a_wrong_keyword_is_a_type_error(shift):
+    with pytest.raises(TypeError, match="buy"):
+        shift(POINTS, buy=1.0)
+
+
+def test_the_public_function_keeps_its_name_and_docstring(shift):
+    assert shift.__name__ == "shift"
+    assert shift.__doc__ == "Shift."
+    assert dispatch.OPERATIONS["shift"].public is shift
+
+
+def test_every_backend_can_be_named(shift):
+    assert dispatch.backends() == ["torch", "fast", "absent"]
+
+
+@pytest.mark.parametrize("name", sorted(dispatch.BACKEND_MODULES))
+def test_every_real_backend_is_live_or_says_what_to_do(name):
+    reason = dispatch.why_unavailable(name)
+    assert reason is None or len(reason.split()) > 3
