@@ -32,7 +32,11 @@ def test_float_means_either_width(dtype):
     ("values", "error", "message"),
     [
         ({"points": [[0.0, 0.0, 0.0]]}, DTypeError, r"step: points must be a torch.Tensor, float32 \(N, 3\), not list"),
-        ({"points": torch.zeros(2, 3).double()}, DTypeError, r"step: points must be float32 \(N, 3\), not torch.float64"),
+        (
+            {"points": torch.zeros(2, 3).double()},
+            DTypeError,
+            r"step: points must be float32 \(N, 3\), not torch.float64",
+        ),
         ({"matrix": torch.zeros(1, 4, 4).half()}, DTypeError, "float32 or float64"),
         ({"points": torch.zeros(2, 4)}, ShapeError, r"step: points must be float32 \(N, 3\), got shape \(2, 4\)"),
         ({"points": torch.zeros(3)}, ShapeError, r"got shape \(3,\)"),
@@ -42,7 +46,11 @@ def test_float_means_either_width(dtype):
             ShapeError,
             "step: labels has N=3 but points has N=2; they must agree",
         ),
-        ({"points": torch.tensor([[0.0, torch.nan, torch.inf]])}, NonFiniteError, "points has 2 NaN or infinite .* of 3"),
+        (
+            {"points": torch.tensor([[0.0, torch.nan, torch.inf]])},
+            NonFiniteError,
+            "points has 2 NaN or infinite .* of 3",
+        ),
         ({"ptr": torch.tensor([0, 2]).int()}, DTypeError, r"int64 row pointers \(B\+1,\) over N rows"),
         ({"ptr": torch.tensor([0])}, ShapeError, r"one cloud is \[0, N\]"),
         ({"ptr": torch.tensor([[0, 2]])}, ShapeError, "row pointers"),

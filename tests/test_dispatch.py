@@ -96,7 +96,7 @@ def test_a_backend_without_this_kernel_says_so(shift):
     ],
 )
 def test_the_contract_is_held_before_any_backend(shift, backend, points, error):
-    with pytest.raises(error, match="^shift: points"):
+    with pytest.raises(error, match=r"^shift: points"):
         shift(points, backend=backend)
 
 

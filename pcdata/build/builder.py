@@ -19,7 +19,7 @@ import pcdata
 from pcdata.build.config import BuildConfig
 from pcdata.build.loading_script import loading_script
 from pcdata.errors import CacheError, CaptureError, add_note
-from pcdata.io.folder import write_capture
+from pcdata.io.raw import write_capture
 from pcdata.io.manifest import Manifest, Sample, key_of
 from pcdata.io.record import record_from_cloud
 from pcdata.io.stores import STORES

@@ -1,0 +1,45 @@
+"""Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device."""
+
+from pcdata.functional.clusters import dbscan
+from pcdata.functional.depth import deproject_depth, pixel_rays, project_points, range_to_depth
+from pcdata.functional.grid import ImageGrid
+from pcdata.functional.lens import distort_normalized, undistort_normalized
+from pcdata.functional.metrics import chamfer_distance
+from pcdata.functional.neighbors import ball_query, knn
+from pcdata.functional.normals import estimate_normals, orient_normals
+from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.sampling import farthest_point_sample, random_sample_index
+from pcdata.functional.voxels import (
+    find_voxel_size,
+    voxel_downsample,
+    voxel_majority,
+    voxel_mean,
+    voxel_mean_direction,
+)
+
+__all__ = [
+    "ImageGrid",
+    "ball_query",
+    "chamfer_distance",
+    "dbscan",
+    "deproject_depth",
+    "distort_normalized",
+    "estimate_normals",
+    "farthest_point_sample",
+    "find_voxel_size",
+    "knn",
+    "orient_normals",
+    "pixel_rays",
+    "project_points",
+    "radius_outlier_mask",
+    "random_sample_index",
+    "range_to_depth",
+    "ransac_plane",
+    "statistical_outlier_mask",
+    "undistort_normalized",
+    "voxel_downsample",
+    "voxel_majority",
+    "voxel_mean",
+    "voxel_mean_direction",
+]

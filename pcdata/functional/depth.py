@@ -149,10 +149,11 @@ def check_lengths(where: str, name: str, lengths: Tensor) -> None:
     Raises:
         CaptureError: with how many are negative, and the lowest.
     """
-    if lengths.numel() and float(lengths.min()) < 0:
+    negative = lengths < 0
+    if bool(negative.any()):
         raise CaptureError(
-            f"{where}: {name} must be metres with 0 for no reading, but {int((lengths < 0).sum())} values are negative "
-            f"(lowest {float(lengths.min()):g}); set them to 0 where the image is read"
+            f"{where}: {name} must be metres with 0 for no reading, but {int(negative.sum())} values are negative "
+            f"(lowest {float(lengths.detach().min()):g}); set them to 0 where the image is read"
         )
 
 

@@ -24,6 +24,8 @@ _CONVERGED = 1e-12
 _MAX_STEPS = 60
 # Coordinates inverted at once: the dozens of intermediate tensors stay in a CPU core's cache.
 _CHUNK = 16384
+# Largest r^2 of a ray that any pinhole image holds: 89.4 degrees off axis.
+_FAR = 1e4
 
 
 class _Coefficients(NamedTuple):
@@ -113,10 +115,17 @@ def fold_radius(distortion: Tensor) -> Tensor:
         denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
         t = np.polynomial.Polynomial([0.0, 1.0])
         slope = numerator * denominator + 2 * t * (numerator.deriv() * denominator - numerator * denominator.deriv())
-        roots = np.concatenate([slope.trim().roots(), denominator.trim().roots()])
-        positive = [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and root.real > 0]
-        radii.append(min(positive, default=np.inf) ** 0.5)
+        folds = [*_positive_roots(slope), *_positive_roots(denominator)]
+        radii.append(min(folds, default=np.inf) ** 0.5)
     return torch.tensor(radii, dtype=torch.float64, device=distortion.device)
+
+
+def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
+    """Return the real roots in (0, _FAR]; leading terms too small to matter there are dropped first."""
+    coefficients = polynomial.coef
+    matters = np.abs(coefficients) * _FAR ** np.arange(len(coefficients)) > 1e-12
+    roots: list[complex] = np.polynomial.Polynomial(coefficients[: np.flatnonzero(matters)[-1] + 1]).roots().tolist()
+    return [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and 0 < root.real <= _FAR]
 
 
 def _invert(target: Tensor, coefficients: _Coefficients, fold: float) -> Tensor:

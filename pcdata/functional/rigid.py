@@ -48,7 +48,7 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
     """
     length = quaternion.double().norm(dim=-1, keepdim=True)
     if not bool(((length > 0) & torch.isfinite(length)).all()):
-        raise PoseError("rotation_from_quaternion: a quaternion has length 0 or is not finite; it stands for no rotation")
+        raise PoseError("rotation_from_quaternion: a quaternion has length 0 or is not finite")
     x, y, z, w = (quaternion.double() / length).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, PoseError, near_matches
+from pcdata.errors import CaptureError, PcdataError, PoseError, near_matches
 from pcdata.functional import rigid
 from pcdata.io.files import existing_file, read_text, replacing
 from pcdata.io.images import check_metres_per_unit
@@ -159,7 +159,7 @@ def write_pose(path: str | os.PathLike[str], pose: Tensor) -> None:
 def _camera(where: str, **values: Any) -> Camera:
     try:
         return Camera.pinhole(**values)
-    except CaptureError as error:
+    except PcdataError as error:
         raise CaptureError(f"{where}: {error}") from error
 
 

@@ -22,7 +22,7 @@ _PARTNERS = {  # role: folder, suffixes
 
 
 class FolderSource(Source):
-    """``intrinsics.json``, ``depth/NAME.png``, and for all names or none: ``color``, ``labels``, ``masks``, ``poses``."""
+    """``intrinsics.json``, ``depth/NAME.png``; for all names or none ``color``, ``labels``, ``masks``, ``poses``."""
 
     kind = "folder"
     needs = (

@@ -207,7 +207,7 @@ def _columns(where: str, arrays: CloudArrays, encoding: str) -> dict[str, NDArra
     for name, values in arrays.extra.items():
         if name in columns or name in ("rgb", "rgba", "label", PADDING, *_NORMALS):
             raise CaptureError(f"{where}: an extra field cannot be called {name!r}, which means something else in PCD")
-        columns[name] = values.reshape(len(values), -1)
+        columns[name] = values[:, None] if values.ndim == 1 else values
     return columns
 
 

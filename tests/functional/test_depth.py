@@ -173,7 +173,9 @@ def test_impossible_intrinsics_are_refused_with_a_hint(spoil, message):
 def test_bad_depth_is_refused():
     depth = random_depth()
     with pytest.raises(CaptureError, match="1 values are negative"):
-        deproject_depth(depth.index_put((torch.tensor(0), torch.tensor(3), torch.tensor(3)), torch.tensor(-0.5)), camera())
+        deproject_depth(
+            depth.index_put((torch.tensor(0), torch.tensor(3), torch.tensor(3)), torch.tensor(-0.5)), camera()
+        )
     with pytest.raises(CaptureError, match="ray_length must be metres"):
         range_to_depth(-1 - depth, camera())
     with pytest.raises(NonFiniteError):

@@ -9,8 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
+from pcdata.functional.depth import deproject_depth
 from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
+
+
+@pytest.fixture(scope="module")
+def frame_points(test_data: Path) -> torch.Tensor:
+    """100,000 points of a real depth frame, in row-major order."""
+    depth = np.array(pytest.importorskip("PIL.Image").open(test_data / "graspnet_frame/depth.png"))
+    meta = pytest.importorskip("scipy.io").loadmat(test_data / "graspnet_frame/meta.mat")
+    metres = torch.from_numpy(depth.astype(np.float32) / 1000)[None]
+    points, _, _ = deproject_depth(metres, torch.from_numpy(meta["intrinsic_matrix"].astype(np.float64))[None])
+    kept = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:100_000]
+    return points[kept.sort().values]
 
 
 def brute_force(points: np.ndarray, count: int) -> list[int]:
@@ -97,12 +109,9 @@ def test_inputs_that_require_gradients_are_sampled():
     assert len(farthest_point_sample(cloud(9).requires_grad_(), num_samples=3)[0]) == 3
 
 
-def test_a_real_frame_is_sampled_as_by_brute_force(test_data: Path):
-    from tests_graspnet import frame_points  # placeholder, replaced below
-
-    points = frame_points(test_data)
-    index, _ = farthest_point_sample(points, num_samples=1024)
-    assert index.tolist() == brute_force(points.numpy(), 1024)
+def test_a_real_frame_is_sampled_as_by_brute_force(frame_points: torch.Tensor):
+    index, _ = farthest_point_sample(frame_points, num_samples=1024)
+    assert index.tolist() == brute_force(frame_points.numpy(), 1024)
 
 
 def test_random_rows_are_distinct_and_inside_their_cloud():

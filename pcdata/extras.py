@@ -1,0 +1,63 @@
+"""Optional dependencies: what is installed, and the exact command that installs what is not."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from dataclasses import dataclass
+from types import ModuleType
+
+from pcdata.errors import MissingExtraError
+
+# Open3D's wheel is linked against these and does not bring them along.
+_OPEN3D_LIBRARIES = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
+
+
+@dataclass(frozen=True)
+class Extra:
+    """One optional dependency."""
+
+    module: str
+    name: str  # of the extra in pcdata's metadata
+    purpose: str
+    install: str
+
+
+EXTRAS = {
+    extra.module: extra
+    for extra in (
+        Extra("matplotlib", "viz", "pictures (pcdata demo, pcdata.report)", 'pip install "pcdata[viz]"'),
+        Extra("open3d", "open3d", "viewing and comparing with Open3D", 'pip install "pcdata[open3d]"'),
+        Extra(
+            "torch_cluster",
+            "cluster",
+            "the torch_cluster backend",
+            "pip install ninja && pip install --no-build-isolation torch-cluster",
+        ),
+    )
+}
+
+
+def require(module: str) -> ModuleType:
+    """Import an optional dependency.
+
+    Raises:
+        MissingExtraError: with what it is for and the command that installs it.
+    """
+    problem = why_missing(module)
+    if problem is not None:
+        raise MissingExtraError(problem)
+    return importlib.import_module(module)
+
+
+def why_missing(module: str) -> str | None:
+    """Return None when the dependency can be imported, else what is wrong and what to run."""
+    extra = EXTRAS[module]
+    if importlib.util.find_spec(module) is None:
+        return f"{module} is not installed; it is needed for {extra.purpose}: run {extra.install}"
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError) as error:
+        system = f"; on Debian or Ubuntu run {_OPEN3D_LIBRARIES}" if module == "open3d" else ""
+        return f"{module} is installed but cannot be loaded ({error}){system}"
+    return None

@@ -1,0 +1,48 @@
+"""Deliver a capture beside its cloud: a plain folder per view that :func:`pcdata.open_source` reads back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from pcdata.errors import CaptureError
+from pcdata.io.calibration import Calibration, write_calibration, write_pose
+from pcdata.io.images import write_color, write_depth
+from pcdata.structures import DepthFrame
+
+
+def write_capture(frame: DepthFrame, folder: Path) -> None:
+    """Write depth, colour, pose and calibration of every view to ``folder/view<v>``.
+
+    Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
+
+    Raises:
+        CaptureError: a file cannot be written.
+    """
+    for v in range(frame.num_views):
+        view = folder / f"view{v}"
+        (view / "depth").mkdir(parents=True)
+        unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
+        calibration = Calibration(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
+        write_calibration(view / "intrinsics.json", calibration)
+        if frame.colors is not None:
+            (view / "color").mkdir()
+            write_color(view / "color" / "0.png", frame.colors[v])
+        if frame.world_from_camera is not None:
+            (view / "poses").mkdir()
+            write_pose(view / "poses" / "0.txt", frame.world_from_camera[v])
+
+
+def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
+    """Write one depth image and return the length of its stored unit."""
+    if unit is not None:
+        try:
+            write_depth(folder / "0.png", depth, metres_per_unit=unit)
+        except CaptureError:  # filtered or resampled: no longer whole units
+            pass
+        else:
+            return unit
+    np.save(folder / "0.npy", depth.cpu().numpy(), allow_pickle=False)
+    return 1.0

@@ -1,0 +1,138 @@
+"""One picture of what a pipeline did: the capture, the cloud after its steps, and how many points each left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pcdata import extras
+from pcdata.structures import DepthFrame, PointCloud
+
+_PALETTE = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e", "#9498a0")
+_MAX_DRAWN = 60_000  # more points than a panel has pixels only cost time
+
+
+def save_pipeline_figure(
+    path: str | Path, capture: DepthFrame, stages: Sequence[tuple[str, PointCloud]], *, title: str = ""
+) -> None:
+    """Draw a capture and the clouds that came of it into one PNG; needs no display.
+
+    Args:
+        path: the PNG file.
+        capture: the first view is drawn.
+        stages: (caption, cloud) in order; objects are told apart by colour where the cloud has labels from clustering.
+        title: printed above all.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    extras.require("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no pyplot: no global state, no display
+    from matplotlib.figure import Figure
+
+    columns = 4
+    rows = 1 + -(-len(stages) // columns)
+    figure = Figure(figsize=(4.0 * columns, 3.3 * rows), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    if title:
+        figure.suptitle(title, fontsize=15, fontweight="bold")
+    _draw_colors(axes[0, 0], capture)
+    _draw_depth(figure, axes[0, 1], capture)
+    _draw_counts(axes[0, 2], stages)
+    _draw_facts(axes[0, 3], stages)
+    flat = axes[1:].flatten()
+    for axis, (caption, cloud) in zip(flat, stages):
+        _draw_cloud(axis, caption, cloud)
+    for axis in flat[len(stages) :]:
+        axis.set_axis_off()
+    figure.savefig(path, format="png")
+
+
+def _draw_colors(axis: Any, capture: DepthFrame) -> None:
+    axis.set_title(f"colour, view 1 of {capture.num_views}")
+    axis.set_axis_off()
+    if capture.colors is not None:
+        axis.imshow(capture.colors[0].cpu().numpy())
+
+
+def _draw_depth(figure: Any, axis: Any, capture: DepthFrame) -> None:
+    depth = capture.depth[0].cpu().numpy()
+    valid = depth > 0
+    axis.set_title(f"depth, {100 * valid.mean():.0f} % valid (holes white)")
+    axis.set_axis_off()
+    image = axis.imshow(np.where(valid, depth, np.nan), cmap="viridis")
+    figure.colorbar(image, ax=axis, label="metres", shrink=0.8)
+
+
+def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
+    names = [caption for caption, _ in stages]
+    counts = [cloud.num_points for _, cloud in stages]
+    axis.set_title("points left after each step")
+    axis.barh(names, counts, color=_PALETTE[0], log=True)
+    axis.invert_yaxis()
+    axis.set_xlim(right=max(counts) * 8)
+    for position, count in enumerate(counts):
+        axis.text(count * 1.15, position, f"{count:,}", va="center", fontsize=8)
+    axis.tick_params(labelsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_facts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
+    axis.set_axis_off()
+    cloud = stages[-1][1]
+    axis.set_title("the sample")
+    meta = cloud.meta[0]
+    lines = [f"points   {cloud.num_points}", f"frame    {cloud.frame_id}", f"unit     {cloud.unit}"]
+    lines += [f"fields   {', '.join(cloud.fields())}"]
+    if meta.get("objects"):
+        lines += [f"objects  {len(meta['objects'])}"]
+    if meta.get("planes"):
+        plane = meta["planes"][0]
+        normal = ", ".join(f"{value:+.3f}" for value in plane["normal"])
+        lines += [f"plane    n = ({normal})", f"         offset {1000 * plane['offset']:+.1f} mm in {plane['frame']!r}"]
+    wrapped = "\n".join(lines).replace("source_index", "\n         source_index")
+    axis.text(0.0, 0.95, wrapped, va="top", family="monospace", fontsize=9, transform=axis.transAxes)
+
+
+def _draw_cloud(axis: Any, caption: str, cloud: PointCloud) -> None:
+    """Draw an oblique orthographic view, far points first."""
+    axis.set_title(f"{caption}: {cloud.num_points:,} points", fontsize=10)
+    axis.set_axis_off()
+    stride = max(1, cloud.num_points // _MAX_DRAWN)
+    points = cloud.points[::stride].cpu().double()
+    across, up, toward = (points @ _view_axes(cloud.frame_id).T).unbind(1)
+    order = toward.argsort()
+    colors = _point_colors(cloud)[::stride][order.numpy()]
+    size = float(np.clip(4000 / max(cloud.num_points, 1), 0.4, 6.0))
+    axis.scatter(across[order], up[order], c=colors, s=size, linewidths=0, rasterized=True)
+    axis.set_aspect("equal")
+
+
+def _view_axes(frame_id: str) -> torch.Tensor:
+    """Return rows right, up, toward the viewer: obliquely from above for z-up frames, from the lens for cameras."""
+    if frame_id.startswith("camera"):
+        return torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    turn, tilt = np.deg2rad(35.0), np.deg2rad(40.0)
+    right = [np.cos(turn), np.sin(turn), 0.0]
+    toward = [np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt), np.sin(tilt)]
+    up = np.cross(toward, right)
+    return torch.tensor(np.array([right, up, toward]))
+
+
+def _point_colors(cloud: PointCloud) -> np.ndarray:
+    """Colour by object once objects were clustered, else by the camera's colours, else by depth."""
+    from matplotlib.colors import to_rgb
+
+    clustered = any(step["step"] == "ClusterObjects" for step in cloud.history[0])
+    if clustered and cloud.labels is not None:
+        palette = np.array([to_rgb(color) for color in _PALETTE])
+        labels = cloud.labels.cpu().numpy()
+        return np.where(labels[:, None] < 0, 0.8, palette[labels % len(palette)])
+    if cloud.colors is not None:
+        return cloud.colors.cpu().numpy()
+    return np.full((cloud.num_points, 3), 0.3)

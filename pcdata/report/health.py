@@ -1,0 +1,41 @@
+"""What is installed, which backends are live, and what to install."""
+
+from __future__ import annotations
+
+import os
+import platform
+
+import torch
+
+import pcdata
+import pcdata.functional
+from pcdata import dispatch, extras
+from pcdata.report.table import text_table
+
+
+def health_text() -> str:
+    """Return the report of ``pcdata doctor``."""
+    cuda = "none" if not torch.cuda.is_available() else torch.cuda.get_device_name(0)
+    machine = [
+        ["pcdata", pcdata.__version__],
+        ["Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"],
+        ["torch", f"{torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} cores"],
+        ["CUDA device", cuda],
+    ]
+    backends = []
+    for name in dispatch.backends():
+        reason = dispatch.why_unavailable(name)
+        operations = [op for op, entry in sorted(dispatch.OPERATIONS.items()) if name in entry.kernels]
+        serves = "every operation, on any device" if name == dispatch.REFERENCE else ", ".join(operations)
+        backends.append([name, "live" if reason is None else "absent", serves if reason is None else reason])
+    optional = []
+    for extra in extras.EXTRAS.values():
+        problem = extras.why_missing(extra.module)
+        optional.append([extra.module, "installed" if problem is None else "absent", problem or extra.purpose])
+    return "\n\n".join(
+        [
+            text_table(["machine", ""], machine),
+            text_table(["backend", "state", "serves, or what to do"], backends),
+            text_table(["optional", "state", "for, or what to do"], optional),
+        ]
+    )

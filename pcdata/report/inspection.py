@@ -1,0 +1,76 @@
+"""Datasets, builds and captures in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import median
+
+from pcdata.build import BuildReport
+from pcdata.datasets import CachedCloudDataset
+from pcdata.io.source import Source
+from pcdata.report.table import text_table
+from pcdata.structures import DepthFrame, PointCloud
+
+
+def build_text(report: BuildReport) -> str:
+    """Tell how many points every step left, over all captures of a build."""
+    rows: list[list[object]] = []
+    chains: dict[tuple[str, ...], list[list[int]]] = {}
+    for sample in report.samples:
+        names = tuple(name for name, _ in sample.counts)
+        chains.setdefault(names, []).append([count for _, count in sample.counts])
+    for names, counts in chains.items():
+        for position, name in enumerate(names):
+            left = [sample[position] for sample in counts]
+            rows.append([name, min(left), round(median(left)), max(left)])
+    seconds = sum(sample.seconds for sample in report.samples)
+    as_clouds = sum(sample.entered_at == "cloud" for sample in report.samples)
+    head = f"{len(report.samples)} samples in {seconds:.1f} s"
+    if as_clouds:
+        head += f"; {as_clouds} captures were clouds already and entered at the section 'cloud'"
+    return f"{head}\n\n{text_table(['points after', 'fewest', 'median', 'most'], rows)}"
+
+
+def dataset_text(folder: str | Path) -> str:
+    """Tell what a built dataset holds; reads its manifest and its first sample."""
+    dataset = CachedCloudDataset(folder, augment=None)
+    manifest = dataset.manifest
+    counts = [sample.num_points for sample in manifest.samples]
+    cloud = dataset[0]
+    facts = [
+        ["samples", len(dataset)],
+        ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
+        ["format", f"{manifest.format}, compression {manifest.compression}"],
+        ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
+        ["fields", ", ".join(f"{name} {tuple(value.shape)}" for name, value in cloud.fields().items())],
+        ["fingerprint", manifest.fingerprint[:16]],
+        ["made with", ", ".join(f"{name} {version}" for name, version in manifest.versions.items())],
+    ]
+    stored = dataset.pipeline.deterministic_prefix()
+    steps = [["stored", repr(step)] for step in [*stored.depth, *stored.cloud, *stored.augment]]
+    steps += [["on the fly", repr(step)] for step in dataset.pipeline.random_suffix().steps]
+    return f"{text_table(['dataset', str(folder)], facts)}\n\n{text_table(['when', 'step'], steps)}"
+
+
+def capture_text(source: Source) -> str:
+    """Tell what a source holds; loads its first capture."""
+    first = source.load(source.ids[0])
+    names = ", ".join(source.ids[:3]) + (", ..." if len(source) > 3 else "")
+    facts = [["layout", source.kind], ["captures", f"{len(source)}: {names}"], ["first", repr(first)]]
+    facts += _frame_facts(first) if isinstance(first, DepthFrame) else _cloud_facts(first)
+    return text_table(["capture", str(source.name)], facts)
+
+
+def _frame_facts(frame: DepthFrame) -> list[list[str]]:
+    valid = frame.depth[frame.depth > 0]
+    return [
+        ["camera", repr(frame.camera)],
+        ["depth", f"{valid.numel():,} of {frame.depth.numel():,} pixels valid, {valid.min():.3f} to {valid.max():.3f} m"],
+        ["poses", "none" if frame.frame_id is None else f"lead to {frame.frame_id!r}"],
+    ]
+
+
+def _cloud_facts(cloud: PointCloud) -> list[list[str]]:
+    low, high = cloud.points.amin(0).tolist(), cloud.points.amax(0).tolist()
+    extent = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high))
+    return [["extent", f"{extent} m"], ["fields", ", ".join(cloud.fields())]]

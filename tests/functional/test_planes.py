@@ -1,0 +1,251 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcdata.errors import ConfigError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.functional import planes as planes_module
+from pcdata.functional.depth import deproject_depth
+from pcdata.functional.planes import fit_plane, plane_distance, ransac_plane
+
+
+@pytest.fixture(scope="module")
+def frame_points(test_data: Path) -> torch.Tensor:
+    """100,000 points of a real depth frame, in row-major order."""
+    depth = np.array(pytest.importorskip("PIL.Image").open(test_data / "graspnet_frame/depth.png"))
+    meta = pytest.importorskip("scipy.io").loadmat(test_data / "graspnet_frame/meta.mat")
+    metres = torch.from_numpy(depth.astype(np.float32) / 1000)[None]
+    points, _, _ = deproject_depth(metres, torch.from_numpy(meta["intrinsic_matrix"].astype(np.float64))[None])
+    kept = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:100_000]
+    return points[kept.sort().values]
+
+
+def slab(count: int, normal: list[float], offset: float, *, noise: float = 0.002, seed: int = 0) -> torch.Tensor:
+    """Points within ``noise`` of the plane n.p + offset = 0, over a square metre."""
+    generator = torch.Generator().manual_seed(seed)
+    unit = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    along = torch.linalg.svd(unit[None]).Vh[1:]
+    points = (torch.rand((count, 2), generator=generator, dtype=torch.float64) - 0.5) @ along - offset * unit
+    noise_along = noise * (2 * torch.rand((count, 1), generator=generator, dtype=torch.float64) - 1)
+    return (points + noise_along * unit).float()
+
+
+def clutter(count: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand((count, 3), generator=torch.Generator().manual_seed(seed)) - 0.5
+
+
+def scene(seed: int = 0) -> torch.Tensor:
+    """A table below the origin (z up) with clutter."""
+    return torch.cat([clutter(300, seed), slab(700, [0.1, 0.0, 1.0], 0.3, seed=seed)])
+
+
+def least_squares_inliers(points: np.ndarray, inliers: np.ndarray, distance: float) -> np.ndarray:
+    """Refit by singular values (not eigenvalues) and select again, in NumPy."""
+    chosen = points[inliers].astype(np.float64)
+    centre = chosen.mean(axis=0)
+    normal = np.linalg.svd(chosen - centre, full_matrices=False)[2][-1]
+    x, y, z = points.T
+    nx, ny, nz, d = np.append(normal, -normal @ centre).astype(np.float32)
+    return np.abs(((nx * x + ny * y) + nz * z) + d) < np.float32(distance)
+
+
+def angle_to(plane: torch.Tensor, direction: list[float]) -> float:
+    unit = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
+    return math.acos(min(1.0, float(plane[:3] @ unit)))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 999), st.floats(0.05, 2.0))
+def test_a_known_plane_is_found(seed, offset):
+    normal = torch.randn(3, generator=torch.Generator().manual_seed(seed)).tolist()
+    points = torch.cat([slab(500, normal, offset, seed=seed), clutter(100, seed)])
+    planes, inliers = ransac_plane(points, num_hypotheses=100)
+    assert planes.dtype == torch.float64
+    assert float(planes[0, :3].norm()) == pytest.approx(1.0)
+    assert bool(inliers[:500].all())
+    assert angle_to(planes[0], normal) < 0.01
+    assert float(planes[0, 3]) == pytest.approx(offset, abs=0.002)
+
+
+def test_the_mask_is_the_documented_float32_test_on_the_returned_plane():
+    points = scene()
+    planes, inliers = ransac_plane(points)
+    x, y, z = points.numpy().T
+    nx, ny, nz, d = planes[0].float().numpy()
+    assert torch.equal(inliers, torch.from_numpy(np.abs(((nx * x + ny * y) + nz * z) + d) < np.float32(0.01)))
+
+
+def test_the_distance_is_strict():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.3, 0.7, 0.25], [0.7, 0.3, -0.25]])
+    assert ransac_plane(points, distance=0.25)[1].tolist() == [True] * 4 + [False] * 2
+
+
+def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
+    points = scene()
+    planes, inliers = ransac_plane(points)
+    fitted = fit_plane(points[inliers])
+    assert min(float((planes[0] - fitted).abs().max()), float((planes[0] + fitted).abs().max())) < 1e-12
+    expected = least_squares_inliers(points.numpy(), inliers.numpy(), 0.01)
+    assert torch.equal(inliers, torch.from_numpy(expected))
+
+
+def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
+    monkeypatch.setitem(planes_module._BLOCK, "cpu", (3, 7))
+    points = scene()
+    hypotheses = planes_module._draw_planes(points, 50, seed=0)
+    counts = planes_module._count_inliers(points, hypotheses, 0.01)
+    expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
+    assert torch.equal(counts, expected)
+
+
+def test_among_equal_hypotheses_the_earliest_wins():
+    points = slab(50, [0.0, 0.0, 1.0], 0.5, noise=0.0)
+    hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
+    best = planes_module._best_plane(points, hypotheses, torch.ones(3, dtype=torch.bool), 0.01, "test")
+    assert torch.equal(best, hypotheses[1])
+
+
+def test_triples_are_distinct_and_uniform():
+    triples = planes_module._draw_triples(4, 24_000, seed=1)
+    assert bool((triples.sort(dim=1).values.diff(dim=1) > 0).all())
+    ordered = torch.bincount(triples @ torch.tensor([16, 4, 1]), minlength=64)
+    assert int((ordered > 0).sum()) == 24  # every ordered triple of 4 points
+    assert int((ordered[ordered > 0] - 1000).abs().max()) < 160  # five standard deviations
+
+
+def test_the_same_seed_repeats_and_a_batch_is_each_cloud_alone():
+    clouds = [scene(0), scene(1)[:400], scene(2)]
+    ptr = torch.tensor([0, 1000, 1400, 2400])
+    planes, inliers = ransac_plane(torch.cat(clouds), ptr, num_hypotheses=50, seed=3)
+    alone = [ransac_plane(one, num_hypotheses=50, seed=3) for one in clouds]
+    assert torch.equal(planes, torch.cat([plane for plane, _ in alone]))
+    assert torch.equal(inliers, torch.cat([mask for _, mask in alone]))
+
+
+def test_clouds_can_have_their_own_seeds_and_ups():
+    cloud = scene()
+    both = torch.cat([cloud, cloud])
+    up = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
+    planes, _ = ransac_plane(both, torch.tensor([0, 1000, 2000]), seed=[3, 4], up=up)
+    assert torch.equal(planes[0], ransac_plane(cloud, seed=3, up=(0, 0, 1))[0][0])
+    assert torch.equal(planes[1], ransac_plane(cloud, seed=4, up=(0, 0, -1))[0][0])
+
+
+@pytest.mark.parametrize("offset", [0.3, -0.3])
+def test_without_up_the_normal_faces_the_origin(offset):
+    planes, _ = ransac_plane(slab(200, [0.2, 0.1, 1.0], offset))
+    assert float(planes[0, 3]) > 0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_with_up_the_normal_points_along_it(sign):
+    planes, _ = ransac_plane(slab(200, [0.2, 0.1, 1.0], 0.3), up=(0, 0, 7 * sign))
+    assert float(planes[0, 2]) * sign > 0
+
+
+def test_a_wall_larger_than_the_table_loses_under_a_tilt_limit():
+    points = torch.cat([slab(800, [1.0, 0.0, 0.0], 0.4, seed=1), slab(300, [0.0, 0.05, 1.0], 0.3, seed=2)])
+    wall, _ = ransac_plane(points)
+    assert angle_to(wall[0], [1, 0, 0]) < 0.02
+    table, inliers = ransac_plane(points, up=(0, 0, 1), max_tilt=0.2)
+    assert angle_to(table[0], [0, 0.05, 1]) < 0.02
+    assert bool(inliers[800:].all())
+
+
+def test_refinement_never_leaves_the_tilt_limit():
+    points = slab(500, [0.3, 0.0, 1.0], 0.3, noise=0.03)
+    limit = math.atan(0.3) - 0.02  # just short of the true plane
+    planes, inliers = ransac_plane(points, distance=0.02, up=(0, 0, 1), max_tilt=limit)
+    assert angle_to(planes[0], [0, 0, 1]) <= limit
+    assert int(inliers.sum()) > 100
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3, 1e6])
+def test_the_result_scales_with_the_unit(scale):
+    points = scene()
+    planes, inliers = ransac_plane(points)
+    scaled, scaled_inliers = ransac_plane(points * scale, distance=0.01 * scale)
+    assert float((inliers ^ scaled_inliers).sum()) <= 2  # rounding at the edge of the slab
+    torch.testing.assert_close(scaled[0] / torch.tensor([1, 1, 1, scale]), planes[0], atol=1e-4, rtol=0)
+
+
+def test_duplicates_do_not_break_the_search():
+    planes, inliers = ransac_plane(scene().repeat(3, 1))
+    assert bool(inliers[300:1000].all())
+    assert float(planes[0, :3].norm()) == pytest.approx(1.0)
+
+
+def test_three_points_make_a_plane():
+    planes, inliers = ransac_plane(torch.tensor([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]))
+    torch.testing.assert_close(planes, torch.tensor([[0.0, 0, -1, 1]], dtype=torch.float64))
+    assert inliers.tolist() == [True] * 3
+
+
+@pytest.mark.parametrize(
+    "points",
+    [torch.ones(10, 3), torch.linspace(-1, 1, 50)[:, None] * torch.tensor([[0.3, -0.7, 0.9]]) + 0.123],
+    ids=["one point repeated", "a line"],
+)
+def test_points_on_a_line_have_no_plane(points):
+    with pytest.raises(NoPlaneError, match="cloud 0: all 1000 triples drawn lie on a line"):
+        ransac_plane(points)
+
+
+def test_no_plane_within_the_tilt_limit_is_an_error():
+    with pytest.raises(NoPlaneError, match="within max_tilt of up; is up in the frame"):
+        ransac_plane(slab(200, [1.0, 0.0, 0.0], 0.3, noise=0.0), up=(0, 0, 1), max_tilt=0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_points_name_their_cloud(count):
+    points = torch.cat([scene(), clutter(count)])
+    with pytest.raises(TooFewPointsError, match=f"needs 3 points, cloud 1 has {count}"):
+        ransac_plane(points, torch.tensor([0, 1000, 1000 + count]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"max_tilt": 0.1}, ConfigError, "max_tilt is an angle from up"),
+        ({"max_tilt": 10.0, "up": (0, 0, 1)}, ConfigError, "radians"),
+        ({"distance": 0.0}, ConfigError, "distance"),
+        ({"num_hypotheses": 0}, ConfigError, "num_hypotheses"),
+        ({"up": (0, 0, 0)}, ConfigError, "not zero"),
+        ({"up": (0, 1)}, ShapeError, "up must be"),
+        ({"seed": [1, 2]}, ShapeError, "2 seeds were given for 1 clouds"),
+    ],
+)
+def test_wrong_parameters_are_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        ransac_plane(scene(), **arguments)
+
+
+def test_non_finite_points_are_refused():
+    with pytest.raises(NonFiniteError):
+        ransac_plane(torch.full((5, 3), torch.nan))
+
+
+def test_the_table_of_a_real_frame_is_its_own_least_squares_plane(frame_points: torch.Tensor):
+    planes, inliers = ransac_plane(frame_points)
+    expected = least_squares_inliers(frame_points.numpy(), inliers.numpy(), 0.01)
+    assert torch.equal(inliers, torch.from_numpy(expected))
+    assert int(inliers.sum()) > 50_000
+    assert float(planes[0, 3]) > 0  # the camera looks down on the table
+
+
+@pytest.mark.open3d
+def test_the_table_of_a_real_frame_is_the_one_open3d_finds(frame_points: torch.Tensor):
+    open3d = pytest.importorskip("open3d")
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(frame_points.double().numpy()))
+    open3d.utility.random.seed(0)
+    theirs, their_inliers = cloud.segment_plane(0.01, 3, 1000, 1.0)
+    planes, inliers = ransac_plane(frame_points)
+    cosine = abs(float(planes[0, :3] @ torch.tensor(theirs[:3])))
+    assert math.acos(min(1.0, cosine)) < math.radians(0.5)
+    assert int(inliers.sum()) > 0.98 * len(their_inliers)
