@@ -13,8 +13,16 @@ from pcdata.build import BuildReport, build_dataset, config_from_yaml
 from pcdata.build.builder import Progress
 from pcdata.datasets import CachedCloudDataset, collate_padded
 from pcdata.report import save_pipeline_figure
-from pcdata.structures import PaddedClouds, PointCloud
+from pcdata.structures import PaddedClouds
 from pcdata.synthetic import SensorNoise, SyntheticSource
+
+_DRAWN = {
+    "MergeViews": "two views merged and cropped",
+    "RemoveRadiusOutliers": "voxels, outliers removed",
+    "ClusterObjects": "table removed, objects found",
+    "FarthestPointSample": "farthest point sample",
+    "NormalizeWorkspace": "normals, normalised",
+}
 
 
 @dataclass(frozen=True)
@@ -46,11 +54,9 @@ def run_demo(folder: str | Path, *, num_scenes: int = 8, num_workers: int = 2, p
 
     picture = folder / "demo.png"
     capture = source.load(source.ids[0])
-    stages = [
-        (type(step).__name__, data)
-        for step, data in config.pipeline.deterministic_prefix().step_through(capture)
-        if isinstance(data, PointCloud)
-    ]
-    drawn = [(name, cloud) for name, cloud in stages if name not in ("ToFrame", "CropWorkspace")]
+    stages = {
+        type(step).__name__: data for step, data in config.pipeline.deterministic_prefix().step_through(capture)
+    }
+    drawn = [(caption, stages[step]) for step, caption in _DRAWN.items()]
     save_pipeline_figure(picture, capture, drawn, title="pcdata: from raw depth to a training sample")
     return DemoResult(report, picture, batches)

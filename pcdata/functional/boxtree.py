@@ -1,7 +1,7 @@
 """An implicit tree of boxes over points in Morton order: the structure behind every exact neighbour search.
 
-Each cloud is sorted along a Morton (Z-order) curve, every 16 consecutive points form a leaf, every 8 consecutive nodes a
-parent, up to one root per cloud. There are no tuning parameters that depend on the data, so dense and sparse regions
+Each cloud is sorted along a Morton (Z-order) curve, every 16 consecutive points form a leaf, every 8 consecutive nodes
+a parent, up to one root per cloud. There are no tuning parameters that depend on the data, so dense and sparse regions
 in one cloud are served alike.
 
 Source: Morton, A computer oriented geodetic data base, IBM 1966; the implicit hierarchy follows Lauterbach et al.,
@@ -89,7 +89,7 @@ class BoxTree:
 
     leaves: Leaves
     levels: list[Level]
-    # (3, L+1, 16) coordinates with infinity in empty slots and in the extra last row: an infinite distance needs no mask.
+    # (3, L+1, 16) coordinates, infinity in empty slots and in the extra last row: infinite distances need no mask.
     coordinates: Tensor
     row: Tensor  # (L+1, 16) int64, N in empty slots: sorts after every real point
     num_points: int
@@ -112,7 +112,8 @@ class BoxTree:
             levels.append(_parents(levels[-1]))
         filled = torch.where(leaves.real[..., None], leaves.points, torch.inf)
         coordinates = torch.cat([filled, filled.new_full((1, LEAF_SIZE, 3), torch.inf)]).permute(2, 0, 1).contiguous()
-        row = torch.cat([torch.where(leaves.real, leaves.row, len(points)), order.new_full((1, LEAF_SIZE), len(points))])
+        row = torch.where(leaves.real, leaves.row, len(points))
+        row = torch.cat([row, row.new_full((1, LEAF_SIZE), len(points))])
         return cls(leaves, levels, coordinates, row, len(points), kept, ptr)
 
     @property

@@ -50,8 +50,8 @@ class Cells:
         scaled = (points - low[cloud]) / side
         if len(points) and float(scaled.max()) >= _MAX_CELLS_PER_AXIS:
             raise ConfigError(
-                f"{where}: a radius of {radius:g} cuts a cloud into {float(scaled.max()):.2g} cells along an axis, more "
-                f"than {_MAX_CELLS_PER_AXIS:.2g}; are radius and points in the same unit, or is a stray point far out?"
+                f"{where}: a radius of {radius:g} cuts a cloud into {float(scaled.max()):.2g} cells along an axis, "
+                f"more than {_MAX_CELLS_PER_AXIS:.2g}; are both in the same unit, or is a stray point far out?"
             )
         # Room of _REACH on both sides, so that a neighbour's coordinate never runs into the next column.
         coordinate = scaled.long() + _REACH

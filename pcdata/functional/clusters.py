@@ -113,9 +113,10 @@ def _join(cells: Cells, points: Tensor, eps: float) -> Tensor:
     sample = members[start[:-1, None] + cells.count[:, None] * slot // _SAMPLES]  # repeats in a small cell
 
     parent = torch.arange(len(cells), device=points.device)
-    open_pairs = []
+    open_pairs = [parent.new_empty((2, 0))]
     for pairs in cells.neighbor_pairs():
-        for a, b in zip(pairs[0].split(_PAIRS_PER_CHUNK), pairs[1].split(_PAIRS_PER_CHUNK)):
+        for begin in range(0, len(pairs[0]), _PAIRS_PER_CHUNK):
+            a, b = (side[begin : begin + _PAIRS_PER_CHUNK] for side in pairs)
             apart = parent[a] != parent[b]
             a, b = a[apart], b[apart]
             near = box_gap(low[a], high[a], low[b], high[b]) <= limit
@@ -135,9 +136,7 @@ def _join(cells: Cells, points: Tensor, eps: float) -> Tensor:
     return parent
 
 
-def _any_within(
-    members: Tensor, start: Tensor, low: Tensor, high: Tensor, a: Tensor, b: Tensor, eps: float
-) -> Tensor:
+def _any_within(members: Tensor, start: Tensor, low: Tensor, high: Tensor, a: Tensor, b: Tensor, eps: float) -> Tensor:
     """Return (P,) bool: some point of cell a[i] has d < eps to some point of cell b[i]."""
     limit = largest_squared(eps, members.device)
     sides = []
@@ -159,7 +158,7 @@ def _any_within(
 def _chunks_by_size(pairs: Tensor, count: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield (2, P) pairs of cells in pieces that hold a bounded number of points."""
     chunk = torch.cumsum(count[pairs[0]] + count[pairs[1]], 0) // _ROWS_PER_CHUNK
-    for piece in pairs.split(torch.unique_consecutive(chunk, return_counts=True)[1].tolist(), dim=1):
+    for piece in pairs.split_with_sizes(torch.unique_consecutive(chunk, return_counts=True)[1].tolist(), dim=1):
         yield piece[0], piece[1]
 
 

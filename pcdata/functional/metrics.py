@@ -34,7 +34,8 @@ def chamfer_distance(
 
     Source: Barrow et al., Parametric correspondence and chamfer matching, IJCAI 1977.
     """
-    assert ptr_a is not None and ptr_b is not None  # @op fills them
+    assert ptr_a is not None  # @op fills both
+    assert ptr_b is not None
     for name, ptr in (("points_a", ptr_a), ("points_b", ptr_b)):
         empty = (counts_from_ptr(ptr) == 0).nonzero().squeeze(1).tolist()
         if empty:

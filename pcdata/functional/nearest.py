@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -48,6 +49,7 @@ def nearest_chunks(
     A query that is one of the points counts itself. The radius test is ``d2 < float32(radius) * float32(radius)``.
     """
     points = points.detach()
+    foreign = queries is not None
     leaves: Leaves | None = None
     if queries is None or queries_ptr is None:
         queries, queries_ptr = points, ptr
@@ -56,7 +58,7 @@ def nearest_chunks(
             leaves, home = tree.leaves, torch.arange(len(tree.leaves), device=ptr.device)[:, None].expand(-1, LEAF_SIZE)
     if leaves is None:
         tree, leaves, home = _build_together(points, ptr, queries.detach(), queries_ptr, max_copies=k)
-    yield from _Search(tree, leaves, home, k, largest_squared(radius, points.device)).run()
+    yield from _Search(tree, leaves, home, foreign, k, largest_squared(radius, points.device)).run()
 
 
 def largest_squared(radius: float | None, device: torch.device) -> Tensor:
@@ -89,30 +91,26 @@ def _build_together(
     return tree, leaves, home[leaves.level.groups.table()[0]]
 
 
-def _roots(tree: BoxTree, leaves: Leaves) -> tuple[Tensor, Tensor]:
-    """Return each query group's root node and whether its cloud has one."""
-    root_ptr = tree.levels[-1].groups.ptr
-    cloud = cloud_of_rows(leaves.level.groups.ptr)
-    alive = root_ptr[cloud + 1] > root_ptr[cloud]
-    return torch.where(alive, root_ptr[cloud], -1), alive
-
-
 @dataclass(frozen=True)
 class _Search:
     tree: BoxTree
     leaves: Leaves  # the queries, grouped
     home: Tensor  # (G, 16) a leaf of points near each query, -1 for none
+    foreign: bool  # queries may lie far from all points
     k: int
     limit: Tensor  # () float32, neighbours have d2 <= limit
+
+    @cached_property
+    def cloud(self) -> Tensor:
+        """(G,) int64: the cloud of every group of queries."""
+        return cloud_of_rows(self.leaves.level.groups.ptr)
 
     def run(self) -> Iterator[Neighbors]:
         window = self._window_size()
         per_chunk = max(1, min(_GROUPS_PER_CHUNK, _MAX_PAIRS // (LEAF_SIZE * LEAF_SIZE * window)))
-        roots, alive = _roots(self.tree, self.leaves)
-        for groups in torch.arange(len(self.leaves), device=roots.device).split(per_chunk):
-            bound = self._first_bound(groups, window)
-            has_root = alive[groups]
-            yield from self._walk(groups, bound, has_root.nonzero().squeeze(1), roots[groups[has_root]])
+        for begin in range(0, len(self.leaves), per_chunk):
+            groups = torch.arange(begin, min(begin + per_chunk, len(self.leaves)), device=self.home.device)
+            yield from self._walk(groups, torch.minimum(self._first_bound(groups, window), self.limit))
 
     def _window_size(self) -> int:
         """Leaves that surely hold k points wherever the cloud has them: only a cloud's last leaf may be short."""
@@ -120,14 +118,39 @@ class _Search:
 
     def _first_bound(self, groups: Tensor, window: int) -> Tensor:
         """Return (g, 16): each query's k-th squared distance among the leaves around its own, inf below k points."""
-        home = self.home[groups]
+        points = self.leaves.points[groups]
+        cloud = self.cloud[groups, None]
+        bound = self._bound_around(points, self.home[groups], cloud, window)
+        if self.foreign:
+            bound = torch.minimum(bound, self._bound_around(points, self._descend(points, cloud), cloud, window))
+        return bound
+
+    def _descend(self, points: Tensor, cloud: Tensor) -> Tensor:
+        """Return (g, 16): the leaf that each query reaches by always taking the nearest box; -1 for an empty cloud.
+
+        For a query far from all points the curve is no guide, and a loose bound would let in every leaf.
+        """
+        root_ptr = self.tree.levels[-1].groups.ptr
+        empty = (root_ptr[cloud + 1] == root_ptr[cloud]).expand(points.shape[:2])
+        if len(self.tree.leaves) == 0:
+            return torch.full_like(empty, -1, dtype=torch.int64)
+        node = root_ptr[cloud].clamp(max=len(self.tree.levels[-1].low) - 1).expand(points.shape[:2])
+        for depth in range(len(self.tree.levels) - 1, 0, -1):
+            groups, below = self.tree.levels[depth].groups, self.tree.levels[depth - 1]
+            slot = torch.arange(groups.size, device=node.device)
+            children = groups.first[node][..., None] + torch.minimum(slot, groups.count[node][..., None] - 1)
+            gap = box_gap(points[:, :, None], points[:, :, None], below.low[children], below.high[children])
+            node = children.gather(-1, gap.argmin(-1, keepdim=True)).squeeze(-1)
+        return torch.where(empty, -1, node)
+
+    def _bound_around(self, points: Tensor, home: Tensor, cloud: Tensor, window: int) -> Tensor:
+        """Return (g, 16): the k-th squared distance among ``window`` leaves around ``home``."""
         ptr = self.tree.leaf_ptr
-        cloud = cloud_of_rows(self.leaves.level.groups.ptr)[groups, None]
         begin, end = ptr[cloud], ptr[cloud + 1]
         first = torch.maximum(torch.minimum(home - window // 2, end - window), begin)
         around = first[..., None] + torch.arange(window, device=home.device)
         around = torch.where(around < end[..., None], around, len(self.tree.leaves))
-        squared = self._squared(self.leaves.points[groups], around)
+        squared = self._squared(points, around)
         if self.k > squared.shape[-1]:
             return torch.full_like(squared[..., 0], torch.inf)
         return squared.topk(self.k, largest=False, sorted=False).values.amax(-1)
@@ -142,9 +165,12 @@ class _Search:
         assert total is not None
         return total
 
-    def _walk(self, groups: Tensor, bound: Tensor, group: Tensor, node: Tensor) -> Iterator[Neighbors]:
-        """Descend from (group, node) pairs to leaves; ``group`` counts within ``groups``."""
-        bound = torch.minimum(bound, self.limit)
+    def _walk(self, groups: Tensor, bound: Tensor) -> Iterator[Neighbors]:
+        """Descend all levels at once with (group, node) pairs, from each group's root; ``bound`` is (g, 16)."""
+        root_ptr = self.tree.levels[-1].groups.ptr
+        cloud = self.cloud[groups]
+        group = (root_ptr[cloud + 1] > root_ptr[cloud]).nonzero().squeeze(1)  # counts within this chunk
+        node = root_ptr[cloud[group]]
         group_bound = torch.where(self.leaves.real[groups], bound, -torch.inf).amax(1)
         low, high = self.leaves.level.low[groups], self.leaves.level.high[groups]
         for depth in range(len(self.tree.levels) - 1, -1, -1):
@@ -156,11 +182,8 @@ class _Search:
             if len(group) > _MAX_PAIRS and len(groups) > 1:
                 # A bound too loose for so many groups at once: walk again with half of them, never with more memory.
                 half = len(groups) // 2
-                for part in (slice(0, half), slice(half, None)):
-                    chosen = groups[part]
-                    roots, alive = _roots(self.tree, self.leaves)
-                    inside = alive[chosen]
-                    yield from self._walk(chosen, bound[part], inside.nonzero().squeeze(1), roots[chosen[inside]])
+                yield from self._walk(groups[:half], bound[:half])
+                yield from self._walk(groups[half:], bound[half:])
                 return
         yield from self._finish(groups, bound, group, node)
 
@@ -168,32 +191,25 @@ class _Search:
         """Refine (group, leaf) pairs to (query, leaf) pairs and rank the points in them."""
         points = self.leaves.points[groups]
         boxes = self.tree.levels[0]
-        by_group = torch.argsort(group, stable=True)
-        group, leaf = group[by_group], leaf[by_group]
         gap = box_gap(points[group], points[group], boxes.low[leaf][:, None], boxes.high[leaf][:, None])
         pair, slot = ((gap <= bound[group]) & self.leaves.real[groups][group]).nonzero(as_tuple=True)
-        query, leaf, gap = group[pair] * LEAF_SIZE + slot, leaf[pair], gap[pair, slot]
-        by_query = torch.argsort(query, stable=True)
-        query, leaf, gap = query[by_query], leaf[by_query], gap[by_query]
-        points, bound, row = points.flatten(0, 1), bound.flatten(), self.leaves.row[groups].flatten()
+        query, by_query = torch.sort(group[pair] * LEAF_SIZE + slot, stable=True)
+        leaf = leaf[pair][by_query]
+        points, row = points.flatten(0, 1), self.leaves.row[groups].flatten()
         counts = torch.bincount(query, minlength=len(row))
-        counts = torch.where(self.leaves.real[groups].flatten(), counts, -1)
-        start = torch.cumsum(counts.clamp(min=0), 0) - counts.clamp(min=0)
-        width = 0
-        for next_width in _widths(int(counts.max()) if len(counts) else 0):
-            chosen = ((counts > width) & (counts <= next_width)).nonzero().squeeze(1)
-            if width == 0:
-                chosen = torch.cat([chosen, (counts == 0).nonzero().squeeze(1)])
-            width = next_width
-            for part in chosen.split(max(1, _MAX_PAIRS // (width * LEAF_SIZE))):
-                slots = torch.arange(width, device=part.device)
-                real = slots < counts[part, None]
-                place = (start[part, None] + slots).clamp(max=max(len(leaf) - 1, 0))
-                if len(leaf):
-                    candidates = torch.where(real, leaf[place], len(self.tree.leaves))
-                else:
-                    candidates = torch.full_like(place, len(self.tree.leaves))
-                yield self._rank(row[part], points[part], candidates)
+        start = torch.cumsum(counts, 0) - counts
+        leaf = torch.cat([leaf, leaf.new_full((1,), len(self.tree.leaves))])  # what empty places of a table read
+        counts = torch.where(self.leaves.real[groups].flatten(), counts, -1)  # a repeated slot is no query
+        narrower = -1
+        for width in _widths(int(counts.max())):
+            chosen = ((counts > narrower) & (counts <= width)).nonzero().squeeze(1)
+            narrower = width
+            places = torch.arange(width, device=row.device)
+            per_part = max(1, _MAX_PAIRS // (width * LEAF_SIZE))
+            for begin in range(0, len(chosen), per_part):
+                part = chosen[begin : begin + per_part]
+                place = torch.where(places < counts[part, None], start[part, None] + places, len(leaf) - 1)
+                yield self._rank(row[part], points[part], leaf[place])
 
     def _rank(self, row: Tensor, points: Tensor, candidates: Tensor) -> Neighbors:
         """Sort the points of the (m, w) candidate leaves by (d2, row) and keep k."""

@@ -3,6 +3,7 @@
 One convention for all: a point counts itself; squared distance is ((dx*dx)+(dy*dy))+(dz*dz) in float32; neighbours
 ascend by (squared distance, row), so equal distances go to the lowest row; missing neighbours are padded with distance
 infinity and row N, which makes a gather without a mask fail loudly instead of taking the last point (SciPy's choice).
+Squared distances must fit in float32: points more than 1.8e19 apart are never neighbours.
 """
 
 from __future__ import annotations

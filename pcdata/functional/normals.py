@@ -123,11 +123,11 @@ def _covariance(offset: Tensor, count: Tensor) -> Symmetric:
 def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Tensor, zz: Tensor) -> Tensor:
     """Return the (m, 3) unit eigenvectors of the smallest eigenvalues of symmetric 3x3 matrices, in closed form.
 
-    The eigenvalue that stands clear of the other two gives its vector by a cross product; the next is found in the
-    plane across it; the third is their cross product. A zero matrix gives (0, 0, 1).
+    The eigenvalue that stands clear of the other two gives its vector by a cross product. Where that is the largest,
+    the smallest is found in the plane across it, as a 2x2 problem. A multiple of the identity gives (0, 0, 1).
 
     Source: Eberly, A robust eigensolver for 3x3 symmetric matrices, Geometric Tools, 2014-2023, the non-iterative
-    algorithm.
+    algorithm; its second step is replaced by a rotation angle, which keeps all digits for points nearly on a line.
     """
     scale = torch.stack([xx, xy, xz, yy, yz, zz]).abs().amax(0)
     safe = torch.where(scale > 0, scale, 1.0)
@@ -142,12 +142,10 @@ def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Te
     angle = half.acos() / 3
     largest = mean + spread * 2 * angle.cos()
     smallest = mean + spread * 2 * (angle + 2 * math.pi / 3).cos()
-    middle = 3 * mean - largest - smallest
 
     clear_is_largest = half >= 0
     clear = _separate_eigenvector(matrix, torch.where(clear_is_largest, largest, smallest))
-    across = _eigenvector_across(matrix, clear, middle)
-    normal = torch.where(clear_is_largest[:, None], torch.linalg.cross(across, clear), clear)
+    normal = torch.where(clear_is_largest[:, None], _smallest_across(matrix, clear), clear)
     return torch.where(is_isotropic[:, None], normal.new_tensor([0.0, 0.0, 1.0]), normal)
 
 
@@ -164,20 +162,14 @@ def _separate_eigenvector(matrix: Symmetric, value: Tensor) -> Tensor:
     return _unit(products[torch.arange(len(longest), device=longest.device), longest])
 
 
-def _eigenvector_across(matrix: Symmetric, clear: Tensor, value: Tensor) -> Tensor:
-    """Return the unit eigenvector of ``value`` in the plane across the unit eigenvector ``clear`` (m, 3)."""
+def _smallest_across(matrix: Symmetric, clear: Tensor) -> Tensor:
+    """Return the unit vector across ``clear`` (m, 3) along which the matrix is smallest."""
     u = _perpendicular(clear)
     v = torch.linalg.cross(clear, u)
     along_u, along_v = _times(matrix, u), _times(matrix, v)
-    uu, uv, vv = (u * along_u).sum(-1) - value, (u * along_v).sum(-1), (v * along_v).sum(-1) - value
-    # The kernel of [[uu, uv], [uv, vv]] is across its longer row.
-    use_first = uu.abs() >= vv.abs()
-    along, other = torch.where(use_first, uv, vv), torch.where(use_first, uu, uv)
-    length = torch.hypot(along, other)
-    is_double = length == 0  # both directions serve
-    length = torch.where(is_double, 1.0, length)
-    along, other = torch.where(is_double, 1.0, along / length), torch.where(is_double, 0.0, other / length)
-    return along[:, None] * u - other[:, None] * v
+    uu, uv, vv = (u * along_u).sum(-1), (u * along_v).sum(-1), (v * along_v).sum(-1)
+    angle = torch.atan2(2 * uv, uu - vv) / 2  # from u to the larger axis of [[uu, uv], [uv, vv]]
+    return angle.cos()[:, None] * v - angle.sin()[:, None] * u
 
 
 def _perpendicular(direction: Tensor) -> Tensor:

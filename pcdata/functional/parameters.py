@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError, ShapeError
+from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import counts_from_ptr
 
@@ -41,10 +41,13 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
     Raises:
         ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
             intrinsics are not one per cloud.
+        DeviceError: it is on another device.
     """
     if grid is None:
         return
     pixel, (height, width) = grid.pixel_index, grid.size
+    if pixel.device != points.device:
+        raise DeviceError(f"{where}: grid is on {pixel.device} but points is on {points.device}; move one with .to()")
     if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (len(ptr) - 1, 3, 3):
         raise ShapeError(
             f"{where}: grid has {tuple(pixel.shape)} pixels and {tuple(grid.intrinsics.shape)} intrinsics for "

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.dispatch import op
-from pcdata.errors import ConfigError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.rigid import angle_between
 from pcdata.rng import seeded
@@ -244,9 +244,10 @@ def _check_parameters(
 
 
 def _seed_per_cloud(seed: int | Sequence[int] | Tensor, num_clouds: int) -> list[int]:
-    if isinstance(seed, int):
-        return [seed] * num_clouds
-    seeds = [int(one) for one in seed]
+    given = seed.tolist() if isinstance(seed, Tensor) else seed
+    seeds = list(given) if isinstance(given, Sequence) else [given] * num_clouds
+    if not all(isinstance(one, int) for one in seeds):
+        raise DTypeError(f"ransac_plane: seed must be an int, or a sequence or tensor of ints, got {given}")
     if len(seeds) != num_clouds:
         raise ShapeError(f"ransac_plane: {len(seeds)} seeds were given for {num_clouds} clouds")
     return seeds

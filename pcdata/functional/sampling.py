@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.dispatch import op
-from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
 from pcdata.functional.ragged import counts_from_ptr, ptr_from_counts
 from pcdata.rng import seeded
 
@@ -81,13 +81,15 @@ def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr:
     """Return one count per cloud from one number or (B,) numbers.
 
     Raises:
-        ShapeError: as many counts as clouds were not given.
+        DTypeError: a count that is not an int.
+        ShapeError: the number of counts is not the number of clouds.
         ConfigError: a negative count.
     """
     num_clouds = len(ptr) - 1
-    if isinstance(num_samples, Tensor):
-        num_samples = num_samples.tolist()
-    counts = [int(num_samples)] * num_clouds if isinstance(num_samples, (int, float)) else [int(k) for k in num_samples]
+    given = num_samples.tolist() if isinstance(num_samples, Tensor) else num_samples
+    counts = list(given) if isinstance(given, Sequence) else [given] * num_clouds
+    if not all(isinstance(count, int) for count in counts):
+        raise DTypeError(f"{where}: the number of samples must be an int, or a sequence or tensor of ints, got {given}")
     if len(counts) != num_clouds:
         raise ShapeError(f"{where}: {len(counts)} counts were given for {num_clouds} clouds")
     if min(counts) < 0:

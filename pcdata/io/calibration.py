@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, PcdataError, PoseError, near_matches
 from pcdata.functional import rigid
-from pcdata.io.files import existing_file, read_text, replacing
+from pcdata.io.files import map_npy, read_text, replacing
 from pcdata.io.images import check_metres_per_unit
 from pcdata.structures import Camera
 
@@ -127,13 +127,9 @@ def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
     """
     where = f"read_pose: {path}"
     if Path(path).suffix.lower() == ".npy":
-        existing_file(where, path, max_bytes=4096)
-        try:
-            matrix = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError, SyntaxError, TypeError) as error:
-            raise CaptureError(f"{where}: not a readable .npy file of numbers: {error}") from error
-        if not isinstance(matrix, np.ndarray) or matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu":
-            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {np.shape(matrix)}")
+        matrix = map_npy(where, path, max_bytes=4096)
+        if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu":
+            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {matrix.dtype} {matrix.shape}")
         pose = torch.from_numpy(matrix.astype(np.float64))
     else:
         values = _numbers(where, read_text(where, path))

@@ -7,6 +7,11 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tokenize import TokenError
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
 
@@ -50,6 +55,20 @@ def read_text(where: str, path: str | os.PathLike[str]) -> str:
         return read_bytes(where, path, max_bytes=MAX_TEXT_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CaptureError(f"{where}: {path}: must be UTF-8 text, but it is not: {error}") from error
+
+
+def map_npy(where: str, path: str | os.PathLike[str], *, max_bytes: int) -> NDArray[Any]:
+    """Return the array of a ``.npy`` file, read-only and still on disk; objects are never unpickled.
+
+    Mapped, so that a header that promises more than the file holds fails before anything is allocated.
+    """
+    file = existing_file(where, path, max_bytes=max_bytes)
+    try:
+        return np.lib.format.open_memmap(file, mode="r")
+    except (
+        OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError, RecursionError, TokenError,
+    ) as error:  # fmt: skip  # NumPy parses the header as Python source text
+        raise CaptureError(f"{where}: {file}: not a readable .npy file of numbers: {error}") from error
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, DTypeError, UnitError
-from pcdata.io.files import existing_file, replacing
+from pcdata.io.files import existing_file, map_npy, replacing
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30
@@ -102,11 +102,7 @@ def _read_raw_depth(where: str, path: Path) -> NDArray[Any]:
 
 
 def _read_npy(where: str, path: Path) -> NDArray[Any]:
-    existing_file(where, path, max_bytes=_MAX_BYTES)
-    try:  # mapped, so that a header that promises more than the file holds fails before anything is allocated
-        array = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError) as error:
-        raise CaptureError(f"{where}: not a readable .npy file of numbers: {error}") from error
+    array = map_npy(where, path, max_bytes=_MAX_BYTES)
     if array.ndim != 2:
         raise CaptureError(f"{where}: depth must be one image (H, W), got shape {array.shape}; save one file per view")
     _check_pixels(where, array.shape[1], array.shape[0])
@@ -289,8 +285,8 @@ def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDAr
         raise
     except (
         OSError, ValueError, SyntaxError, EOFError, TypeError, IndexError, KeyError, OverflowError, MemoryError,
-        struct.error, zlib.error, Image.DecompressionBombError, Image.DecompressionBombWarning,
-    ) as error:  # fmt: skip  # what Pillow's parsers are known to raise on damaged files
+        struct.error, zlib.error, Image.DecompressionBombError, Warning,
+    ) as error:  # fmt: skip  # what Pillow's parsers raise on damaged files; warnings too where a user made them errors
         raise CaptureError(f"{where}: not a readable {' or '.join(formats)} image: {error}") from error
     # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
     return mode, pixels, (head[24], head[25]) if is_png else (0, 0)

@@ -13,6 +13,7 @@ from pcdata import extras
 from pcdata.structures import DepthFrame, PointCloud
 
 _PALETTE = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e", "#9498a0")
+_COLUMNS = 4
 _MAX_DRAWN = 60_000  # more points than a panel has pixels only cost time
 
 
@@ -24,7 +25,7 @@ def save_pipeline_figure(
     Args:
         path: the PNG file.
         capture: the first view is drawn.
-        stages: (caption, cloud) in order; objects are told apart by colour where the cloud has labels from clustering.
+        stages: (caption, cloud) in order; drawn in the camera's colours, by object once clustered, by normal at last.
         title: printed above all.
 
     Raises:
@@ -34,21 +35,18 @@ def save_pipeline_figure(
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no pyplot: no global state, no display
     from matplotlib.figure import Figure
 
-    columns = 4
-    rows = 1 + -(-len(stages) // columns)
-    figure = Figure(figsize=(4.0 * columns, 3.3 * rows), dpi=110, layout="constrained")
+    rows = -(-(3 + len(stages)) // _COLUMNS)
+    figure = Figure(figsize=(4.2 * _COLUMNS, 3.6 * rows), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False)
     if title:
         figure.suptitle(title, fontsize=15, fontweight="bold")
-    _draw_colors(axes[0, 0], capture)
-    _draw_depth(figure, axes[0, 1], capture)
-    _draw_counts(axes[0, 2], stages)
-    _draw_facts(axes[0, 3], stages)
-    flat = axes[1:].flatten()
-    for axis, (caption, cloud) in zip(flat, stages):
-        _draw_cloud(axis, caption, cloud)
-    for axis in flat[len(stages) :]:
+    axes = iter(figure.subplots(rows, _COLUMNS, squeeze=False).flatten())
+    _draw_colors(next(axes), capture)
+    _draw_depth(figure, next(axes), capture)
+    for caption, cloud in stages:
+        _draw_cloud(next(axes), caption, cloud)
+    _draw_counts(next(axes), stages)
+    for axis in axes:
         axis.set_axis_off()
     figure.savefig(path, format="png")
 
@@ -82,23 +80,6 @@ def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_facts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
-    axis.set_axis_off()
-    cloud = stages[-1][1]
-    axis.set_title("the sample")
-    meta = cloud.meta[0]
-    lines = [f"points   {cloud.num_points}", f"frame    {cloud.frame_id}", f"unit     {cloud.unit}"]
-    lines += [f"fields   {', '.join(cloud.fields())}"]
-    if meta.get("objects"):
-        lines += [f"objects  {len(meta['objects'])}"]
-    if meta.get("planes"):
-        plane = meta["planes"][0]
-        normal = ", ".join(f"{value:+.3f}" for value in plane["normal"])
-        lines += [f"plane    n = ({normal})", f"         offset {1000 * plane['offset']:+.1f} mm in {plane['frame']!r}"]
-    wrapped = "\n".join(lines).replace("source_index", "\n         source_index")
-    axis.text(0.0, 0.95, wrapped, va="top", family="monospace", fontsize=9, transform=axis.transAxes)
-
-
 def _draw_cloud(axis: Any, caption: str, cloud: PointCloud) -> None:
     """Draw an oblique orthographic view, far points first."""
     axis.set_title(f"{caption}: {cloud.num_points:,} points", fontsize=10)
@@ -125,9 +106,11 @@ def _view_axes(frame_id: str) -> torch.Tensor:
 
 
 def _point_colors(cloud: PointCloud) -> np.ndarray:
-    """Colour by object once objects were clustered, else by the camera's colours, else by depth."""
+    """Colour by normal where there are normals, by object once they were clustered, else by the camera's colours."""
     from matplotlib.colors import to_rgb
 
+    if cloud.normals is not None:
+        return (cloud.normals.cpu().numpy() + 1) / 2
     clustered = any(step["step"] == "ClusterObjects" for step in cloud.history[0])
     if clustered and cloud.labels is not None:
         palette = np.array([to_rgb(color) for color in _PALETTE])

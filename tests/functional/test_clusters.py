@@ -70,16 +70,12 @@ def test_labels_equal_the_textbook_algorithm_on_any_small_cloud(
 
 
 def test_a_border_point_takes_the_lowest_label_in_reach():
-    # Two groups of three at one spot each, and a point between that is near both but not core.
-    points = torch.tensor([[0.0, 0, 0]] * 3 + [[1.0, 0, 0]] * 3 + [[0.5, 0, 0]])
-    assert dbscan(points, eps=0.6, min_points=8).tolist() == [-1] * 7
-    labels = dbscan(points[[6, 3, 4, 5, 0, 1, 2]], eps=0.6, min_points=4)
-    assert labels.tolist() == [0] * 7  # with four needed, the middle joins both groups
-    apart = torch.tensor([[1.0, 0, 0]] * 4 + [[0.0, 0, 0]] * 4 + [[0.5, 0.0, 0]])
-    assert dbscan(apart, eps=0.5001, min_points=10).tolist() == [-1] * 9
-    two = torch.tensor([[1.0, 0, 0], [1.4, 0, 0], [1.2, 0, 0], [0.0, 0, 0], [-0.4, 0, 0], [-0.2, 0, 0], [0.5, 0, 0]])
-    assert dbscan(two, eps=0.51, min_points=4).tolist() == [0, 0, 0, 1, 1, 1, 0] or True
-    assert torch.equal(dbscan(two, eps=0.51, min_points=4), textbook_dbscan(two, 0.51, 4))
+    # Cores at x = 1 and x = 0, each with three followers; x = 0.5 has both cores in reach and is not core itself.
+    x = torch.tensor([1.0, 1.4, 1.2, 0.0, -0.4, -0.2, 0.5])
+    points = torch.stack([x, torch.zeros(7), torch.zeros(7)], dim=1)
+    assert dbscan(points, eps=0.51, min_points=4).tolist() == [0, 0, 0, 1, 1, 1, 0]
+    order = torch.tensor([3, 4, 5, 0, 1, 2, 6])
+    assert dbscan(points[order], eps=0.51, min_points=4).tolist() == [0, 0, 0, 1, 1, 1, 0]
 
 
 def test_eps_is_strict_and_the_count_includes_the_point_itself():

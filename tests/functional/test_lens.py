@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError, ShapeError
+from pcdata.functional import lens as lens_module
 from pcdata.functional.lens import distort_normalized, fold_radius, undistort_normalized
 
 # One realistic lens per length: a webcam, the same with k3, a rational wide-angle (Azure Kinect), and with thin prism.
@@ -96,6 +97,24 @@ def test_beyond_the_reach_of_the_lens_there_is_no_answer():
     reach = fold * (1 - 0.3 * fold * fold)
     bent = torch.tensor([[[0.999 * reach, 0.0], [1.001 * reach, 0.0], [0.0, 3.0]]], dtype=torch.float64)
     assert undistort_normalized(bent, lens).isnan().tolist() == [[[False, False], [True, True], [True, True]]]
+
+
+def test_a_solution_beyond_the_fold_is_not_taken():
+    # k1 r^2 + k2 r^4 = 0 at r^2 = 2.5, so the lens seems to leave that ray alone; but it folds at r^2 = 0.5.
+    lens = torch.tensor([[-1.0, 0.4, 0.0, 0.0]], dtype=torch.float64)
+    ray = torch.tensor([[[2.5**0.5, 0.0]]], dtype=torch.float64)
+    torch.testing.assert_close(distort_normalized(ray, lens), ray)
+    assert bool(undistort_normalized(ray, lens).isnan().all())
+
+
+@pytest.mark.parametrize("count", LENSES)
+def test_the_slope_used_by_newton_is_the_derivative(count):
+    terms = lens_module._split(coefficients(count), 1)
+    x, y = torch.rand((2, 50), dtype=torch.float64) - 0.5
+    by_hand = lens_module._jacobian(x, y, terms)
+    (xx, xy), (yx, yy) = torch.autograd.functional.jacobian(lambda x, y: lens_module._bend(x, y, terms), (x, y))
+    for ours, theirs in zip(by_hand, (xx, xy, yx, yy)):
+        torch.testing.assert_close(ours, theirs.diagonal())
 
 
 @pytest.mark.parametrize(("count", "message"), [(14, "tilted sensor"), (6, "4, 5, 8 or 12"), (0, "pass None")])

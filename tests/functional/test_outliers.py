@@ -134,9 +134,10 @@ def test_statistical_mask_equals_open3d_with_duplicates(
     expected = removed(kept, len(points))
     # Means that are equal but for rounding (all points alike) are a coin toss in both libraries.
     distances = torch.cdist(points.double(), points.double()).sort(1).values[:, :num_neighbors].mean(1)
-    threshold = distances.mean() + ratio * ((distances - distances.mean()) ** 2 * (distances > 0)).sum().div(
-        max(1, len(points) - 1)
-    ).sqrt()
+    threshold = (
+        distances.mean()
+        + ratio * ((distances - distances.mean()) ** 2 * (distances > 0)).sum().div(max(1, len(points) - 1)).sqrt()
+    )
     clear = ((distances - threshold).abs() > 1e-6) | (distances == 0)
     assert torch.equal(mask[clear], expected[clear])
 

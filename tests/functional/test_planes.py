@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.errors import ConfigError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional import planes as planes_module
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.planes import fit_plane, plane_distance, ransac_plane
@@ -65,7 +65,8 @@ def angle_to(plane: torch.Tensor, direction: list[float]) -> float:
 def test_a_known_plane_is_found(seed, offset):
     normal = torch.randn(3, generator=torch.Generator().manual_seed(seed)).tolist()
     points = torch.cat([slab(500, normal, offset, seed=seed), clutter(100, seed)])
-    planes, inliers = ransac_plane(points, num_hypotheses=100)
+    planes, inliers = ransac_plane(points.requires_grad_(), num_hypotheses=100)
+    assert not planes.requires_grad
     assert planes.dtype == torch.float64
     assert float(planes[0, :3].norm()) == pytest.approx(1.0)
     assert bool(inliers[:500].all())
@@ -102,6 +103,12 @@ def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
     counts = planes_module._count_inliers(points, hypotheses, 0.01)
     expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
     assert torch.equal(counts, expected)
+
+
+def test_scoring_is_strict_too():
+    points = torch.tensor([[0.0, 0, 0.25], [0, 0, -0.25], [0, 0, 0.125]])
+    level = torch.tensor([[0.0, 0, 1, 0]], dtype=torch.float64)
+    assert planes_module._count_inliers(points, level, 0.25).tolist() == [1]
 
 
 def test_among_equal_hypotheses_the_earliest_wins():
@@ -218,6 +225,7 @@ def test_too_few_points_name_their_cloud(count):
         ({"num_hypotheses": 0}, ConfigError, "num_hypotheses"),
         ({"up": (0, 0, 0)}, ConfigError, "not zero"),
         ({"up": (0, 1)}, ShapeError, "up must be"),
+        ({"seed": 1.5}, DTypeError, "seed must be an int"),
         ({"seed": [1, 2]}, ShapeError, "2 seeds were given for 1 clouds"),
     ],
 )

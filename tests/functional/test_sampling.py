@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
@@ -101,6 +101,8 @@ def test_asking_for_more_points_than_there_are_names_the_cloud():
 def test_wrong_counts_are_refused():
     with pytest.raises(ShapeError, match="2 counts were given for 1 clouds"):
         farthest_point_sample(cloud(5), num_samples=[1, 2])
+    with pytest.raises(DTypeError, match=r"must be an int.*2\.5"):
+        farthest_point_sample(cloud(5), num_samples=2.5)
     with pytest.raises(ConfigError, match="negative"):
         farthest_point_sample(cloud(5), num_samples=-1)
 

@@ -79,7 +79,7 @@ def test_the_order_of_points_does_not_change_a_bit_of_the_means():
 
 
 def test_voxels_come_in_the_order_of_their_lowest_row():
-    _, _, inverse = voxel_downsample(cloud(500), voxel_size=0.2)
+    _, _, inverse = voxel_downsample(cloud(500).requires_grad_(), voxel_size=0.2)
     first_rows = [inverse.tolist().index(voxel) for voxel in range(int(inverse.max()) + 1)]
     assert first_rows == sorted(first_rows)
 
@@ -105,6 +105,13 @@ def test_keys_too_wide_for_64_bits_still_tell_voxels_apart():
     means, _, inverse = voxel_downsample(points, voxel_size=1e-3)
     torch.testing.assert_close(means, corners, rtol=1e-7, atol=0)
     assert inverse.tolist() == [*range(8), *range(8)]
+
+
+def test_voxels_whose_packed_keys_would_wrap_to_the_same_number_stay_apart():
+    # 2^32 voxels along each axis: one step in x is 2^64 in a packed key, which is 0.
+    step = 1 / (2**32 - 1)
+    points = torch.tensor([[0.0, 0, 0], [step, 0, 0], [1, 1, 1]])
+    assert voxel_downsample(points, voxel_size=step)[2].tolist() == [0, 1, 2]
 
 
 def test_an_extent_that_float64_cannot_count_is_an_error():

@@ -54,7 +54,10 @@ def test_a_written_calibration_reads_back_exactly(tmp_path: Path, distortion: li
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({k: v for k, v in GOOD.items() if k != "fx"} | {"Fx": 1}, "'fx' is missing, 'Fx' is not known; did you mean 'fx'"),
+        (
+            {k: v for k, v in GOOD.items() if k != "fx"} | {"Fx": 1},
+            "'fx' is missing, 'Fx' is not known; did you mean 'fx'",
+        ),
         (GOOD | {"distorsion": [0, 0, 0, 0]}, "'distorsion' is not known; did you mean 'distortion'"),
         (GOOD | {"depth_scale": 1000}, "three incompatible meanings"),
         (GOOD | {"fx": -585}, "focal lengths must be positive"),
@@ -78,7 +81,9 @@ def test_a_written_calibration_reads_back_exactly(tmp_path: Path, distortion: li
         ("x" * (1 << 21), "more than the limit"),
     ],
 )
-def test_a_wrong_calibration_is_refused_with_the_reason_and_the_file(tmp_path: Path, content: Any, message: str) -> None:
+def test_a_wrong_calibration_is_refused_with_the_reason_and_the_file(
+    tmp_path: Path, content: Any, message: str
+) -> None:
     with pytest.raises(CaptureError, match=message) as caught:
         read_calibration(write(tmp_path / "c.json", content))
     assert str(tmp_path / "c.json") in str(caught.value)

@@ -77,7 +77,7 @@ def test_a_cut_stream_is_noticed(data: bytes, draw: st.DataObject) -> None:
 @pytest.mark.parametrize("error", [-1, 1])
 def test_a_stream_of_other_length_than_declared_is_noticed(error: int) -> None:
     data = b"tabletop" * 1000
-    with pytest.raises(CaptureError, match="declared|damaged"):
+    with pytest.raises(CaptureError, match=r"declared|damaged"):
         lzf.decompress(lzf.compress(data), len(data) + error)
 
 

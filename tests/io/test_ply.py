@@ -71,7 +71,9 @@ def test_vertices_are_found_among_other_elements_and_lists(tmp_path: Path, encod
 
 @pytest.mark.parametrize("encoding", ORDERS)
 def test_lists_within_vertices_are_skipped(tmp_path: Path, encoding: str) -> None:
-    declarations = "element vertex 2\nproperty float x\nproperty list uchar ushort seen_by\nproperty float y\nproperty float z"
+    declarations = (
+        "element vertex 2\nproperty float x\nproperty list uchar ushort seen_by\nproperty float y\nproperty float z"
+    )
     data = ply(encoding, declarations, ("fBHHff", (1, 2, 9, 9, 2, 3)), ("fBff", (4, 0, 5, 6)))
     assert read_ply(write(tmp_path / "c.ply", data)).points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
@@ -114,7 +116,9 @@ def test_vertices_without_finite_coordinates_are_dropped(tmp_path: Path) -> None
 
 
 def test_millimetres_are_noticed(tmp_path: Path) -> None:
-    path = write(tmp_path / "c.ply", ply("ascii", XYZ.format(3), ("", (0, 0, 500)), ("", (300, 0, 900)), ("", (0, 400, 1))))
+    path = write(
+        tmp_path / "c.ply", ply("ascii", XYZ.format(3), ("", (0, 0, 500)), ("", (300, 0, 900)), ("", (0, 400, 1)))
+    )
     with pytest.raises(UnitError, match="in millimetres"):
         read_ply(path)
     assert read_ply(path, metres_per_unit=0.001).points[1].tolist() == pytest.approx([0.3, 0, 0.9])
@@ -147,7 +151,7 @@ def test_hostile_headers_are_refused(tmp_path: Path, encoding: str, declarations
 
 @pytest.mark.parametrize("data", [b"obj\n", b"ply\n", b"ply\nformat ascii 2.0\nend_header\n", b"\0" * 100])
 def test_files_that_are_no_ply_are_refused(tmp_path: Path, data: bytes) -> None:
-    with pytest.raises(CaptureError, match="not a PLY|not known"):
+    with pytest.raises(CaptureError, match=r"not a PLY|not known"):
         read_ply(write(tmp_path / "c.ply", data))
 
 
@@ -183,7 +187,9 @@ def clouds(draw: st.DrawFn) -> PointCloud:
         points=torch.randn(n, 3, generator=generator) * draw(st.sampled_from([1e-6, 1.0, 30.0])),
         frame_id="camera",
         colors=torch.randint(0, 256, (n, 3), generator=generator) / 255 if draw(st.booleans()) else None,
-        normals=torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1) if draw(st.booleans()) else None,
+        normals=torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
+        if draw(st.booleans())
+        else None,
         labels=torch.randint(-1, 100, (n,), generator=generator) if draw(st.booleans()) else None,
         extra=extra,
         kinds=dict.fromkeys(extra, Kind.INVARIANT),

@@ -1,0 +1,472 @@
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.io import savemat
+
+from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, UnitError
+from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
+from pcdata.io.source import sequence_positions
+from pcdata.structures import DepthFrame, PointCloud
+
+HEIGHT, WIDTH = 6, 8
+K: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
+
+
+def image(path: Path, array: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(array).save(path)
+
+
+def depth_of(seed: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(500, 1500, shape).astype(np.uint16)
+
+
+def color_of(seed: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 3)).astype(np.uint8)
+
+
+def pose_text(shift: float) -> str:
+    return f"0 -1 0 {shift}\n1 0 0 0\n0 0 1 0.5\n0 0 0 1\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    root = tmp_path / "capture"
+    for i, name in enumerate(["a_2", "a_10", "a_1"]):
+        image(root / "depth" / f"{name}.png", depth_of(i))
+        image(root / "color" / f"{name}.png", color_of(i))
+        image(root / "labels" / f"{name}.png", np.full((HEIGHT, WIDTH), i, np.uint8))
+        image(root / "masks" / f"{name}.png", np.eye(HEIGHT, WIDTH, dtype=bool))
+        (root / "poses").mkdir(exist_ok=True)
+        (root / "poses" / f"{name}.txt").write_text(pose_text(i))
+    (root / "intrinsics.json").write_text(json.dumps(K | {"metres_per_unit": 0.001, "frame_id": "base"}))
+    return root
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> Path:
+    root = tmp_path / "seq-01"
+    for i in (0, 20, 40):
+        raw = depth_of(i)
+        raw[0, :2] = 65535, 0
+        image(root / f"frame-{i:06d}.depth.png", raw)
+        image(root / f"frame-{i:06d}.color.png", color_of(i))
+        (root / f"frame-{i:06d}.pose.txt").write_text(pose_text(i))
+    (root / "camera-intrinsics.txt").write_text("10 0 3.5\n0 11 2.5\n0 0 1\n")
+    return root
+
+
+def graspnet_frame(root: Path, **changes: Any) -> Path:
+    label = np.zeros((HEIGHT, WIDTH), np.uint8)
+    label[2, 3], label[4, 5] = 4, 7
+    image(root / "depth.png", depth_of(1))
+    image(root / "color.png", color_of(1))
+    image(root / "label.png", label)
+    image(root / "workspace_mask.png", np.eye(HEIGHT, WIDTH, dtype=bool))
+    poses = np.tile(np.eye(4)[:3, :, None], (1, 1, 2))
+    poses[:, 3, 1] = 0.1, 0.2, 0.3
+    meta = {"intrinsic_matrix": np.array([[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]]), "factor_depth": np.array([[1000]])}
+    meta |= {"cls_indexes": np.array([[4, 7]], np.uint8), "poses": poses} | changes
+    savemat(root / "meta.mat", {name: value for name, value in meta.items() if value is not None})
+    return root
+
+
+@pytest.fixture
+def clouds(tmp_path: Path) -> Path:
+    root = tmp_path / "clouds"
+    root.mkdir()
+    write_pcd(PointCloud(points=torch.rand(5, 3), frame_id="x"), root / "b.pcd")
+    write_ply(PointCloud(points=torch.rand(4, 3), frame_id="x"), root / "a.ply")
+    (root / "README.md").write_text("notes do not matter")
+    return root
+
+
+# -- laws that every layout keeps --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["folder", "seven_scenes", "graspnet", "clouds"])
+def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    if request.param == "graspnet":
+        return graspnet_frame(tmp_path / "set" / "frame_1").parent
+    fixture = {"seven_scenes": "scenes"}.get(request.param, request.param)
+    path: Path = request.getfixturevalue(fixture)
+    return path
+
+
+def test_ids_are_sorted_unique_and_all_load(capture: Path) -> None:
+    source = open_source(capture)
+    assert source.ids == sorted(set(source.ids))
+    assert len(source) == len(source.ids) > 0
+    for sample_id in source.ids:
+        sample = source.load(sample_id)
+        facts = sample.provenance if isinstance(sample, DepthFrame) else sample.meta[0]["provenance"]
+        assert (sample.sample_id if isinstance(sample, DepthFrame) else sample.meta[0]["sample_id"]) == sample_id
+        assert facts["source"] == source.kind
+        assert json.loads(json.dumps(facts)) == facts
+        assert all((capture / name).is_file() for name in facts["files"].values())
+        assert facts["metres_per_unit"] > 0
+
+
+def test_a_source_is_small_when_pickled_and_still_loads(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(capture.parent)
+    source = open_source(capture.name)  # a relative path must survive a change of folder
+    again = pickle.loads(pickle.dumps(source))
+    monkeypatch.chdir("/")
+    assert again.ids == source.ids
+    assert len(pickle.dumps(source)) < 5000
+    first, second = source.load(source.ids[0]), again.load(source.ids[0])
+    if isinstance(first, DepthFrame):
+        assert torch.equal(first.depth, second.depth)
+    else:
+        assert torch.equal(first.points, second.points)
+
+
+def test_limit_keeps_the_first_samples_unchanged(capture: Path) -> None:
+    whole, one = open_source(capture), open_source(capture, limit=1)
+    assert one.ids == whole.ids[:1]
+    assert one.files(one.ids[0]) == whole.files(one.ids[0])
+    with pytest.raises(CaptureError, match="no sample 'absent'"):
+        one.load("absent")
+    if len(whole) > 1:
+        with pytest.raises(CaptureError, match="no sample"):
+            one.load(whole.ids[1])
+
+
+def test_naming_the_kind_gives_what_detection_gives(capture: Path) -> None:
+    found = open_source(capture)
+    named = open_source(capture, kind=found.kind)
+    assert type(named) is type(found)
+    assert named.ids == found.ids
+
+
+def test_unknown_options_kinds_and_limits_are_refused_with_near_matches(capture: Path) -> None:
+    with pytest.raises(ConfigError, match="has no option 'nonsense'"):
+        open_source(capture, nonsense=1)
+    with pytest.raises(ConfigError, match="did you mean 'folder'"):
+        open_source(capture, kind="foldr")
+    for limit in (0, -1, 1.5, True):
+        with pytest.raises(ConfigError, match="limit must be"):
+            open_source(capture, limit=limit)  # type: ignore[arg-type]
+
+
+# -- detection ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_of_no_known_layout_lists_what_each_needs_and_what_was_found(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_bytes(b"x")
+    with pytest.raises(CaptureError, match=r"found holiday\.jpg") as caught:
+        open_source(tmp_path)
+    assert all(layout.needs in str(caught.value) for layout in LAYOUTS.values())
+
+
+def test_missing_paths_and_foreign_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no such file or folder"):
+        open_source(tmp_path / "absent")
+    (tmp_path / "scan.bag").write_bytes(b"x")
+    with pytest.raises(CaptureError, match=r"a \.bag file"):
+        open_source(tmp_path / "scan.bag")
+
+
+def test_a_path_with_the_signs_of_two_layouts_asks_for_the_kind(scenes: Path, clouds: Path) -> None:
+    shutil.copy(clouds / "a.ply", scenes / "mesh.ply")
+    with pytest.raises(CaptureError, match="looks like seven_scenes and clouds; say which"):
+        open_source(scenes)
+    assert open_source(scenes, kind="seven_scenes").kind == "seven_scenes"
+
+
+def test_naming_the_wrong_kind_says_what_it_needs(tmp_path: Path) -> None:
+    for kind in LAYOUTS:
+        with pytest.raises(CaptureError, match=r"needs"):
+            open_source(tmp_path, kind=kind)
+
+
+# -- folder ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_sample_carries_every_file_in_its_place(folder: Path) -> None:
+    source = open_source(folder)
+    assert source.ids == ["a_1", "a_10", "a_2"]
+    frame = source.load("a_10")
+    assert isinstance(frame, DepthFrame)
+    assert torch.equal(frame.depth[0], read_depth(folder / "depth" / "a_10.png", metres_per_unit=0.001))
+    assert frame.colors is not None
+    assert np.array_equal(frame.colors[0].numpy(), color_of(1))
+    assert frame.labels is not None
+    assert frame.labels.unique().tolist() == [1]
+    assert frame.mask is not None
+    assert int(frame.mask.sum()) == HEIGHT
+    assert frame.world_from_camera is not None
+    assert frame.world_from_camera[0].tolist() == [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+    assert (frame.frame_id, frame.capture_index) == ("base", 10)
+    assert frame.camera.intrinsics[0].tolist() == [[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]]
+
+
+def test_depth_alone_is_enough_and_says_nothing_of_a_world(folder: Path) -> None:
+    for name in ("color", "labels", "masks", "poses"):
+        shutil.rmtree(folder / name)
+    frame = open_source(folder).load("a_1")
+    assert isinstance(frame, DepthFrame)
+    assert (frame.colors, frame.labels, frame.mask, frame.world_from_camera, frame.frame_id) == (None,) * 5
+
+
+def test_float_npy_in_metres_and_camera_json_are_read(folder: Path) -> None:
+    for name in ("color", "labels", "masks", "poses", "depth"):
+        shutil.rmtree(folder / name)
+    (folder / "intrinsics.json").unlink()
+    (folder / "camera.json").write_text(json.dumps(K))
+    (folder / "depth").mkdir()
+    np.save(folder / "depth" / "only.npy", np.full((HEIGHT, WIDTH), 0.75, np.float32))
+    frame = open_source(folder, metres_per_unit=1.0).load("only")
+    assert isinstance(frame, DepthFrame)
+    assert frame.depth.unique().tolist() == [0.75]
+
+
+def test_the_background_label_becomes_none_on_request(folder: Path) -> None:
+    frame = open_source(folder, background_label=1).load("a_10")
+    assert isinstance(frame, DepthFrame)
+    assert frame.labels is not None
+    assert frame.labels.unique().tolist() == [-1]
+
+
+def test_the_unit_must_be_stated_once(folder: Path) -> None:
+    with pytest.raises(UnitError, match=r"says metres_per_unit 0\.001, the argument 0\.0002"):
+        open_source(folder, metres_per_unit=0.0002)
+    (folder / "intrinsics.json").write_text(json.dumps(K))
+    with pytest.raises(UnitError, match="the unit of depth must be stated"):
+        open_source(folder)
+    assert open_source(folder, metres_per_unit=0.001).ids
+
+
+def break_color_missing(root: Path) -> None:
+    (root / "color" / "a_2.png").unlink()
+
+
+def break_pose_missing(root: Path) -> None:
+    (root / "poses" / "a_1.txt").unlink()
+
+
+def break_depth_missing(root: Path) -> None:
+    (root / "depth" / "a_10.png").unlink()
+
+
+def break_twice(root: Path) -> None:
+    np.save(root / "depth" / "a_1.npy", depth_of(0))
+
+
+def break_foreign(root: Path) -> None:
+    (root / "depth" / "a_1.exr").write_bytes(b"x")
+
+
+def break_no_depth(root: Path) -> None:
+    for file in (root / "depth").iterdir():
+        file.unlink()
+
+
+def break_two_calibrations(root: Path) -> None:
+    shutil.copy(root / "intrinsics.json", root / "camera.json")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (break_color_missing, "color is missing for a_2"),
+        (break_pose_missing, "pose is missing for a_1"),
+        (break_depth_missing, "there is color but no depth for a_10.*there is pose but no depth for a_10"),
+        (break_twice, r"a_1\.npy and a_1\.png are both 'a_1'"),
+        (break_foreign, r"there is a_1\.exr"),
+        (break_no_depth, "no sample found"),
+        (break_two_calibrations, "but both is there"),
+    ],
+)
+def test_an_incomplete_folder_is_refused_when_it_is_opened(
+    folder: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    damage(folder)
+    with pytest.raises(CaptureError, match=message):
+        open_source(folder)
+
+
+def test_hidden_files_do_not_matter(folder: Path) -> None:
+    (folder / "depth" / ".DS_Store").write_bytes(b"x")
+    (folder / "depth" / "Thumbs.db").write_bytes(b"x")
+    assert len(open_source(folder)) == 3
+
+
+@pytest.mark.parametrize("role", ["color", "labels", "masks"])
+def test_an_image_of_another_size_than_its_depth_is_refused(folder: Path, role: str) -> None:
+    array = color_of(0, (4, 4)) if role == "color" else np.zeros((4, 4), np.uint8)
+    image(folder / role / "a_1.png", array)
+    with pytest.raises(CaptureError, match=r"image is 4x4 .* but its depth is 8x6") as caught:
+        open_source(folder).load("a_1")
+    assert any("'a_1'" in note for note in caught.value.__notes__)
+
+
+def test_intrinsics_of_another_resolution_are_refused_with_the_remedy(folder: Path) -> None:
+    stated = K | {"width": 16, "height": 12, "cx": 7.5, "cy": 5.5, "metres_per_unit": 0.001}
+    (folder / "intrinsics.json").write_text(json.dumps(stated))
+    with pytest.raises(CaptureError, match=r"depth is 8x6 .* belong to 16x12 .*Camera\.resized\(\(6, 8\)\)"):
+        open_source(folder).load("a_1")
+
+
+def test_poses_cannot_lead_to_the_camera_they_start_from(folder: Path) -> None:
+    (folder / "intrinsics.json").write_text(json.dumps(K | {"metres_per_unit": 0.001, "frame_id": "camera"}))
+    with pytest.raises(CaptureError, match="cannot be 'camera'"):
+        open_source(folder)
+
+
+def test_capture_index_is_the_number_in_the_name_or_else_the_place() -> None:
+    assert sequence_positions(["f1", "f10", "f2"]) == {"f1": 1, "f10": 10, "f2": 2}
+    assert sequence_positions(["mug", "bowl"]) == {"bowl": 0, "mug": 1}
+
+
+# -- 7-Scenes ----------------------------------------------------------------------------------------------------------
+
+
+def test_seven_scenes_frames_have_pose_unit_and_both_marks_of_no_reading(scenes: Path) -> None:
+    frame = open_source(scenes).load("frame-000020")
+    assert isinstance(frame, DepthFrame)
+    assert (frame.depth == 0).nonzero().tolist() == [[0, 0, 0], [0, 0, 1]]
+    assert float(frame.depth.max()) < 1.5
+    assert frame.world_from_camera is not None
+    assert frame.world_from_camera[0, 0, 3] == 20
+    assert (frame.frame_id, frame.capture_index, frame.camera.size) == ("world", 20, (HEIGHT, WIDTH))
+
+
+def test_lost_tracking_is_reported_with_the_frame(scenes: Path) -> None:
+    (scenes / "frame-000020.pose.txt").write_text("\n".join(["-inf -inf -inf -inf"] * 4))
+    source = open_source(scenes)
+    source.load("frame-000000")
+    with pytest.raises(PoseError, match=r"frame-000020\.pose\.txt.*tracking lost"):
+        source.load("frame-000020")
+
+
+def test_seven_scenes_without_intrinsics_takes_them_as_an_option_only(scenes: Path) -> None:
+    with pytest.raises(CaptureError, match="both are given"):
+        open_source(scenes, intrinsics=(585, 585, 320, 240))
+    (scenes / "camera-intrinsics.txt").unlink()
+    with pytest.raises(CaptureError, match=r"neither is there; the data set documents \(585"):
+        open_source(scenes)
+    frame = open_source(scenes, intrinsics=(10, 11, 3.5, 2.5)).load("frame-000000")
+    assert isinstance(frame, DepthFrame)
+    assert frame.camera.intrinsics[0].tolist() == [[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]]
+
+
+def test_seven_scenes_frames_without_their_partners_are_named(scenes: Path) -> None:
+    (scenes / "frame-000020.pose.txt").unlink()
+    (scenes / "frame-000040.depth.png").unlink()
+    with pytest.raises(CaptureError, match=r"no depth for frame-000040.*pose is missing for frame-000020"):
+        open_source(scenes)
+
+
+# -- GraspNet ----------------------------------------------------------------------------------------------------------
+
+
+def test_graspnet_meta_becomes_camera_unit_labels_and_object_poses(tmp_path: Path) -> None:
+    source = open_source(graspnet_frame(tmp_path / "scene"))
+    assert source.ids == ["scene"]
+    frame = source.load("scene")
+    assert isinstance(frame, DepthFrame)
+    assert frame.camera.intrinsics[0].tolist() == [[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]]
+    assert np.array_equal(frame.depth[0].numpy(), (depth_of(1) / 1000).astype(np.float32))
+    assert frame.labels is not None
+    assert sorted(frame.labels.unique().tolist()) == [-1, 4, 7]
+    assert frame.labels[0, 2, 3] == 4
+    assert frame.mask is not None
+    assert int(frame.mask.sum()) == HEIGHT
+    assert frame.provenance["cls_indexes"] == [4, 7]
+    assert frame.provenance["camera_from_object"][1] == [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    assert frame.frame_id is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"intrinsic_matrix": None}, "must have intrinsic_matrix"),
+        ({"intrinsic_matrix": np.eye(2)}, "finite numbers of shape"),
+        ({"intrinsic_matrix": np.full((3, 3), np.nan)}, "finite numbers of shape"),
+        ({"intrinsic_matrix": np.array([[10, 0, 0], [0, 11, 0], [3.5, 2.5, 1]])}, "intrinsic_matrix must be fx"),
+        ({"intrinsic_matrix": np.diag([-1.0, 1, 1])}, "focal"),
+        ({"factor_depth": np.array([[0]])}, "factor_depth"),
+        ({"factor_depth": np.array([[0.001]])}, "at least 1"),
+        ({"factor_depth": np.array([[1]])}, r"is metres_per_unit right\?"),
+        ({"poses": np.zeros((3, 4, 5))}, r"poses must be \(3, 4, 2\)"),
+        ({"poses": np.zeros((3, 4, 2))}, "not rigid"),
+        ({"cls_indexes": np.array([[0.5, 1]])}, "whole numbers"),
+    ],
+)
+def test_graspnet_meta_that_cannot_be_true_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    source = open_source(graspnet_frame(tmp_path / "scene", **changes))
+    with pytest.raises(PcdataError, match=message):
+        source.load("scene")
+
+
+def test_a_damaged_meta_file_is_a_capture_error(tmp_path: Path) -> None:
+    root = graspnet_frame(tmp_path / "scene")
+    (root / "meta.mat").write_bytes((root / "meta.mat").read_bytes()[:200])
+    with pytest.raises(CaptureError, match=r"not a readable MATLAB 5 file|must have"):
+        open_source(root).load("scene")
+
+
+# -- cloud files -------------------------------------------------------------------------------------------------------
+
+
+def test_a_single_cloud_file_is_a_source_of_one(clouds: Path) -> None:
+    for name, count in (("a.ply", 4), ("b.pcd", 5)):
+        source = open_source(clouds / name, frame_id="table")
+        assert source.ids == [name[0]]
+        cloud = source.load(name[0])
+        assert isinstance(cloud, PointCloud)
+        assert (cloud.num_points, cloud.frame_id) == (count, "table")
+
+
+def test_two_cloud_files_of_one_name_are_refused(clouds: Path) -> None:
+    shutil.copy(clouds / "a.ply", clouds / "b.ply")
+    with pytest.raises(CaptureError, match=r"b\.pcd and b\.ply are both 'b'"):
+        open_source(clouds, kind="clouds")
+
+
+# -- real captures -----------------------------------------------------------------------------------------------------
+
+
+def test_the_real_graspnet_frame_has_the_documented_facts(test_data: Path) -> None:
+    frame = open_source(test_data / "graspnet_frame").load("graspnet_frame")
+    assert isinstance(frame, DepthFrame)
+    valid = frame.depth[frame.depth > 0]
+    assert frame.size == (720, 1280)
+    assert len(valid) == 825_160
+    assert (round(float(valid.min()), 3), round(float(valid.max()), 2)) == (0.229, 1.59)
+    assert frame.camera.intrinsics[0, 0, 0] == pytest.approx(631.5, abs=0.1)
+    assert frame.mask is not None
+    assert 0 < int(frame.mask.sum()) < frame.mask.numel()
+    assert len(frame.provenance["camera_from_object"]) == len(frame.provenance["cls_indexes"])
+
+
+def test_the_real_seven_scenes_sequence_has_the_documented_facts(test_data: Path) -> None:
+    source = open_source(test_data / "seven_scenes")
+    assert len(source) == 50
+    for place in (0, 25, 49):
+        frame = source.load(source.ids[place])
+        assert isinstance(frame, DepthFrame)
+        assert frame.capture_index == 20 * place
+        assert frame.size == (480, 640)
+        assert float(frame.depth.max()) < 65
+        assert frame.camera.intrinsics[0, 0, 0] == 585
+
+
+def test_the_real_labelled_clouds_open_as_one_source(test_data: Path) -> None:
+    source = open_source(test_data / "osd")
+    assert len(source) == 12
+    cloud = source.load("learn0")
+    assert isinstance(cloud, PointCloud)
+    assert cloud.labels is not None
+    assert cloud.meta[0]["organised_size"] == [480, 640]
