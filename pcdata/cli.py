@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -17,9 +20,10 @@ from pcdata.errors import ConfigError, PcdataError
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code: 0 done, 1 the data or a file is at fault, 2 the request is."""
     arguments = _parser().parse_args(argv)
-    signal.signal(signal.SIGTERM, _interrupt)  # a polite kill cleans up like Ctrl-C
     try:
-        arguments.run(arguments)
+        with _sigterm_interrupts():
+            arguments.run(arguments)
+            sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was left behind", file=sys.stderr)
         return 130
@@ -30,7 +34,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         for note in getattr(error, "__notes__", ()):
             print(f"  {note}", file=sys.stderr)
         return 2 if isinstance(error, ConfigError) else 1
+    except BrokenPipeError:  # "pcdata inspect ... | head" has read enough
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the flush at exit
+        return 0
+    except OSError as error:
+        if arguments.debug:
+            raise
+        print(f"pcdata: {error}", file=sys.stderr)
+        return 1
     return 0
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Let a polite kill clean up like Ctrl-C; Python allows that in the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if previous is None else previous)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -62,14 +87,15 @@ def _parser() -> argparse.ArgumentParser:
 
     doctor = commands.add_parser("doctor", help="say what is installed, which backends are live, what to install")
     doctor.set_defaults(run=_doctor)
+    for command in (demo, build, inspect, doctor):  # also after the command, where one adds it to a line that failed
+        command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     return parser
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    return int(text)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -120,7 +146,8 @@ def _open(arguments: argparse.Namespace, limit: int | None = None) -> Any:
     from pcdata.io import open_source
 
     options = {} if arguments.metres_per_unit is None else {"metres_per_unit": arguments.metres_per_unit}
-    return open_source(arguments.source if "source" in arguments else arguments.path, kind=arguments.kind, limit=limit, **options)
+    path = arguments.source if "source" in arguments else arguments.path
+    return open_source(path, kind=arguments.kind, limit=limit, **options)
 
 
 def _build_table(report: Any) -> str:

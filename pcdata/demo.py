@@ -12,6 +12,7 @@ from pcdata import extras
 from pcdata.build import BuildReport, build_dataset, config_from_yaml
 from pcdata.build.builder import Progress
 from pcdata.datasets import CachedCloudDataset, collate_padded
+from pcdata.errors import CacheError
 from pcdata.report import save_pipeline_figure
 from pcdata.structures import PaddedClouds
 from pcdata.synthetic import SensorNoise, SyntheticSource
@@ -34,16 +35,21 @@ class DemoResult:
     batches: list[PaddedClouds]  # one epoch, loaded back
 
 
-def run_demo(folder: str | Path, *, num_scenes: int = 8, num_workers: int = 2, progress: Progress | None = None) -> DemoResult:
+def run_demo(
+    folder: str | Path, *, num_scenes: int = 8, num_workers: int = 2, progress: Progress | None = None
+) -> DemoResult:
     """Build ``folder/dataset`` from synthetic captures, load one epoch back and draw ``folder/demo.png``.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        CacheError: ``folder/dataset`` exists and is not a dataset.
+        CacheError: ``folder`` cannot be made, or ``folder/dataset`` exists and is not a dataset.
     """
     extras.require("matplotlib")  # before the work, not after
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = Path(folder).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CacheError(f"{folder}: cannot be made: {error}; choose another folder") from error
     config = config_from_yaml((files("pcdata") / "demo.yaml").read_text(encoding="utf-8"), name="demo.yaml")
     source = SyntheticSource(num_scenes=num_scenes, num_objects=5, num_views=2, noise=SensorNoise())
     report = build_dataset(config, source, folder / "dataset", overwrite=True, progress=progress)

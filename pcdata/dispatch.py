@@ -96,7 +96,7 @@ def kernel(name: str, backend: str) -> Callable[[Callable[P, R]], Callable[P, R]
     return decorate
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def why_unavailable(backend: str) -> str | None:
     """Load a backend; return None when it is live, else the reason and what to do."""
     if backend == REFERENCE:
@@ -137,7 +137,7 @@ def _choose(operation: Operation, backend: str, device: torch.device) -> Callabl
     if backend not in BACKEND_MODULES:
         raise BackendError(
             f"{operation.name}: unknown backend {backend!r}; known: 'auto', {', '.join(map(repr, backends()))}"
-            f"{near_matches(backend, ['auto', *backends()])}"
+            f"{near_matches(str(backend), ['auto', *backends()])}"
         )
     reason = why_unavailable(backend)
     if reason is not None:

@@ -10,7 +10,7 @@ from types import ModuleType
 from pcdata.errors import MissingExtraError
 
 # Open3D's wheel is linked against these and does not bring them along.
-_OPEN3D_LIBRARIES = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
+_OPEN3D_LIBRARIES = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libidn2-0 libudev1"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,9 @@ def why_missing(module: str) -> str | None:
         return f"{module} is not installed; it is needed for {extra.purpose}: run {extra.install}"
     try:
         importlib.import_module(module)
-    except (ImportError, OSError) as error:
-        system = f"; on Debian or Ubuntu run {_OPEN3D_LIBRARIES}" if module == "open3d" else ""
-        return f"{module} is installed but cannot be loaded ({error}){system}"
+    except Exception as error:  # a wheel built for another torch or numpy fails in ways of its own
+        repair = f"reinstall it: {extra.install}"
+        if module == "open3d":
+            repair = f"on Debian or Ubuntu run {_OPEN3D_LIBRARIES}"
+        return f"{module} is installed but cannot be loaded ({type(error).__name__}: {error}); {repair}"
     return None

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor
 
-from pcdata.errors import DTypeError, ShapeError
+from pcdata.errors import DeviceError, DTypeError, ShapeError
 
 
 def seeded(seed: int) -> Generator:
@@ -47,12 +47,18 @@ class Streams:
         Raises:
             ShapeError: a sequence whose length is not the number of clouds.
             DTypeError: something other than generators.
+            DeviceError: a generator that is not on the CPU.
         """
+        given = [generator] if isinstance(generator, Generator) else generator
+        if not isinstance(given, Sequence) or not all(isinstance(one, Generator) for one in given):
+            raise DTypeError(f"generator must be a torch.Generator or a sequence with one per cloud, not {generator!r}")
+        if any(one.device.type != "cpu" for one in given):
+            raise DeviceError(
+                "generator must be on the CPU, where decisions are drawn for every device: use torch.Generator()"
+            )
         if isinstance(generator, Generator):
             return cls([seeded(child_seed(generator)) for _ in range(num_clouds)])
-        generators = list(generator)
-        if not all(isinstance(one, Generator) for one in generators):
-            raise DTypeError("generator must be a torch.Generator, or a sequence with one per cloud")
+        generators = list(given)
         if len(generators) != num_clouds:
             raise ShapeError(f"generator: {len(generators)} generators were given for {num_clouds} clouds")
         return cls(generators)

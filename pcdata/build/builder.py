@@ -6,8 +6,9 @@ import os
 import platform
 import shutil
 import time
+import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,12 +19,15 @@ import torch
 import pcdata
 from pcdata.build.config import BuildConfig
 from pcdata.build.loading_script import loading_script
-from pcdata.errors import CacheError, CaptureError, add_note
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
+from pcdata.io.manifest import FILE_NAME, Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
-from pcdata.io.manifest import Manifest, Sample, key_of
 from pcdata.io.record import record_from_cloud
 from pcdata.io.stores import STORES
 from pcdata.structures import DepthFrame, PointCloud
+
+_OWN = {FILE_NAME, "pipeline.yaml", "load.py", "clouds", "clouds.h5", "raw"}
+_LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 
@@ -78,13 +82,14 @@ def build_dataset(
         progress: called after every capture.
 
     Raises:
+        ConfigError: the pipeline has nothing deterministic to store.
         CacheError: the folder exists, or cannot be written.
         PcdataError: a capture or a step failed; the note names the sample, the step and its input.
     """
-    folder = Path(folder)
+    _check_arguments(config, source)
+    # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
+    folder = Path(os.path.realpath(Path(folder).expanduser()))
     _check_target(folder, overwrite)
-    if not source.ids:
-        raise CaptureError(f"{source!r} has no captures to build from")
     report = BuildReport(folder)
     with _complete_or_nothing(folder) as partial:
         samples = _write_samples(config, source, partial, report, progress)
@@ -101,9 +106,12 @@ def build_dataset(
                 "python": platform.python_version(),
             },
         )
-        (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
-        (partial / "load.py").write_text(loading_script(config.loader), encoding="utf-8")
-        manifest.write(partial)
+        try:
+            (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
+            (partial / "load.py").write_text(loading_script(config.loader), encoding="utf-8")
+            manifest.write(partial)
+        except OSError as error:
+            raise CacheError(f"{folder}: cannot be written: {error}") from error
     return report
 
 
@@ -112,13 +120,14 @@ def _write_samples(
 ) -> list[Sample]:
     store = STORES[config.output.format](partial, config.output.compression)
     prefix = config.pipeline.deterministic_prefix()
+    ids = list(source.ids)
     written = []
     try:
-        for position, sample_id in enumerate(source.ids):
+        for position, sample_id in enumerate(ids):
             started = time.perf_counter()
             try:
                 capture = source.load(sample_id)
-                cloud = _with_sample_id(prefix(capture), sample_id)
+                cloud = _with_sample_id(_checked_cloud(prefix(capture)), sample_id)
                 record = record_from_cloud(cloud)
                 key = key_of(sample_id)
                 store.write(key, record)
@@ -130,10 +139,37 @@ def _write_samples(
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
             report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))
             if progress is not None:
-                progress(position + 1, len(source.ids), sample_id)
+                progress(position + 1, len(ids), sample_id)
     finally:
         store.close()
     return written
+
+
+def _check_arguments(config: BuildConfig, source: Source) -> None:
+    if not isinstance(config, BuildConfig):
+        raise DTypeError(
+            f"build_dataset: config must be a BuildConfig, not {type(config).__name__}; "
+            "pcdata.load_config(path) reads one"
+        )
+    if not hasattr(source, "ids") or not hasattr(source, "load"):
+        raise DTypeError(
+            f"build_dataset: source must have ids and load(id), got {type(source).__name__}; pcdata.open_source(path) "
+            "makes one of a folder"
+        )
+    ids = list(source.ids)
+    if not ids:
+        raise CaptureError(f"{source!r} has no captures to build from")
+    if len(set(ids)) != len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise CaptureError(f"{source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    if any(step.is_random for step in config.pipeline.depth):
+        raise ConfigError("the section depth has a random step, so there is no cloud to store; move it to augment")
+
+
+def _checked_cloud(data: Any) -> PointCloud:
+    if not isinstance(data, PointCloud):
+        raise ConfigError(f"the pipeline gives a {type(data).__name__}, not a cloud to store; end depth in Deproject")
+    return data
 
 
 def _with_sample_id(cloud: PointCloud, sample_id: str) -> PointCloud:
@@ -158,28 +194,51 @@ def _built_sample(sample_id: str, capture: Any, cloud: PointCloud, seconds: floa
 
 
 def _check_target(folder: Path, overwrite: bool) -> None:
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        names = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    except OSError as error:
+        raise CacheError(f"{folder}: cannot be examined: {error}") from error
     if not overwrite:
-        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting")
-    Manifest.read(folder)  # only a dataset may be overwritten, never somebody's files
+        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting (--overwrite)")
+    if FILE_NAME not in names:
+        raise CacheError(f"{folder} is not a pcdata dataset, so it is not overwritten; choose another folder")
+    Manifest.read(folder)
+    foreign = sorted(names - _OWN - _LITTER)
+    if foreign:
+        raise CacheError(
+            f"{folder} is a dataset but also holds {', '.join(foreign[:5])}, which overwriting would delete; move that "
+            "out first, or choose another folder"
+        )
 
 
 @contextmanager
 def _complete_or_nothing(folder: Path) -> Iterator[Path]:
     """Give a hidden neighbour to write into; rename it into place at the end, remove it on any failure."""
-    partial = folder.with_name(f".{folder.name}.partial-{platform.node()}-{os.getpid()}")
+    unique = f"{platform.node()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    partial = folder.with_name(f".{folder.name}.partial-{unique}")
+    retired = folder.with_name(f".{folder.name}.retired-{unique}")
+    created = [parent for parent in folder.parents if not parent.exists()]
     try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise CacheError(f"{folder}: cannot write there: {error}") from error
-    try:
+        try:
+            partial.mkdir(parents=True)
+        except OSError as error:
+            raise CacheError(f"{folder}: cannot write there: {error}") from error
         yield partial
-        retired = folder.with_name(f".{folder.name}.retired-{platform.node()}-{os.getpid()}")
-        if folder.exists():
-            os.replace(folder, retired)
-        os.replace(partial, folder)
-        shutil.rmtree(retired, ignore_errors=True)
+        try:
+            if folder.exists():
+                os.replace(folder, retired)
+            os.replace(partial, folder)
+        except OSError as error:
+            raise CacheError(f"{folder}: cannot be put into place: {error}") from error
     except BaseException:
+        if retired.exists() and not folder.exists():  # stopped between the two renames
+            os.replace(retired, folder)
         shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):  # not empty: somebody else uses it
+            for parent in created:
+                parent.rmdir()
         raise
+    finally:
+        shutil.rmtree(retired, ignore_errors=True)

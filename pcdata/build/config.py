@@ -76,7 +76,10 @@ def config_from_yaml(text: str, *, name: str = "<yaml>") -> BuildConfig:
     output = settings["output"]
     if output is not None and output.compression not in COMPRESSIONS[output.format]:
         known_here = ", ".join(COMPRESSIONS[output.format])
-        document.fault(entries["output"][1], f"format {output.format} knows compression {known_here}, not {output.compression}")
+        document.fault(
+            node_at(entries["output"][1], ["compression"]),
+            f"output.compression: format {output.format} knows {known_here}, not {output.compression}",
+        )
     pipeline = pipeline_from_document(document, entries)
     return BuildConfig(pipeline, settings["output"], settings["loader"])
 

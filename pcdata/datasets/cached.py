@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from pcdata.datasets.samples import SampleDataset
-from pcdata.errors import CacheError
-from pcdata.io.manifest import Manifest
+from pcdata.errors import CacheError, ConfigError, DTypeError
+from pcdata.io.manifest import FILE_NAME, Manifest
 from pcdata.io.record import cloud_from_record
 from pcdata.io.stores import STORES
 from pcdata.structures import PointCloud
@@ -41,9 +41,16 @@ class CachedCloudDataset(SampleDataset):
         augment: Transform | Literal["stored"] | None = "stored",
         seed: int = 0,
     ) -> None:
+        if isinstance(augment, str) and augment != "stored":
+            raise ConfigError(f"augment must be 'stored', None or a transform, got {augment!r}")
+        if pipeline is not None and not isinstance(pipeline, Pipeline):
+            raise DTypeError(
+                f"pipeline must be a Pipeline, not {type(pipeline).__name__}; of a configuration file it is "
+                "pcdata.load_config(path).pipeline"
+            )
         self.folder = Path(folder)
         self.manifest = Manifest.read(folder)
-        stored = Pipeline.from_config(self.manifest.pipeline)
+        stored = self._stored_pipeline()
         wanted = stored if pipeline is None else pipeline
         if wanted.fingerprint() != self.manifest.fingerprint:
             raise CacheError(
@@ -56,12 +63,31 @@ class CachedCloudDataset(SampleDataset):
         super().__init__([sample.id for sample in self.manifest.samples], transform, seed)
         self._store = STORES[self.manifest.format](self.folder)
 
+    def _stored_pipeline(self) -> Pipeline:
+        try:
+            return Pipeline.from_config(self.manifest.pipeline)
+        except (ConfigError, RecursionError) as error:
+            raise CacheError(
+                f"{self.folder / FILE_NAME}: its pipeline cannot be built: {error}; import the modules that define "
+                "your own transforms before you load the dataset, or rebuild it"
+            ) from error
+
     def _load(self, index: int) -> PointCloud:
         sample = self.manifest.samples[index]
         record = self._store.read(sample.key)
+        path = self._store.path_of(sample.key)
         if record.digest() != sample.digest:
-            raise CacheError(f"{self.folder}: sample {sample.id!r} differs from what was written; rebuild the dataset")
-        return cloud_from_record(record)
+            raise CacheError(f"{path}: sample {sample.id!r} differs from what was written; rebuild the dataset")
+        try:
+            cloud = cloud_from_record(record)
+        except CacheError as error:
+            raise CacheError(f"{path}: sample {sample.id!r}: {error}; rebuild the dataset") from error
+        if cloud.num_points != sample.num_points:
+            raise CacheError(
+                f"{path}: sample {sample.id!r} has {cloud.num_points} points, but {FILE_NAME} says "
+                f"{sample.num_points}; rebuild the dataset"
+            )
+        return cloud
 
     def __repr__(self) -> str:
         return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples, {self.manifest.format})"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from pcdata.datasets.samples import SampleDataset
+from pcdata.errors import DTypeError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Transform
 
@@ -30,6 +31,11 @@ class CloudDataset(SampleDataset):
     """
 
     def __init__(self, source: CaptureSource, transform: Transform | None = None, *, seed: int = 0) -> None:
+        if not hasattr(source, "ids") or not hasattr(source, "load"):
+            raise DTypeError(
+                f"CloudDataset: source must have ids and load(id), got {type(source).__name__}; "
+                "pcdata.open_source(path) makes one of a folder"
+            )
         super().__init__(source.ids, transform, seed)
         self.source = source
 

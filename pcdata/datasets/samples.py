@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -21,13 +22,15 @@ class SampleDataset(Dataset[PointCloud]):
     """
 
     def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int) -> None:
+        if transform is not None and not isinstance(transform, Transform):
+            raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
         if len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
         self.ids = list(ids)
         self.transform = transform
         self.seed = seed
         # Shared memory: workers that live through several epochs see the change too.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._epoch = _shared(torch.zeros((), dtype=torch.int64))
 
     @property
     def epoch(self) -> int:
@@ -36,12 +39,18 @@ class SampleDataset(Dataset[PointCloud]):
 
     def set_epoch(self, epoch: int) -> None:
         """Change the random draws; call it before each epoch, also with persistent workers."""
-        self._epoch.fill_(epoch)
+        self._epoch.fill_(operator.index(epoch))
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __getitem__(self, index: int) -> PointCloud:
+    def __iter__(self) -> Iterator[PointCloud]:
+        # Without this, Python would take an IndexError from inside a transform for the end.
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int | slice) -> PointCloud:
+        if isinstance(index, slice):
+            raise DTypeError("a dataset gives one sample per index; for several use torch.utils.data.Subset")
         sample_id = self.ids[index]
         try:
             data = self._load(index)
@@ -54,6 +63,15 @@ class SampleDataset(Dataset[PointCloud]):
             add_note(error, f"sample {sample_id!r} of {self!r}")
             raise
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._epoch = _shared(self._epoch)  # a copy or an unpickled dataset owns its own number
+
     def _load(self, index: int) -> Any:
         """Load the sample before the transform."""
         raise NotImplementedError
+
+
+def _shared(number: torch.Tensor) -> torch.Tensor:
+    shared: torch.Tensor = number.share_memory_()
+    return shared

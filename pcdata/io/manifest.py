@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from pcdata.errors import CacheError
 from pcdata.io.record import parse_info
-from pcdata.io.stores import STORES, Compression, Format
+from pcdata.io.stores import COMPRESSIONS, STORES, Compression, Format
 
 SCHEMA = "pcdata.dataset/1"
 FILE_NAME = "dataset.json"
 
 _MAX_BYTES = 256 * 2**20  # about a million samples
+_MAX_KEY = 200  # file names end at 255 bytes
 
 
 @dataclass(frozen=True)
@@ -59,22 +62,36 @@ class Manifest:
         path = Path(folder) / FILE_NAME
         if not path.is_file():
             raise CacheError(f"{folder}: not a pcdata dataset: it has no {FILE_NAME}; make one with 'pcdata build'")
-        if path.stat().st_size > _MAX_BYTES:
-            raise CacheError(f"{path}: {path.stat().st_size} bytes are too many for a manifest")
         try:
+            if path.stat().st_size > _MAX_BYTES:
+                raise CacheError(f"{path.stat().st_size} bytes are too many for a manifest")
             content = parse_info(path.read_bytes())
             if content.get("schema") != SCHEMA:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r}; rebuild the dataset")
             manifest = cls(**{**content, "samples": [Sample(**sample) for sample in content["samples"]]})
             _check(manifest)
-        except (CacheError, TypeError, KeyError) as error:
+        except CacheError as error:
             raise CacheError(f"{path}: {error}") from error
+        except (TypeError, ValueError, KeyError, OSError) as error:
+            kind = type(error).__name__
+            raise CacheError(f"{path}: cannot be read ({kind}: {error}); rebuild the dataset") from error
         return manifest
 
 
 def _check(manifest: Manifest) -> None:
     if manifest.format not in STORES:
-        raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r}")
+        raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r:.100}")
+    if manifest.compression not in COMPRESSIONS[manifest.format]:
+        raise CacheError(f"compression {manifest.compression!r:.100} does not exist for format {manifest.format}")
+    for name, kind in (("fingerprint", str), ("pipeline", dict), ("versions", dict)):
+        if not isinstance(getattr(manifest, name), kind):
+            raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
+    if not manifest.samples:
+        raise CacheError("it lists no samples; rebuild the dataset")
+    for sample in manifest.samples:
+        texts = (sample.id, sample.key, sample.digest)
+        if not all(isinstance(text, str) for text in texts) or type(sample.num_points) is not int:
+            raise CacheError(f"a sample needs an id, a key, num_points and a digest, got {sample!r:.200}")
     if len({sample.key for sample in manifest.samples}) != len(manifest.samples):
         raise CacheError("two samples share a key")
     for sample in manifest.samples:
@@ -84,11 +101,20 @@ def _check(manifest: Manifest) -> None:
 
 
 def key_of(sample_id: str) -> str:
-    """Return a file-name safe, reversible and unique key for a sample id.
+    """Return a file-name safe and unique key for a sample id.
 
-    Letters, digits, dot, dash and underscore stay; other bytes become %XX; a leading dot too.
+    Letters, digits, dot, dash and underscore stay; other bytes become %XX; a leading dot too. A key too long for a file
+    name ends in ``~`` and a hash instead.
+
+    Raises:
+        CacheError: the id is empty, or no text.
     """
-    from urllib.parse import quote
-
-    key = quote(str(sample_id), safe="").replace("~", "%7E")
-    return "%2E" + key[1:] if key.startswith(".") else key
+    if not isinstance(sample_id, str) or not sample_id:
+        raise CacheError(f"a sample id must be a text that is not empty, got {sample_id!r:.100}")
+    # surrogatepass: file names that are not UTF-8 reach Python as lone surrogates.
+    key = quote(sample_id, safe="", errors="surrogatepass").replace("~", "%7E")
+    key = "%2E" + key[1:] if key.startswith(".") else key
+    if len(key) > _MAX_KEY:
+        digest = hashlib.sha256(key.encode()).hexdigest()[:32]
+        key = f"{key[: _MAX_KEY - 33]}~{digest}"
+    return key

@@ -21,28 +21,36 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
     Raises:
         CaptureError: a file cannot be written.
     """
-    for v in range(frame.num_views):
-        view = folder / f"view{v}"
-        (view / "depth").mkdir(parents=True)
-        unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
-        calibration = Calibration(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
-        write_calibration(view / "intrinsics.json", calibration)
-        if frame.colors is not None:
-            (view / "color").mkdir()
-            write_color(view / "color" / "0.png", frame.colors[v])
-        if frame.world_from_camera is not None:
-            (view / "poses").mkdir()
-            write_pose(view / "poses" / "0.txt", frame.world_from_camera[v])
+    try:
+        for v in range(frame.num_views):
+            _write_view(frame, v, folder / f"view{v}")
+    except OSError as error:
+        raise CaptureError(f"{folder}: cannot be written: {error}") from error
+
+
+def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
+    (view / "depth").mkdir(parents=True)
+    unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
+    calibration = Calibration(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
+    write_calibration(view / "intrinsics.json", calibration)
+    if frame.colors is not None:
+        (view / "color").mkdir()
+        write_color(view / "color" / "0.png", frame.colors[v])
+    if frame.world_from_camera is not None:
+        (view / "poses").mkdir()
+        write_pose(view / "poses" / "0.txt", frame.world_from_camera[v])
 
 
 def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
     """Write one depth image and return the length of its stored unit."""
-    if unit is not None:
+    metres = depth.cpu().numpy()
+    # Filtered or resampled depth is no longer whole units, as the reader turns them into metres.
+    if unit is not None and np.array_equal((np.rint(metres / float(unit)) * float(unit)).astype(np.float32), metres):
         try:
             write_depth(folder / "0.png", depth, metres_per_unit=unit)
-        except CaptureError:  # filtered or resampled: no longer whole units
+        except CaptureError:  # more than 65535 units
             pass
         else:
             return unit
-    np.save(folder / "0.npy", depth.cpu().numpy(), allow_pickle=False)
+    np.save(folder / "0.npy", metres, allow_pickle=False)
     return 1.0

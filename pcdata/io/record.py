@@ -12,6 +12,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 import torch
@@ -52,17 +53,19 @@ def record_from_cloud(cloud: PointCloud) -> Record:
     """Write a cloud, or a batch, as a record; everything it knows is kept.
 
     Raises:
-        CacheError: a label does not fit into int32.
+        CacheError: a label does not fit into int32, a dtype has no NumPy counterpart, or meta or history hold what JSON
+            cannot.
     """
     cloud = cloud.to("cpu")
-    arrays = {name: value.numpy() for name in _POINT_FIELDS if (value := getattr(cloud, name)) is not None}
+    arrays = {name: _array(name, value) for name in _POINT_FIELDS if (value := getattr(cloud, name)) is not None}
     if cloud.labels is not None:
         arrays["labels"] = _labels_as_int32(arrays["labels"])
-    arrays |= {_EXTRA + name: value.numpy() for name, value in cloud.extra.items()}
-    arrays |= {_FRAMES + name: matrix.numpy() for name, matrix in cloud.frames.items()}
-    arrays |= {"ptr": cloud.ptr.numpy(), "source_from_cloud": cloud.source_from_cloud.numpy()}
+    arrays |= {_EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
+    # Frames may be called "robot/base_link", and a slash would open a group in HDF5.
+    arrays |= {_FRAMES + quote(name, safe=""): _array(name, matrix) for name, matrix in cloud.frames.items()}
+    arrays |= {"ptr": cloud.ptr.numpy(), "source_from_cloud": _array("source_from_cloud", cloud.source_from_cloud)}
     if cloud.viewpoint is not None:
-        arrays["viewpoint"] = cloud.viewpoint.numpy()
+        arrays["viewpoint"] = _array("viewpoint", cloud.viewpoint)
     arrays |= _camera_arrays(cloud)
     info = {
         "schema": SCHEMA,
@@ -73,7 +76,7 @@ def record_from_cloud(cloud: PointCloud) -> Record:
         "meta": list(cloud.meta),
         "history": [list(steps) for steps in cloud.history],
     }
-    return Record(arrays, info)
+    return Record(arrays, _as_json(info))
 
 
 def cloud_from_record(record: Record) -> PointCloud:
@@ -86,11 +89,19 @@ def cloud_from_record(record: Record) -> PointCloud:
     if not isinstance(info, Mapping) or info.get("schema") != SCHEMA:
         schema = info.get("schema") if isinstance(info, Mapping) else info
         raise CacheError(f"not a cloud record: schema must be {SCHEMA!r}, got {schema!r}")
-    tensors = {name: _tensor(array) for name, array in record.arrays.items() if name not in _DERIVED}
+    _check_info(info)
+    tensors = {name: _tensor(name, array) for name, array in record.arrays.items() if name not in _DERIVED}
     extra = {name.removeprefix(_EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(_EXTRA)}
-    frames = {name.removeprefix(_FRAMES): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)}
+    frames = {
+        unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
+    }
+    if any(matrix.dtype != torch.float64 for matrix in frames.values()):
+        raise CacheError(f"frames must be float64, got {[str(matrix.dtype) for matrix in frames.values()]}")
     if "labels" in tensors:
-        tensors["labels"] = tensors["labels"].reshape(-1).long()
+        labels = tensors["labels"]
+        if labels.dtype != torch.int32 or labels.shape[1:] != (1,):
+            raise CacheError(f"labels must be int32 (N, 1), got {labels.dtype} {tuple(labels.shape)}")
+        tensors["labels"] = labels[:, 0].long()
     try:
         return PointCloud(
             **tensors,
@@ -122,6 +133,30 @@ def parse_info(text: str | bytes) -> dict[str, Any]:
     return info
 
 
+def _as_json(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts as JSON gives them back, so that what is read has the digest of what was written."""
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(info, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CacheError(
+            f"meta and history must hold plain finite numbers, texts, lists and dicts to be stored: {error}; convert "
+            "tensors with .tolist(), and leave out NaN"
+        ) from error
+    return plain
+
+
+def _check_info(info: Mapping[str, Any]) -> None:
+    for name in ("frame_id", "source_frame", "unit"):
+        if not isinstance(info.get(name), str):
+            raise CacheError(f"{name} must be a text, got {info.get(name)!r:.100}")
+    if not isinstance(info.get("kinds"), dict):
+        raise CacheError(f"kinds must be an object, got {info.get('kinds')!r:.100}")
+    for name, kind in (("meta", dict), ("history", list)):
+        entries = info.get(name)
+        if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
+            raise CacheError(f"{name} must be a list with one {kind.__name__} per cloud, got {entries!r:.100}")
+
+
 def _camera_arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
     cameras = [camera for entry in cloud.meta for camera in entry.get("cameras", [])]
     if not cameras:
@@ -138,7 +173,15 @@ def _labels_as_int32(labels: np.ndarray) -> np.ndarray:
     return labels.astype(np.int32)[:, None]
 
 
-def _tensor(array: np.ndarray) -> Tensor:
-    if array.dtype == object or array.dtype.kind not in "biuf":
-        raise CacheError(f"an array has dtype {array.dtype}, which no cloud field has")
+def _array(name: str, value: Tensor) -> np.ndarray:
+    try:
+        array: np.ndarray = value.detach().numpy()
+    except (TypeError, RuntimeError) as error:
+        raise CacheError(f"{name}: {value.dtype} cannot be stored: {error}; convert it, e.g. to float32") from error
+    return array
+
+
+def _tensor(name: str, array: np.ndarray) -> Tensor:
+    if array.dtype.kind not in "biuf" or not array.dtype.isnative or array.dtype.itemsize > 8:
+        raise CacheError(f"array {name!r} has dtype {array.dtype}, which no cloud field has")
     return torch.from_numpy(np.ascontiguousarray(array))

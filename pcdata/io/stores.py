@@ -6,9 +6,11 @@ spawned at any time. Nothing is ever unpickled, and sizes that a file claims are
 
 from __future__ import annotations
 
+import errno
 import os
+import pickletools
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -27,6 +29,14 @@ INFO = "pcdata"  # the name that the JSON text is stored under
 # Deflate cannot pack tighter than 1032:1, LZF not tighter than 100:1; a larger claim is a bomb or a damaged header.
 _MAX_RATIO = 1100
 
+# All that a dict of tensors and one text needs. weights_only allows more, such as bytearray(10**12), which allocates.
+_PT_GLOBALS = frozenset(
+    ["torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor_v3", "collections OrderedDict"]
+    + ["torch.storage UntypedStorage", "torch uint16", "torch uint32", "torch uint64"]
+    + [f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")]
+)
+_PT_FORBIDDEN = ("STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4")
+
 
 class Store:
     """Records by key inside one dataset folder."""
@@ -37,8 +47,16 @@ class Store:
         self.folder = Path(folder)
         self.compression = compression
 
+    def path_of(self, key: str) -> Path:
+        """Return the file that holds a record."""
+        return self.folder / "clouds" / f"{key}{self.suffix}"
+
     def write(self, key: str, record: Record) -> None:
-        """Add one record; keys are file-name safe and unique."""
+        """Add one record; keys are file-name safe and unique.
+
+        Raises:
+            CacheError: the file cannot be written.
+        """
         raise NotImplementedError
 
     def read(self, key: str) -> Record:
@@ -61,21 +79,19 @@ class NpzStore(Store):
     def write(self, key: str, record: Record) -> None:
         """Write one file."""
         save = np.savez if self.compression == "none" else np.savez_compressed
-        path = _file_of(self, key)
-        with _synced(path) as file:
+        with _synced(self.path_of(key)) as file:
             arrays: dict[str, Any] = {**record.arrays, INFO: np.array(record.info_text())}
             save(file, allow_pickle=False, **arrays)
 
     def read(self, key: str) -> Record:
         """Read one file."""
-        path = _file_of(self, key)
-        with _damage_named(path):
-            with zipfile.ZipFile(path) as archive:
-                for member in archive.infolist():
-                    _check_npz_member(archive, member)
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files if name != INFO}
-                return Record(arrays, parse_info(str(stored[INFO])))
+        path = self.path_of(key)
+        with _damage_named(path), zipfile.ZipFile(path) as archive:
+            members = _checked_members(archive, path)
+            arrays = {member.filename.removesuffix(".npy"): _read_npy(archive, member) for member in members}
+            if INFO not in arrays:
+                raise CacheError(f"has no member {INFO!r}")
+            return Record(arrays, parse_info(str(arrays.pop(INFO))))
 
 
 class PtStore(Store):
@@ -85,20 +101,27 @@ class PtStore(Store):
 
     def write(self, key: str, record: Record) -> None:
         """Write one file."""
-        # A tensor that is a view would drag its whole storage into the file: copy.
-        tensors: dict[str, Any] = {name: torch.from_numpy(array).clone() for name, array in record.arrays.items()}
-        with _synced(_file_of(self, key)) as file:
+        # A tensor that is a view would drag its whole storage into the file: copy, rows next to each other.
+        tensors: dict[str, Any] = {
+            name: torch.from_numpy(np.array(array, order="C")) for name, array in record.arrays.items()
+        }
+        with _synced(self.path_of(key)) as file:
             torch.save({**tensors, INFO: record.info_text()}, file)
 
     def read(self, key: str) -> Record:
         """Read one file."""
-        path = _file_of(self, key)
+        path = self.path_of(key)
         with _damage_named(path):
+            with zipfile.ZipFile(path) as archive:
+                _check_pt(archive, _checked_members(archive, path))
             stored = torch.load(path, weights_only=True, map_location="cpu")
-            if not isinstance(stored, dict) or not isinstance(stored.get(INFO), str):
+            if not isinstance(stored, dict) or not isinstance(text := stored.pop(INFO, None), str):
                 raise CacheError(f"must hold a dict with tensors and a text {INFO!r}")
-            arrays = {name: value.numpy() for name, value in stored.items() if isinstance(value, torch.Tensor)}
-            return Record(arrays, parse_info(stored[INFO]))
+            for name, value in stored.items():
+                # A stride of 0 makes gigabytes of one stored number.
+                if not isinstance(name, str) or not isinstance(value, torch.Tensor) or not value.is_contiguous():
+                    raise CacheError(f"entry {name!r:.100} must be a contiguous tensor")
+            return Record({name: value.numpy() for name, value in stored.items()}, parse_info(text))
 
 
 class Hdf5Store(Store):
@@ -111,19 +134,26 @@ class Hdf5Store(Store):
         self.path = self.folder / "clouds.h5"
         self._file: Any = None
         self._opened_by = 0
+        self._written = False
+
+    def path_of(self, key: str) -> Path:
+        """Return the one file that holds all records."""
+        return self.path
 
     def write(self, key: str, record: Record) -> None:
         """Append one group."""
-        group = self._open("a").create_group(key)
-        for name, array in record.arrays.items():
-            # One chunk per array: a sample is always read whole.
-            packed = self.compression != "none" and array.size > 0
-            options = {"compression": self.compression, "shuffle": True, "chunks": array.shape} if packed else {}
-            group.create_dataset(name, data=array, track_times=False, **options)
-        # A dataset, not an attribute: attributes end at 64 KB and a history may be longer.
-        group.create_dataset(INFO, data=np.bytes_(record.info_text().encode()), track_times=False)
-        for name in ("frame_id", "unit"):
-            group.attrs[name] = record.info[name]
+        with _writing(self.path):
+            group = self._open("a").create_group(key)
+            self._written = True
+            for name, array in record.arrays.items():
+                # One chunk per array: a sample is always read whole.
+                packed = self.compression != "none" and array.size > 0
+                options = {"compression": self.compression, "shuffle": True, "chunks": array.shape} if packed else {}
+                group.create_dataset(name, data=array, track_times=False, **options)
+            # A dataset, not an attribute: attributes end at 64 KB and a history may be longer.
+            group.create_dataset(INFO, data=np.bytes_(record.info_text().encode()), track_times=False)
+            for name in ("frame_id", "unit"):
+                group.attrs[name] = record.info[name]
 
     def read(self, key: str) -> Record:
         """Read one group."""
@@ -134,27 +164,41 @@ class Hdf5Store(Store):
             if not isinstance(file.get(key, getlink=True, default=None), h5py.HardLink):
                 raise CacheError(f"has no group {key!r}")
             group = file[key]
+            if not isinstance(group, h5py.Group):
+                raise CacheError(f"{key!r} must be a group, not a {type(group).__name__}")
             arrays = {name: _checked_dataset(group, name) for name in group}
+            if INFO not in arrays:
+                raise CacheError(f"group {key!r} has no dataset {INFO!r}")
             return Record(arrays, parse_info(bytes(arrays.pop(INFO))))
 
     def close(self) -> None:
-        """Close the handle of this process."""
-        if self._file is not None and self._opened_by == os.getpid():
-            self._file.close()
-        self._file = None
+        """Force what was written to disk and close the handle of this process."""
+        file, self._file = self._file, None
+        if file is None:
+            return
+        if self._opened_by != os.getpid():
+            _INHERITED.append(file)
+            return
+        with _writing(self.path):
+            file.close()
+            if self._written:
+                with open(self.path, "rb+") as written:
+                    os.fsync(written.fileno())
+        self._written = False
 
     def _open(self, mode: str) -> Any:
         import h5py
 
         if self._file is None or self._opened_by != os.getpid():
             # A handle that came through fork shares its file position with the parent: never use or close it here.
-            _INHERITED.append(self._file)
+            if self._file is not None:
+                _INHERITED.append(self._file)
             self._file = h5py.File(self.path, mode)
             self._opened_by = os.getpid()
         return self._file
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_opened_by": 0}
+        return {**self.__dict__, "_file": None, "_opened_by": 0, "_written": False}
 
 
 STORES: dict[Format, type[Store]] = {"hdf5": Hdf5Store, "npz": NpzStore, "pt": PtStore}
@@ -168,18 +212,24 @@ COMPRESSIONS: dict[Format, tuple[Compression, ...]] = {
 _INHERITED: list[Any] = []
 
 
-def _file_of(store: Store, key: str) -> Path:
-    return store.folder / "clouds" / f"{key}{store.suffix}"
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Name the file in what a full disk or a missing permission makes a library raise."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:  # h5py raises both
+        raise CacheError(f"{path}: cannot be written: {error}; is the disk full, or the folder read-only?") from error
 
 
 @contextmanager
 def _synced(path: Path) -> Iterator[Any]:
     """Open a new file for writing and force it to disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "xb") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
+    with _writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
 
 
 @contextmanager
@@ -194,28 +244,60 @@ def _damage_named(path: Path) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:  # zipfile, numpy, h5py and torch raise many types on damaged bytes
+        if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
+            raise CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine") from error
         raise CacheError(
             f"{path}: cannot be read ({type(error).__name__}: {error}); the file is damaged or truncated: "
             "rebuild the dataset"
         ) from error
 
 
-def _check_npz_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    """Compare the array size that a member's header claims with the bytes it has."""
-    if member.file_size > _MAX_RATIO * member.compress_size + 4096:
-        raise CacheError(f"member {member.filename!r} claims {member.file_size} bytes from {member.compress_size}")
+def _checked_members(archive: zipfile.ZipFile, path: Path) -> list[zipfile.ZipInfo]:
+    """Return a zip file's members if the sizes that it claims can be true."""
+    members = archive.infolist()
+    size = path.stat().st_size
+    if sum(member.compress_size for member in members) > size:
+        raise CacheError(f"its members claim more bytes than its {size}")
+    if len({member.filename for member in members}) != len(members):
+        raise CacheError("two members have one name")
+    for member in members:
+        if member.file_size > _MAX_RATIO * member.compress_size:
+            raise CacheError(f"member {member.filename!r} claims {member.file_size} bytes from {member.compress_size}")
+    return members
+
+
+def _read_npy(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Read an array after comparing the size that its header claims with the bytes it has."""
+    readers: dict[tuple[int, int], Callable[..., Any]] = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
-        readers: dict[tuple[int, int], Callable[..., Any]] = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }
         if version not in readers:
             raise CacheError(f"member {member.filename!r} has npy version {version}")
-        shape, _, dtype = readers[version](stream)
+        try:
+            shape, by_columns, dtype = readers[version](stream)
+        except MemoryError as error:  # Python's parser on nested signs, not a lack of memory
+            raise CacheError(f"member {member.filename!r} has a header that cannot be parsed") from error
         expected = int(np.prod(shape, dtype=object)) * dtype.itemsize
         if dtype.hasobject or expected + stream.tell() != member.file_size:
             raise CacheError(f"member {member.filename!r} claims shape {shape} of {dtype} in {member.file_size} bytes")
+        content = bytearray(stream.read())  # to the end, where zipfile compares the checksum
+    return np.ndarray(shape, dtype, buffer=content, order="F" if by_columns else "C")
+
+
+def _check_pt(archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]) -> None:
+    """Refuse a .pt file that is compressed, or whose pickle names anything but tensors."""
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise CacheError("its members must not be compressed")
+    pickles = [member for member in members if member.filename.endswith(".pkl")]
+    if len(pickles) != 1:
+        raise CacheError(f"must hold one pickle of tensors, got {[member.filename for member in pickles]}")
+    for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
+        named = opcode.name == "GLOBAL" and argument not in _PT_GLOBALS
+        if named or opcode.name in _PT_FORBIDDEN:
+            raise CacheError(f"its pickle asks for {argument or opcode.name!r}, which no tensor needs; it was not run")
 
 
 def _checked_dataset(group: Any, name: str) -> np.ndarray:
@@ -225,9 +307,13 @@ def _checked_dataset(group: Any, name: str) -> np.ndarray:
     dataset = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
         raise CacheError(f"{group.name}/{name} must be a dataset stored in this file, not a link to another")
-    claimed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
+    if dataset.shape is None or dataset.dtype.kind not in "biufS":
+        raise CacheError(f"{group.name}/{name} must hold numbers or one text, got {dataset.dtype}")
     stored = dataset.id.get_storage_size()
-    if claimed > (stored if dataset.compression is None else _MAX_RATIO * stored):
-        raise CacheError(f"{group.name}/{name} claims shape {dataset.shape} of {dataset.dtype} but stores {stored} bytes")
+    chunks = [] if dataset.chunks is None else [dataset.chunks]  # unpacked whole, however little of one is used
+    for shape in [dataset.shape, *chunks]:
+        claimed = int(np.prod(shape, dtype=object)) * dataset.dtype.itemsize
+        if claimed > (stored if dataset.compression is None else _MAX_RATIO * stored):
+            raise CacheError(f"{group.name}/{name} claims shape {shape} of {dataset.dtype} but stores {stored} bytes")
     array: np.ndarray = dataset[()]
     return array

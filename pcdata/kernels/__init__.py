@@ -1,0 +1,1 @@
+"""Faster bodies of operations, one module per backend; loaded by :mod:`pcdata.dispatch` when first asked for."""

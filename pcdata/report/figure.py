@@ -12,7 +12,10 @@ import torch
 from pcdata import extras
 from pcdata.structures import DepthFrame, PointCloud
 
-_PALETTE = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e", "#9498a0")
+_PALETTE = (
+    *("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951"),
+    *("#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e", "#9498a0"),
+)
 _COLUMNS = 4
 _MAX_DRAWN = 60_000  # more points than a panel has pixels only cost time
 
@@ -71,9 +74,10 @@ def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
     names = [caption for caption, _ in stages]
     counts = [cloud.num_points for _, cloud in stages]
     axis.set_title("points left after each step")
-    axis.barh(names, counts, color=_PALETTE[0], log=True)
+    axis.barh(range(len(counts)), counts, color=_PALETTE[0], log=True)  # by position: captions may repeat
+    axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
-    axis.set_xlim(right=max(counts) * 8)
+    axis.set_xlim(left=0.8, right=max(counts, default=1) * 8 + 1)
     for position, count in enumerate(counts):
         axis.text(count * 1.15, position, f"{count:,}", va="center", fontsize=8)
     axis.tick_params(labelsize=8)

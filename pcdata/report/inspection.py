@@ -37,7 +37,7 @@ def dataset_text(folder: str | Path) -> str:
     manifest = dataset.manifest
     counts = [sample.num_points for sample in manifest.samples]
     cloud = dataset[0]
-    facts = [
+    facts: list[list[object]] = [
         ["samples", len(dataset)],
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
         ["format", f"{manifest.format}, compression {manifest.compression}"],
@@ -63,14 +63,17 @@ def capture_text(source: Source) -> str:
 
 def _frame_facts(frame: DepthFrame) -> list[list[str]]:
     valid = frame.depth[frame.depth > 0]
+    span = f", {valid.min():.3f} to {valid.max():.3f} m" if len(valid) else ""
     return [
         ["camera", repr(frame.camera)],
-        ["depth", f"{valid.numel():,} of {frame.depth.numel():,} pixels valid, {valid.min():.3f} to {valid.max():.3f} m"],
+        ["depth", f"{valid.numel():,} of {frame.depth.numel():,} pixels valid{span}"],
         ["poses", "none" if frame.frame_id is None else f"lead to {frame.frame_id!r}"],
     ]
 
 
 def _cloud_facts(cloud: PointCloud) -> list[list[str]]:
+    if not cloud.num_points:
+        return [["extent", "none, the cloud is empty"], ["fields", ", ".join(cloud.fields())]]
     low, high = cloud.points.amin(0).tolist(), cloud.points.amax(0).tolist()
     extent = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high))
     return [["extent", f"{extent} m"], ["fields", ", ".join(cloud.fields())]]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, ShapeError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,6 +25,7 @@ class Camera:
     intrinsics: Tensor  # (V, 3, 3) float64, pixels
     size: tuple[int, int]  # (height, width) in pixels
     distortion: Tensor | None = None  # (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
+    is_window: bool = False  # cut from a larger image, so the principal point may lie outside
 
     def __post_init__(self) -> None:
         check_tensors(
@@ -32,11 +33,14 @@ class Camera:
             {"intrinsics": self.intrinsics, "distortion": self.distortion},
             {"intrinsics": "V 3 3 : float64", "distortion": "V D : float64"},
         )
-        height, width = self.size
-        if height < 1 or width < 1:
+        # The class is frozen; a list would never equal the size of an image.
+        object.__setattr__(self, "size", tuple(self.size))
+        if len(self.size) != 2 or not all(isinstance(side, int) and side >= 1 for side in self.size):
             raise CaptureError(f"Camera: size must be (height, width) of at least one pixel, got {self.size}")
+        if self.num_views < 1:
+            raise ShapeError("Camera: intrinsics must describe at least one view, got shape (0, 3, 3)")
         for view, k in enumerate(self.intrinsics.tolist()):
-            _check_intrinsics(view, k, self.size)
+            _check_intrinsics(view, k, self.size, is_window=self.is_window)
 
     @classmethod
     def pinhole(
@@ -60,7 +64,12 @@ class Camera:
         return self.intrinsics.shape[0]
 
     def view(self, index: int) -> Camera:
-        """Return one camera of the V as a camera of its own."""
+        """Return one camera of the V as a camera of its own.
+
+        Raises:
+            ShapeError: there is no such view; views count from 0.
+        """
+        check_view("Camera", index, self.num_views)
         keep = slice(index, index + 1)
         distortion = None if self.distortion is None else self.distortion[keep]
         return replace(self, intrinsics=self.intrinsics[keep], distortion=distortion)
@@ -89,7 +98,7 @@ class Camera:
         intrinsics = self.intrinsics.clone()
         intrinsics[:, 0, 2] -= left
         intrinsics[:, 1, 2] -= top
-        return replace(self, intrinsics=intrinsics, size=size)
+        return replace(self, intrinsics=intrinsics, size=size, is_window=True)
 
     def to(self, device: torch.device | str) -> Camera:
         """Move the tensors to a device."""
@@ -99,7 +108,8 @@ class Camera:
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; :meth:`from_dict` reads them back exactly."""
         distortion = None if self.distortion is None else self.distortion.tolist()
-        return {"intrinsics": self.intrinsics.tolist(), "size": list(self.size), "distortion": distortion}
+        plain = {"intrinsics": self.intrinsics.tolist(), "size": list(self.size), "distortion": distortion}
+        return {**plain, "is_window": True} if self.is_window else plain
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Camera:
@@ -109,6 +119,7 @@ class Camera:
             intrinsics=torch.tensor(data["intrinsics"], dtype=torch.float64),
             size=(int(data["size"][0]), int(data["size"][1])),
             distortion=None if distortion is None else torch.tensor(distortion, dtype=torch.float64),
+            is_window=bool(data.get("is_window", False)),
         )
 
     def __repr__(self) -> str:
@@ -118,7 +129,13 @@ class Camera:
         return f"Camera({self.num_views} views, {width}x{height}, fx {focal}{lens})"
 
 
-def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int]) -> None:
+def check_view(where: str, index: int, num_views: int) -> None:
+    """Require a view that exists: a slice would give an empty one without a word."""
+    if not 0 <= index < num_views:
+        raise ShapeError(f"{where}.view: there is no view {index}; views count from 0 to {num_views - 1}")
+
+
+def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int], *, is_window: bool) -> None:
     """Refuse matrices that cannot be the intrinsics of this image."""
     fx, fy, cx, cy = k[0][0], k[1][1], k[0][2], k[1][2]
     where = f"Camera: intrinsics of view {view}"
@@ -130,7 +147,7 @@ def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int]) ->
             "means flipped axes: flip the image or the axes first"
         )
     height, width = size
-    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+    if not is_window and not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         raise CaptureError(
             f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image; "
             "do these intrinsics belong to another resolution? Rescale them with Camera.resized"

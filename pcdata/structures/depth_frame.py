@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
-from pcdata.structures.camera import Camera
+from pcdata.structures.camera import Camera, check_view
 
 CAMERA_FRAME = "camera"
 
@@ -47,7 +47,6 @@ class DepthFrame:
                 "labels": self.labels,
                 "confidence": self.confidence,
                 "mask": self.mask,
-                "world_from_camera": self.world_from_camera,
             },
             {
                 "depth": "V H W : float32",
@@ -56,6 +55,13 @@ class DepthFrame:
                 "confidence": "V H W : uint8",
                 "mask": "V H W : bool",
             },
+        )
+        # Its shape is tied to the depth, its values have their own check: NaN in a pose means lost tracking.
+        check_tensors(
+            where,
+            {"depth": self.depth, "world_from_camera": self.world_from_camera},
+            {"depth": "V H W : float32", "world_from_camera": "V 4 4 : float64"},
+            check_values=False,
         )
         if bool((self.depth < 0).any()):
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
@@ -67,11 +73,6 @@ class DepthFrame:
         if (self.world_from_camera is None) != (self.frame_id is None):
             raise CaptureError(f"{where}: give world_from_camera and the frame_id it leads to together, or neither")
         if self.world_from_camera is not None:
-            if tuple(self.world_from_camera.shape) != (self.num_views, 4, 4):
-                raise ShapeError(
-                    f"{where}: world_from_camera must be ({self.num_views}, 4, 4), "
-                    f"got {tuple(self.world_from_camera.shape)}"
-                )
             if self.frame_id == CAMERA_FRAME:
                 raise CaptureError(f"{where}: frame_id names where the poses lead to; {CAMERA_FRAME!r} is the start")
             rigid.check_rigid(f"{where}: world_from_camera", self.world_from_camera)
@@ -92,7 +93,12 @@ class DepthFrame:
         return self.depth.device
 
     def view(self, index: int) -> DepthFrame:
-        """Return one view as a frame of its own."""
+        """Return one view as a frame of its own.
+
+        Raises:
+            ShapeError: there is no such view; views count from 0.
+        """
+        check_view("DepthFrame", index, self.num_views)
         keep = slice(index, index + 1)
         images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
         return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]

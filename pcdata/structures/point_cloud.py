@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_ptr_values, check_tensors
-from pcdata.errors import DTypeError, FrameError, ShapeError
+from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
 from pcdata.structures.fields import CORE_KINDS, Kind
@@ -55,13 +55,16 @@ class PointCloud:
 
     def _fill_defaults(self) -> None:
         fill = object.__setattr__  # the class is frozen
+        check_tensors("PointCloud", {"points": self.points}, {"points": "N 3"}, check_values=False)
+        if self.points is None:
+            raise DTypeError("PointCloud: points must be a float32 (N, 3) tensor, not None")
         if self.ptr is None:
             fill(self, "ptr", torch.tensor([0, len(self.points)], device=self.points.device))
         num_clouds = len(self.ptr) - 1
         if self.source_from_cloud is None:
             fill(self, "source_from_cloud", torch.eye(4, dtype=torch.float64).repeat(num_clouds, 1, 1).to(self.device))
         fill(self, "source_frame", self.source_frame or self.frame_id)
-        fill(self, "meta", tuple(self.meta) or ({},) * num_clouds)
+        fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
         fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
         fill(self, "kinds", {name: Kind(kind) for name, kind in self.kinds.items()})
 
@@ -91,16 +94,22 @@ class PointCloud:
         if self.ptr.device.type == "cpu":
             check_ptr_values("PointCloud", "ptr", self.ptr, sizes["N"])
         self._check_extra(sizes["N"])
-        for name, matrix in self.frames.items():
-            if tuple(matrix.shape) != (self.num_clouds, 4, 4):
-                raise ShapeError(f"PointCloud: frames[{name!r}] must be ({self.num_clouds}, 4, 4), {matrix.shape}")
+        poses = {f"frames[{name!r}]": matrix for name, matrix in self.frames.items()}
+        check_tensors(
+            "PointCloud",
+            {"source_from_cloud": self.source_from_cloud, **poses},
+            dict.fromkeys(["source_from_cloud", *poses], "B 4 4 : float64"),
+            check_values=False,
+        )
         for name in ("meta", "history"):
             if len(getattr(self, name)) != self.num_clouds:
                 raise ShapeError(
                     f"PointCloud: {name} needs an entry per cloud, {self.num_clouds}, got {len(getattr(self, name))}"
                 )
+        if not self.frame_id:
+            raise FrameError("PointCloud: frame_id must name the coordinate frame, it is empty")
         if self.unit not in (METRE, NORMALIZED):
-            raise FrameError(f"PointCloud: unit must be {METRE!r} or {NORMALIZED!r}, got {self.unit!r}")
+            raise UnitError(f"PointCloud: unit must be {METRE!r} or {NORMALIZED!r}, got {self.unit!r}")
 
     def _check_extra(self, num_points: int) -> None:
         if set(self.extra) != set(self.kinds):
@@ -111,6 +120,15 @@ class PointCloud:
         for name, value in self.extra.items():
             if name in CORE_KINDS or not name.isidentifier():
                 raise DTypeError(f"PointCloud: {name!r} cannot name an extra field")
+            if not isinstance(value, Tensor):
+                raise DTypeError(f"PointCloud: extra[{name!r}] must be a torch.Tensor, not {type(value).__name__}")
+            if value.device != self.points.device:
+                raise DeviceError(
+                    f"PointCloud: extra[{name!r}] is on {value.device} but points is on {self.points.device}; "
+                    "move one with .to()"
+                )
+            if name == "viewpoint" and self.kinds[name] is not Kind.POSITION:
+                raise DTypeError(f"PointCloud: extra['viewpoint'] is a position, not {self.kinds[name].value}")
             if value.shape[:1] != (num_points,):
                 raise ShapeError(f"PointCloud: extra[{name!r}] has {tuple(value.shape)[:1]} rows, not {num_points}")
             if self.kinds[name] is not Kind.INVARIANT and (
@@ -164,7 +182,7 @@ class PointCloud:
         for name in values.keys() - core.keys():
             value = values[name]
             if name not in extra:
-                raise FrameError(f"PointCloud.with_fields: no field {name!r}; add it with with_extra(name, value, kind)")
+                raise DTypeError(f"PointCloud.with_fields: no field {name!r}; add it by with_extra(name, value, kind)")
             if value is None:
                 del extra[name]
             else:
@@ -254,8 +272,9 @@ class PointCloud:
         """Pack clouds (or batches) one after another into one batch.
 
         Raises:
-            FrameError: the clouds differ in frame, source frame or unit.
+            FrameError, UnitError: the clouds differ in frame, source frame or unit.
             ShapeError: the clouds carry different fields, or there are none.
+            DeviceError: the clouds lie on different devices.
         """
         if not clouds:
             raise ShapeError("PointCloud.cat: needs at least one cloud")
@@ -332,12 +351,22 @@ class PointCloud:
 
 
 def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:
-    for name in ("frame_id", "unit", "source_frame"):
+    for name in ("frame_id", "source_frame"):
         if getattr(first, name) != getattr(other, name):
             raise FrameError(
                 f"PointCloud.cat: cloud {position} has {name} {getattr(other, name)!r} but cloud 0 has "
                 f"{getattr(first, name)!r}; bring both to one frame (ToFrame) first"
             )
+    if first.unit != other.unit:
+        raise UnitError(
+            f"PointCloud.cat: cloud {position} has unit {other.unit!r} but cloud 0 has {first.unit!r}; "
+            "normalise both or neither"
+        )
+    if first.device != other.device:
+        raise DeviceError(
+            f"PointCloud.cat: cloud {position} is on {other.device} but cloud 0 is on {first.device}; "
+            "move one with .to()"
+        )
     if set(first.fields()) != set(other.fields()) or first.kinds != other.kinds:
         different = set(first.fields()) ^ set(other.fields()) or "kinds"
         raise ShapeError(f"PointCloud.cat: cloud {position} and cloud 0 carry different fields: {different}")

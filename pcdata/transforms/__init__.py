@@ -11,8 +11,8 @@ from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
 from pcdata.transforms.normals import EstimateNormals
-from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
+from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 
 __all__ = [

@@ -29,9 +29,11 @@ class RandomRotation(SpatialTransform):
     about: About = "origin"  # the fixed point
 
     def check_fields(self) -> None:
-        """Require a direction."""
+        """Require a direction, and no angle where there is no axis to measure it about."""
         if self.axis is not None and not any(self.axis):
             raise ConfigError("RandomRotation: axis must not be zero")
+        if self.axis is None and self.degrees != 180.0:
+            raise ConfigError("RandomRotation: axis None means any rotation, so degrees must stay 180; or give an axis")
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
         """Draw one rotation per cloud."""
@@ -51,11 +53,12 @@ class RandomTranslation(SpatialTransform):
 
     is_random = True
 
-    max_offset: NonNegative | Vec3 = 0.02  # in the cloud's unit; one number, or one per axis
+    # In the cloud's unit; one number, or one per axis.
+    max_offset: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 0.02
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
         """Draw one offset per cloud."""
-        limit = torch.tensor(self.max_offset, dtype=torch.float64).abs()
+        limit = torch.tensor(self.max_offset, dtype=torch.float64)
         offset = streams.uniform(-1.0, 1.0, 3) * limit
         return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64), offset)}
 

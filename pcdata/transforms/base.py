@@ -22,6 +22,7 @@ from typing_extensions import dataclass_transform
 from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note, near_matches
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
+from pcdata.structures.fields import CORE_KINDS
 
 Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
@@ -37,6 +38,7 @@ class Transform(nn.Module):
     is_random: ClassVar[bool] = False  # draws from the generator
     needs_metres: ClassVar[bool] = False  # its fields are lengths: refuse normalised clouds
     runs_statistics: ClassVar[bool] = False  # its cost and its answer depend on the rest of the scene
+    keeps_clouds: ClassVar[bool] = True  # cloud b of the result is cloud b of the input: none is joined or split
     takes: ClassVar[type] = PointCloud
     gives: ClassVar[type] = PointCloud
     version: ClassVar[int] = 1  # raised when the same fields give another result
@@ -66,7 +68,10 @@ class Transform(nn.Module):
         """Check rules that bind several fields; raise :class:`ConfigError`."""
 
     def make_params(self, data: Any, streams: Streams | None) -> Params:
-        """Decide: all that is random or derived from the data, leading dimension B; ``streams`` is None if not random."""
+        """Decide: all that is random or derived from the data; ``streams`` is None if not random.
+
+        Every value has leading dimension B, except ``index``, ``ptr`` and those named after a per-point field.
+        """
         return {}
 
     def apply(self, data: Any, params: Params) -> Any:
@@ -78,7 +83,15 @@ class Transform(nn.Module):
         return None
 
     def frame_given(self) -> str | None:
-        """The coordinate frame of the result, or None when it is the input's."""
+        """The coordinate frame of the result, or None when it follows from the input's."""
+        return None
+
+    def frame_after(self, frame: str | None) -> str | None:
+        """The frame of the result for an input in ``frame``; None = not known yet."""
+        return self.frame_given() or self.frame_needed() or frame
+
+    def unit_given(self) -> str | None:
+        """The unit of the result, or None when it is the input's."""
         return None
 
     # -- what everybody calls --------------------------------------------------------------------------------------
@@ -147,14 +160,14 @@ class Transform(nn.Module):
             )
         if self.needs_metres and data.unit != METRE:
             raise UnitError(
-                f"{name}: its fields are lengths in metres but the cloud is {data.unit}; put it before the normalisation"
+                f"{name}: its fields are lengths in metres but the cloud is {data.unit}; put it before normalising"
             )
 
     def _record(self, data: Any, result: Any, params: Params) -> Any:
         if isinstance(result, DepthFrame):
             steps = [*result.provenance.get("history", ()), self._step({}, {})]
             return dataclasses.replace(result, provenance={**result.provenance, "history": steps})
-        before = data.counts.tolist() if isinstance(data, PointCloud) else None
+        before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
         after = result.counts.tolist()
         history = []
         for b, count in enumerate(after):
@@ -180,17 +193,8 @@ class SpatialTransform(Transform, abstract=True):
     """A step that moves every cloud by one 4x4: write ``make_params`` returning ``{"matrix": (B, 4, 4)}``."""
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
-        """Move the cloud; the frame and the unit follow :meth:`frame_given` and :meth:`unit_given`."""
-        frame_id = self.result_frame(data)
-        return data.transformed(params["matrix"], frame_id=frame_id, unit=self.unit_given())
-
-    def result_frame(self, data: PointCloud) -> str | None:
-        """The frame of the result, given the input; None keeps the name."""
-        return self.frame_given()
-
-    def unit_given(self) -> str | None:
-        """The unit of the result; None keeps it."""
-        return None
+        """Move the cloud; the frame and the unit follow :meth:`frame_after` and :meth:`unit_given`."""
+        return data.transformed(params["matrix"], frame_id=self.frame_after(data.frame_id), unit=self.unit_given())
 
 
 class SelectTransform(Transform, abstract=True):
@@ -221,28 +225,24 @@ def sample_name(cloud: PointCloud, b: int) -> str:
     return f" (sample {sample!r})" if sample else ""
 
 
-def slice_params(params: Params, b: int) -> Params:
-    """Return the params of cloud ``b`` alone; every value has leading dimension B."""
-    return {name: value[b : b + 1] for name, value in params.items()}
-
-
 def field_names(cls: type[Transform]) -> list[str]:
     """Return the names of the declared fields, in order."""
     return [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def field_types(cls: type[Transform]) -> dict[str, Any]:
     """Return the declared fields' types with their limits."""
     hints = get_type_hints(cls, include_extras=True)
     return {name: hints[name] for name in field_names(cls)}
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _field_model(cls: type[Transform]) -> Any:
     import pydantic  # imported late: only needed once a transform is made
 
-    config = pydantic.ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
+    # Strict: a quoted number or a YAML yes/no is a slip of the pen, not a length or a count.
+    config = pydantic.ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False, strict=True)
     fields: Any = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.default is not dataclasses.MISSING:
@@ -260,7 +260,7 @@ def field_faults(cls: type[Transform], fields: Mapping[str, Any]) -> list[tuple[
     import pydantic
 
     try:
-        _field_model(cls)(**fields)
+        _field_model(cls)(**_as_plain_fields(fields))
     except pydantic.ValidationError as error:
         return [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
     return []
@@ -272,7 +272,7 @@ def validated_fields(cls: type[Transform], fields: Mapping[str, Any]) -> dict[st
     Raises:
         ConfigError: listing every fault.
     """
-    given = {name: _as_plain_numbers(value) for name, value in fields.items()}
+    given = _as_plain_fields(fields)
     faults = field_faults(cls, given)
     if faults:
         raise ConfigError("\n".join(f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults))
@@ -289,8 +289,15 @@ def _fault_message(cls: type[Transform], fault: Any) -> str:
     return f"{fault['msg']}{given}"
 
 
-def _as_plain_numbers(value: Any) -> Any:
-    return value.tolist() if isinstance(value, (Tensor, np.ndarray, np.generic)) else value
+def _as_plain_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _as_plain(value) for name, value in fields.items()}
+
+
+def _as_plain(value: Any) -> Any:
+    """Turn arrays into numbers and lists into tuples, so that fields cannot change under a transform."""
+    if isinstance(value, (Tensor, np.ndarray, np.generic)):
+        value = value.tolist()
+    return tuple(_as_plain(item) for item in value) if isinstance(value, (list, tuple)) else value
 
 
 def _plain(value: Any) -> Any:
@@ -315,7 +322,9 @@ def _small(params: Params, b: int, num: int) -> dict[str, Any]:
     """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise."""
     kept = {}
     for name, value in params.items():
-        if isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16 and name != "ptr":
+        # By name, not by shape alone: with one point per cloud the shapes are the same.
+        is_per_cloud = name not in ("index", "ptr", *CORE_KINDS)
+        if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16:
             kept[name] = value[b].tolist()
     return kept
 

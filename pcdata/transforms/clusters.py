@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Literal
 
 import torch
 
-from pcdata.errors import ConfigError, DTypeError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, Transform, rows_of_mask
+from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
 from pcdata.transforms.fields import Count, Metres
 
 
@@ -65,26 +66,32 @@ class ClusterObjects(Transform):
 class SplitObjects(Transform):
     """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped."""
 
+    keeps_clouds = False
+
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Split each cloud by its labels; ``meta["object"]`` keeps the label."""
         if data.labels is None:
             raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")
         parts = []
-        for cloud in data.unbatch():
+        for b, cloud in enumerate(data.unbatch()):
             assert cloud.labels is not None
-            for label in torch.unique(cloud.labels[cloud.labels >= 0]).tolist():
+            found = torch.unique(cloud.labels[cloud.labels >= 0]).tolist()
+            if not found:
+                raise TooFewPointsError(
+                    f"SplitObjects: cloud {b}{sample_name(data, b)} has no labelled point among its "
+                    f"{cloud.num_points}; check the fields of ClusterObjects"
+                )
+            for label in found:
                 rows = rows_of_mask(cloud.labels == label)
                 ptr = torch.tensor([0, len(rows)], device=cloud.device)
                 parts.append(cloud.select(rows, ptr).with_meta([{"object": label}]))
-        if not parts:
-            return data.select(torch.zeros(0, dtype=torch.int64, device=data.device), torch.zeros_like(data.ptr))
         return PointCloud.cat(parts)
 
 
 def _objects(labels: torch.Tensor, data: PointCloud) -> list[dict[str, Any]]:
     entries = []
     bounds = data.ptr.tolist()
-    for start, stop in zip(bounds, bounds[1:]):
+    for start, stop in itertools.pairwise(bounds):
         own = labels[start:stop]
         unique, counts = torch.unique(own[own >= 0], return_counts=True)
         found = [{"label": label, "points": count} for label, count in zip(unique.tolist(), counts.tolist())]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -28,7 +29,6 @@ class Compose(Transform):
 
     steps: Sequence[Transform]
 
-
     def __init__(self, steps: Sequence[Transform]) -> None:
         self.steps = list(steps)
         self.__post_init__()
@@ -46,16 +46,17 @@ class Compose(Transform):
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
         """Run every step; the steps record themselves, the chain adds nothing."""
-        for _, data in self.step_through(data, generator=generator):
+        result = data
+        for _, result in self.step_through(data, generator=generator):  # noqa: B007 - the last one counts
             pass
-        return data
+        return result
 
-    def step_through(
-        self, data: Data, *, generator: GeneratorLike | None = None
-    ) -> Iterator[tuple[Transform, Any]]:
+    def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
         """Yield ``(step, data)`` after every step, for looking inside."""
         if self.is_random:
             generator = self._generator(generator)
+            if not isinstance(generator, Generator):
+                generator = Streams.of(generator, num_clouds(data)).generators
         for step in self.steps:
             if step.is_random:
                 # One stream per cloud, split off once: random steps in a row draw from the same streams, so that
@@ -68,7 +69,7 @@ class Compose(Transform):
         """Return the longest deterministic prefix, which a cache may hold, and the rest."""
         steps = list(self.steps)
         first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
-        return Compose(steps[:first]), Compose(steps[first:])
+        return compose_again(steps[:first]), compose_again(steps[first:])
 
     def to_config_list(self) -> list[dict[str, Any]]:
         """Return the steps as a list of ``{name: fields}``."""
@@ -89,6 +90,12 @@ class RandomApply(Transform):
     transform: Transform
     probability: Fraction = 0.5
 
+    def check_fields(self) -> None:
+        """Require a transform from clouds to clouds."""
+        if not (self.transform.takes is PointCloud and self.transform.gives is PointCloud):
+            raise ConfigError(f"RandomApply: {type(self.transform).__name__} does not turn clouds into clouds")
+        self.keeps_clouds = self.transform.keeps_clouds  # type: ignore[misc]
+
     def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
         """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
         chosen = streams.uniform(0.0, 1.0) < self.probability
@@ -101,6 +108,13 @@ class RandomApply(Transform):
             if chosen:
                 clouds[b] = self.transform(clouds[b], generator=[seeded(seed)])
         return PointCloud.cat(clouds)
+
+
+def compose_again(steps: Sequence[Transform]) -> Compose:
+    """Compose steps whose order was checked before: its warning was given then."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PipelineOrderWarning)
+        return Compose(steps)
 
 
 def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Generator]:
@@ -126,7 +140,7 @@ def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
 def _check_chain(steps: Sequence[Transform]) -> None:
     frame: str | None = None
     unit = METRE
-    for position, (before, after) in enumerate(zip(steps, steps[1:]), start=1):
+    for position, (before, after) in enumerate(itertools.pairwise(steps), start=1):
         if not issubclass(before.gives, after.takes):
             raise ConfigError(
                 f"Compose: step {position + 1}, {type(after).__name__}, takes a {after.takes.__name__} but step "
@@ -140,19 +154,17 @@ def _check_chain(steps: Sequence[Transform]) -> None:
             raise ConfigError(f"{where} works in frame {needed!r} but the cloud is in {frame!r} there")
         if step.needs_metres and unit != METRE:
             raise ConfigError(f"{where} works in metres but the cloud is normalised there; put it earlier")
-        frame = step.frame_given() or needed or frame
-        unit = getattr(step, "unit_given", lambda: None)() or unit
+        frame = step.frame_after(frame)
+        unit = step.unit_given() or unit
 
 
 def _warn_statistics_before_crop(steps: Sequence[Transform]) -> None:
     names = [type(step).__name__ for step in steps]
-    early = [i for i, step in enumerate(steps) if step.runs_statistics]
-    if early and "CropWorkspace" in names[early[0] :]:
+    early = next((i for i, step in enumerate(steps) if step.runs_statistics), len(steps))
+    if "CropWorkspace" in names[early:] and "CropWorkspace" not in names[:early]:
         warnings.warn(
-            f"{names[early[0]]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "
+            f"{names[early]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "
             "alone find more of its outliers",
             PipelineOrderWarning,
-            stacklevel=4,
+            stacklevel=5,  # check_fields, __post_init__, __init__, then the caller
         )
-
-

@@ -15,7 +15,7 @@ import yaml
 from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at
+from pcdata.transforms.yaml_nodes import YamlDocument, node_at, yaml_text
 
 
 def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:
@@ -27,17 +27,20 @@ def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:
     document = YamlDocument(text, name)
     steps = steps_from_node(document, document.root, "a pipeline")
     document.raise_faults()
-    return Compose(steps)
+    try:
+        return Compose(steps)
+    except ConfigError as error:  # neighbours that do not fit
+        raise ConfigError(f"{name}: {error}") from error
 
 
 def pipeline_to_yaml(pipeline: Compose) -> str:
     """Write a pipeline as YAML that :func:`pipeline_from_yaml` reads back to an equal one."""
-    return yaml.safe_dump(pipeline.to_config_list(), sort_keys=False, default_flow_style=None, width=110)
+    return yaml_text(pipeline.to_config_list())
 
 
 def pipeline_from_config(steps: Sequence[Mapping[str, Any] | str]) -> Compose:
     """Build a pipeline from plain data, the form that :meth:`Compose.to_config_list` returns."""
-    return pipeline_from_yaml(yaml.safe_dump(list(steps), sort_keys=False), name="<config>")
+    return pipeline_from_yaml(yaml_text(list(steps)), name="<config>")
 
 
 def load_pipeline(path: str | Path) -> Compose:
@@ -67,6 +70,9 @@ def _step_from_node(document: YamlDocument, node: yaml.Node) -> Transform | None
     """Build one step written as ``Name`` or ``{Name: fields}``."""
     if isinstance(node, yaml.ScalarNode):
         name, name_node, fields_node = str(node.value), node, None
+    elif not isinstance(node, yaml.MappingNode):
+        document.fault(node, "a step must be a name, or a name with its fields, not a list")
+        return None
     else:
         entries = document.mapping(node, "a step")
         if len(entries) != 1:
@@ -91,7 +97,7 @@ def _build(
         return None
     for path, message in field_faults(cls, fields):
         place = ".".join(map(str, (cls.__name__, *path)))
-        document.fault(_place(entries, fields_node, name_node, path), f"{place}: {message}")
+        document.fault(_place(cls, entries, fields_node, name_node, path), f"{place}: {message}")
     if len(document.faults) > before:
         return None
     try:
@@ -112,6 +118,7 @@ def _field_value(document: YamlDocument, cls: type[Transform], key: str, node: y
 
 
 def _place(
+    cls: type[Transform],
     entries: Mapping[str, tuple[yaml.Node, yaml.Node]],
     fields_node: yaml.Node | None,
     name_node: yaml.Node,
@@ -121,4 +128,4 @@ def _place(
     if not path or str(path[0]) not in entries:
         return fields_node if fields_node is not None and fields_node.value else name_node
     key, value = entries[str(path[0])]
-    return key if len(path) == 1 and isinstance(value, yaml.MappingNode) else node_at(value, path[1:])
+    return key if path[0] not in field_names(cls) else node_at(value, path[1:])

@@ -42,7 +42,7 @@ class MaskDepth(Transform):
         if self.far is not None:
             keep &= data.depth <= self.far
         if data.mask is None and self.require_mask:
-            raise CaptureError(f"MaskDepth: the capture {data.sample_id!r} has no mask; add one or set require_mask: false")
+            raise CaptureError(f"MaskDepth: capture {data.sample_id!r} has no mask; add one or set require_mask: false")
         if data.mask is not None and self.use_mask:
             keep &= data.mask
         if self.drop_labels:
@@ -89,7 +89,7 @@ class Deproject(Transform):
             labels=None if data.labels is None else data.labels.flatten()[source_index],
             source_index=source_index,
             extra=extra,
-            kinds={name: Kind.INVARIANT for name in extra},
+            kinds=dict.fromkeys(extra, Kind.INVARIANT),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,
             meta=[_view_meta(data, view) for view in range(data.num_views)],
@@ -108,5 +108,3 @@ def _view_meta(frame: DepthFrame, view: int) -> dict[str, Any]:
         "cameras": [{**camera, "view": view, "world_from_camera": pose, "world_frame": frame.frame_id}],
         "provenance": provenance,
     }
-
-

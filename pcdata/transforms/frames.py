@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import groupby
 from typing import Any
 
 import torch
 
 from pcdata.errors import ConfigError, FrameError, PcdataError
 from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, Transform
@@ -60,7 +61,8 @@ class ToFrame(SpatialTransform):
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud and remember where the new frame lies."""
         moved = super().apply(data, params)
-        if self.frame in data.frames or data.frame_id not in data.frames:
+        # A calibration given here replaces the capture's own pose of that frame.
+        if self.matrix is None or data.frame_id not in data.frames:
             return moved
         learned = params["matrix"].to(data.device) @ data.frames[data.frame_id]
         return replace(moved, frames={**data.frames, self.frame: learned})
@@ -69,16 +71,18 @@ class ToFrame(SpatialTransform):
 class MergeViews(Transform):
     """Join the views of each capture, which ToFrame brought into one frame, into one cloud.
 
-    Neighbouring clouds of the batch with the same sample id are one capture. The frame they share becomes the source
-    frame; every point keeps its ``view`` and the ``viewpoint`` it was seen from.
+    Neighbouring clouds of the batch with the same sample id and capture index are one capture, as long as their view
+    numbers rise. The frame they share becomes the source frame; every point keeps its ``view`` and the ``viewpoint`` it
+    was seen from.
     """
 
     needs_metres = True
+    keeps_clouds = False
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
-        """Decide which clouds belong together: ``first_cloud`` (B',) of every capture."""
-        sizes = [len(list(group)) for _, group in groupby(entry.get("sample_id") for entry in data.meta)]
-        return {"group_ptr": ptr_from_counts(sizes)}
+        """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""
+        starts = [b for b in range(data.num_clouds) if b == 0 or not _same_capture(data.meta[b - 1], data.meta[b])]
+        return {"group_ptr": torch.tensor([*starts, data.num_clouds])}
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Drop the boundaries between the views of a capture."""
@@ -89,8 +93,10 @@ class MergeViews(Transform):
                 f"MergeViews: the views are still in {CAMERA_FRAME!r}, each in its own camera's frame; "
                 "add ToFrame(frame=...) before it"
             )
-        if any(entry.get("planes") for entry in data.meta) and int(views.max()) > 1:
-            raise FrameError("MergeViews: planes were found view by view; put RemovePlane after MergeViews")
+        # Found view by view, and in a source frame that ends here.
+        for found, step in (("planes", "RemovePlane"), ("objects", "ClusterObjects")):
+            if any(entry.get(found) for entry in data.meta):
+                raise FrameError(f"MergeViews: {found} were found view by view; put {step} after MergeViews")
         device = data.device
         view_of_cloud = torch.cat([torch.arange(int(size), device=device) for size in views])
         seen_from = data.viewpoint_per_point()
@@ -107,9 +113,25 @@ class MergeViews(Transform):
             source_frame=data.frame_id,
             frames={data.frame_id: identity},
             unit=METRE,
-            meta=[_merged_meta(data, start, stop) for start, stop in zip(bounds, bounds[1:])],
+            meta=[_merged_meta(data, start, stop) for start, stop in itertools.pairwise(bounds)],
             history=[data.history[start] for start in bounds[:-1]],
         )
+
+
+def _same_capture(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    """Whether two neighbouring clouds are views of one capture.
+
+    Raises:
+        ConfigError: nothing says which capture a cloud is from.
+    """
+    views = [[camera["view"] for camera in entry.get("cameras", [])] for entry in (before, after)]
+    if not after.get("sample_id") and not views[1]:
+        raise ConfigError(
+            "MergeViews: nothing says which clouds are views of one capture; give them a meta entry sample_id"
+        )
+    keys = [(entry.get("sample_id"), entry.get("capture_index")) for entry in (before, after)]
+    is_later_view = not views[0] or not views[1] or views[0][-1] < views[1][0]
+    return keys[0] == keys[1] and is_later_view
 
 
 def _merged_meta(data: PointCloud, start: int, stop: int) -> dict[str, Any]:
@@ -117,5 +139,3 @@ def _merged_meta(data: PointCloud, start: int, stop: int) -> dict[str, Any]:
     cameras = [camera for entry in data.meta[start:stop] for camera in entry.get("cameras", [])]
     merged = {**data.meta[start], "points_per_view": counts[start:stop]}
     return {**merged, "cameras": cameras} if cameras else merged
-
-

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -56,7 +58,7 @@ class RandomPointDropout(SelectTransform):
         fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
         bounds = cloud.ptr.tolist()
         kept = []
-        for b, (start, stop) in enumerate(zip(bounds, bounds[1:])):
+        for b, (start, stop) in enumerate(itertools.pairwise(bounds)):
             count = stop - start
             num_kept = max(count - round(count * fractions[b]), min(count, 1))
             order = torch.randperm(count, generator=seeded(seeds[b]))[:num_kept]
@@ -97,7 +99,7 @@ class RandomColorJitter(Transform):
         bounds = data.ptr.tolist()
         parts = [
             _adjust(data.colors[start:stop], params["factors"][b])
-            for b, (start, stop) in enumerate(zip(bounds, bounds[1:]))
+            for b, (start, stop) in enumerate(itertools.pairwise(bounds))
         ]
         return data.with_fields(colors=torch.cat(parts))
 

@@ -48,7 +48,9 @@ class NormalizeWorkspace(SpatialTransform):
     def check_fields(self) -> None:
         """Require lower < upper."""
         if not all(low < high for low, high in zip(self.lower, self.upper)):
-            raise ConfigError(f"NormalizeWorkspace: lower must be below upper on every axis: {self.lower}, {self.upper}")
+            raise ConfigError(
+                f"NormalizeWorkspace: lower must be below upper on every axis, got {self.lower}, {self.upper}"
+            )
 
     def frame_needed(self) -> str:
         """The frame of the box."""
@@ -69,9 +71,9 @@ class NormalizeWorkspace(SpatialTransform):
 class Center(SpatialTransform):
     """Move the mean of every cloud to the origin; the frame becomes ``<frame>/centered``, since its origin moved."""
 
-    def result_frame(self, data: PointCloud) -> str:
+    def frame_after(self, frame: str | None) -> str | None:
         """Name the shifted frame."""
-        return f"{data.frame_id}/centered"
+        return None if frame is None else f"{frame}/centered"
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Measure the mean of every cloud."""

@@ -39,7 +39,5 @@ class RemoveRadiusOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""
-        outlier = radius_outlier_mask(
-            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius
-        )
+        outlier = radius_outlier_mask(cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius)
         return rows_of_mask(~outlier), ptr_after_mask(~outlier, cloud.ptr)

@@ -12,9 +12,9 @@ import yaml
 from pcdata.errors import ConfigError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform
-from pcdata.transforms.compose import Compose
+from pcdata.transforms.compose import Compose, compose_again
 from pcdata.transforms.config import read_config, steps_from_node
-from pcdata.transforms.yaml_nodes import YamlDocument
+from pcdata.transforms.yaml_nodes import YamlDocument, yaml_text
 
 SECTIONS = ("depth", "cloud", "augment")
 
@@ -39,6 +39,11 @@ class Pipeline(Transform, abstract=True):
         """Check each section and the joints between them."""
         if self.depth and self.depth[-1].gives is not PointCloud:
             raise ConfigError("Pipeline: the section depth must end in points; put Deproject last")
+        if self.depth and self.depth[0].takes is not DepthFrame:
+            raise ConfigError(
+                f"Pipeline: the section depth must start with a step that takes a capture, not with "
+                f"{type(self.depth[0]).__name__}, which takes a {self.depth[0].takes.__name__}"
+            )
         for section in ("cloud", "augment"):
             for step in getattr(self, section):
                 if step.takes is not PointCloud:
@@ -47,7 +52,7 @@ class Pipeline(Transform, abstract=True):
                         f"depth, not {section}"
                     )
         self._from_depth = Compose([*self.depth, *self.cloud, *self.augment])
-        self._from_cloud = Compose([*self.cloud, *self.augment])
+        self._from_cloud = compose_again([*self.cloud, *self.augment])
         self.is_random = self._from_depth.is_random  # type: ignore[misc]
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
@@ -91,12 +96,12 @@ class Pipeline(Transform, abstract=True):
 
     def to_yaml(self) -> str:
         """Write the sections as YAML that :meth:`from_yaml` reads back."""
-        return yaml.safe_dump(self.to_config(), sort_keys=False, default_flow_style=None, width=110)
+        return yaml_text(self.to_config())
 
     @classmethod
     def from_config(cls, sections: Mapping[str, Any]) -> Pipeline:
         """Build from plain data, the form that :meth:`to_config` returns."""
-        return cls.from_yaml(yaml.safe_dump(dict(sections), sort_keys=False), name="<config>")
+        return cls.from_yaml(yaml_text(dict(sections)), name="<config>")
 
     @classmethod
     def from_yaml(cls, text: str, *, name: str = "<yaml>") -> Pipeline:
@@ -125,9 +130,7 @@ class Pipeline(Transform, abstract=True):
         return self._from_depth
 
 
-def pipeline_from_document(
-    document: YamlDocument, entries: Mapping[str, tuple[yaml.Node, yaml.Node]]
-) -> Pipeline:
+def pipeline_from_document(document: YamlDocument, entries: Mapping[str, tuple[yaml.Node, yaml.Node]]) -> Pipeline:
     """Build the pipeline sections of a parsed file and raise all faults noted so far."""
     steps = {
         section: steps_from_node(document, entries[section][1], f"section {section}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,6 +13,36 @@ from pcdata.errors import ConfigError
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
 
 
+class _Loader(yaml.SafeLoader):
+    """Reads 5e-3 as a number, as YAML 1.2 and everybody else does; YAML 1.1 wants 5.0e-3."""
+
+
+_Loader.yaml_implicit_resolvers = {**yaml.SafeLoader.yaml_implicit_resolvers}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
+)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a value used twice out twice: aliases are refused when read."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Never write an alias."""
+        return True
+
+
+def yaml_text(data: Any) -> str:
+    """Write plain data as YAML that :class:`YamlDocument` reads back.
+
+    Raises:
+        ConfigError: something that is not plain data.
+    """
+    try:
+        return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"a configuration holds plain data only: {error}") from error
+
+
 class YamlDocument:
     """One parsed file and the faults found in it so far; all are reported at once."""
 
@@ -19,16 +50,18 @@ class YamlDocument:
         self.name = name
         self.faults: list[tuple[yaml.Mark | None, str]] = []
         if len(text) > _MAX_CHARACTERS:
-            raise ConfigError(f"{name}: a configuration of {len(text)} characters is not one; the limit is {_MAX_CHARACTERS}")
+            raise ConfigError(f"{name}: {len(text)} characters are no configuration; the limit is {_MAX_CHARACTERS}")
         try:
             # Aliases let a small file expand without bound, and no configuration needs them.
-            alias = next((token for token in yaml.scan(text, yaml.SafeLoader) if isinstance(token, yaml.AliasToken)), None)
-            self.root: yaml.Node | None = None if alias else yaml.compose(text, yaml.SafeLoader)
+            alias = next((token for token in yaml.scan(text, _Loader) if isinstance(token, yaml.AliasToken)), None)
+            self.root: yaml.Node | None = None if alias else yaml.compose(text, _Loader)
         except yaml.MarkedYAMLError as error:
             self.fault_at(error.problem_mark, f"not valid YAML: {error.problem}")
             self.raise_faults()
         except yaml.YAMLError as error:
             raise ConfigError(f"{name}: not valid YAML: {error}") from error
+        except RecursionError as error:
+            raise ConfigError(f"{name}: not a configuration: nested too deeply") from error
         if alias is not None:
             self.fault_at(alias.start_mark, "YAML aliases (*name) are not allowed; write the value out")
             self.raise_faults()
@@ -80,10 +113,12 @@ class YamlDocument:
         for mapping in _mappings(node):
             self.mapping(mapping, "mapping")
         try:
-            return yaml.SafeLoader("").construct_object(node, deep=True)
+            return _Loader("").construct_object(node, deep=True)
         except yaml.MarkedYAMLError as error:
             self.fault_at(error.problem_mark, f"cannot read this value: {error.problem}")
-            return None
+        except (ValueError, TypeError, OverflowError) as error:  # dates and tagged numbers that are none
+            self.fault(node, f"cannot read this value: {error}")
+        return None
 
 
 def node_at(node: yaml.Node, path: Sequence[int | str]) -> yaml.Node:
