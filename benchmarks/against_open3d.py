@@ -72,7 +72,9 @@ def load_points(limit: int | None) -> tuple[torch.Tensor, str]:
     return points.contiguous(), name
 
 
-def cases(points: torch.Tensor) -> list[tuple[str, int, Callable[[], Any], Callable[[], Any], Callable[[Any, Any], str]]]:
+def cases(
+    points: torch.Tensor,
+) -> list[tuple[str, int, Callable[[], Any], Callable[[], Any], Callable[[Any, Any], str]]]:
     """(name, points, ours, theirs, how the results compare) of every operation."""
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.double().numpy()))
     count = len(points)

@@ -88,7 +88,9 @@ def check_tensors(
         if not isinstance(value, Tensor):
             raise DTypeError(f"{where}: {name} must be a torch.Tensor, {spec.describe()}, not {type(value).__name__}")
         if value.dtype not in spec.dtypes:
-            raise DTypeError(f"{where}: {name} must be {spec.describe()}, not {value.dtype}; convert it before the call")
+            raise DTypeError(
+                f"{where}: {name} must be {spec.describe()}, not {value.dtype}; convert it before the call"
+            )
         _bind_shape(where, name, value, spec, sizes, bound_by)
         if device is None:
             device = (name, value.device)

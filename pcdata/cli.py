@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
 from pcdata import __version__
 from pcdata.errors import ConfigError, PcdataError
@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code: 0 done, 1 the data or a file is at fault, 2 the request is."""
     arguments = _parser().parse_args(argv)
     try:
-        with _sigterm_interrupts():
+        with _signals_interrupt():
             arguments.run(arguments)
             sys.stdout.flush()
     except KeyboardInterrupt:
@@ -46,16 +46,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
+def _signals_interrupt() -> Iterator[None]:
     """Let a polite kill clean up like Ctrl-C; Python allows that in the main thread only."""
+    _Progress.interrupted = False
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    # One that is ignored (nohup, a job in the background) stays so.
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
+    previous = {number: signal.signal(number, _interrupt) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if previous is None else previous)
+        for number, handler in previous.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,6 +103,7 @@ def _positive(text: str) -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    _Progress.interrupted = True
     raise KeyboardInterrupt
 
 
@@ -157,7 +162,9 @@ def _build_table(report: Any) -> str:
 
 
 class _Progress:
-    """A bar on a terminal, plain lines elsewhere."""
+    """A bar on a terminal, plain lines elsewhere; also the place where a lost Ctrl-C is heard."""
+
+    interrupted: ClassVar[bool] = False
 
     def __init__(self, what: str) -> None:
         self.what = what
@@ -172,6 +179,8 @@ class _Progress:
             self.bar.close()
 
     def __call__(self, done: int, total: int, sample_id: str) -> None:
+        if self.interrupted:  # it was raised inside a destructor or a callback, where Python drops exceptions
+            raise KeyboardInterrupt
         if not sys.stderr.isatty():
             print(f"{self.what} {done}/{total} {sample_id} {time.perf_counter() - self.started:.1f} s", file=sys.stderr)
             return

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-# Small tensors: threads cost more than they give, and runs become repeatable in time.
-torch.set_num_threads(2)
+# Small tensors: threads cost more than they give, most of all where tests share the cores. Subprocesses inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -45,7 +45,7 @@ def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
     """Write one depth image and return the length of its stored unit."""
     metres = depth.cpu().numpy()
     # Filtered or resampled depth is no longer whole units, as the reader turns them into metres.
-    if unit is not None and np.array_equal((np.rint(metres / float(unit)) * float(unit)).astype(np.float32), metres):
+    if unit is not None and np.array_equal(_whole_units(metres, float(unit)), metres):
         try:
             write_depth(folder / "0.png", depth, metres_per_unit=unit)
         except CaptureError:  # more than 65535 units
@@ -54,3 +54,7 @@ def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
             return unit
     np.save(folder / "0.npy", metres, allow_pickle=False)
     return 1.0
+
+
+def _whole_units(metres: np.ndarray, unit: float) -> np.ndarray:
+    return (np.rint(metres.astype(np.float64) / unit) * unit).astype(np.float32)

@@ -56,12 +56,13 @@ class PointCloud:
     def _fill_defaults(self) -> None:
         fill = object.__setattr__  # the class is frozen
         check_tensors("PointCloud", {"points": self.points}, {"points": "N 3"}, check_values=False)
-        if self.points is None:
+        given: dict[str, Any] = vars(self)  # as the caller left it, whatever the annotations promise
+        if given["points"] is None:
             raise DTypeError("PointCloud: points must be a float32 (N, 3) tensor, not None")
-        if self.ptr is None:
+        if given["ptr"] is None:
             fill(self, "ptr", torch.tensor([0, len(self.points)], device=self.points.device))
         num_clouds = len(self.ptr) - 1
-        if self.source_from_cloud is None:
+        if given["source_from_cloud"] is None:
             fill(self, "source_from_cloud", torch.eye(4, dtype=torch.float64).repeat(num_clouds, 1, 1).to(self.device))
         fill(self, "source_frame", self.source_frame or self.frame_id)
         fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
@@ -209,7 +210,7 @@ class PointCloud:
         """Replace all per-point fields at once, and any other attributes."""
         core = {name: value for name, value in rows.items() if name in CORE_KINDS}
         extra = {name: value for name, value in rows.items() if name not in CORE_KINDS}
-        return replace(self, **core, extra=extra, **others)
+        return replace(self, **core, extra=extra, **others)  # type: ignore[arg-type]
 
     def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:
         """Move every positional and directional field by one affine (B, 4, 4) matrix per cloud.

@@ -35,7 +35,7 @@ class RandomRotation(SpatialTransform):
         if self.axis is None and self.degrees != 180.0:
             raise ConfigError("RandomRotation: axis None means any rotation, so degrees must stay 180; or give an axis")
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one rotation per cloud."""
         if self.axis is None:
             quaternion = streams.normal(4)  # a normalised Gaussian quaternion is uniform over rotations
@@ -56,7 +56,7 @@ class RandomTranslation(SpatialTransform):
     # In the cloud's unit; one number, or one per axis.
     max_offset: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 0.02
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one offset per cloud."""
         limit = torch.tensor(self.max_offset, dtype=torch.float64)
         offset = streams.uniform(-1.0, 1.0, 3) * limit
@@ -78,7 +78,7 @@ class RandomScale(SpatialTransform):
         if self.low > self.high:
             raise ConfigError(f"RandomScale: low {self.low} exceeds high {self.high}")
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one factor, or three, per cloud."""
         factors = streams.uniform(self.low, self.high, 3 if self.per_axis else 1)
         return {"matrix": _about(self.about, data, torch.diag_embed(factors.expand(-1, 3)))}
@@ -95,7 +95,7 @@ class RandomFlip(SpatialTransform):
     probability: tuple[Fraction, Fraction, Fraction] = (0.5, 0.0, 0.0)  # for x, y, z
     about: About = "origin"
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw the signs per cloud."""
         flipped = streams.uniform(0.0, 1.0, 3) < torch.tensor(self.probability, dtype=torch.float64)
         signs = torch.where(flipped, -1.0, 1.0).double()

@@ -251,7 +251,7 @@ def _field_model(cls: type[Transform]) -> Any:
             default = field.default_factory()
         else:
             default = ...
-        fields[field.name] = (field_types(cls)[field.name], default)
+        fields[field.name] = (field_types(cls)[field.name], default)  # type: ignore[arg-type]
     return pydantic.create_model(cls.__name__, __config__=config, **fields)
 
 
@@ -260,7 +260,7 @@ def field_faults(cls: type[Transform], fields: Mapping[str, Any]) -> list[tuple[
     import pydantic
 
     try:
-        _field_model(cls)(**_as_plain_fields(fields))
+        _field_model(cls)(**_as_plain_fields(fields))  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
         return [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
     return []
@@ -276,7 +276,7 @@ def validated_fields(cls: type[Transform], fields: Mapping[str, Any]) -> dict[st
     faults = field_faults(cls, given)
     if faults:
         raise ConfigError("\n".join(f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults))
-    model = _field_model(cls)(**given)
+    model = _field_model(cls)(**given)  # type: ignore[arg-type]
     return {name: getattr(model, name) for name in field_names(cls)}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from torch import Generator, nn
@@ -41,8 +42,20 @@ class Compose(Transform):
         steps = self.__dict__.pop("steps")
         self.steps = nn.ModuleList(steps)  # type: ignore[assignment]
         self.is_random = any(step.is_random for step in steps)  # type: ignore[misc]
+        self.keeps_clouds = all(step.keeps_clouds for step in steps)  # type: ignore[misc]
         self.takes = steps[0].takes if steps else PointCloud  # type: ignore[misc]
         self.gives = steps[-1].gives if steps else PointCloud  # type: ignore[misc]
+
+    def frame_after(self, frame: str | None) -> str | None:
+        """The frame after the last step."""
+        for step in self.steps:
+            frame = step.frame_after(frame)
+        return frame
+
+    def unit_given(self) -> str | None:
+        """The unit that the last step to change it gives."""
+        units = [step.unit_given() for step in self.steps]
+        return next((unit for unit in reversed(units) if unit is not None), None)
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
         """Run every step; the steps record themselves, the chain adds nothing."""
@@ -69,7 +82,8 @@ class Compose(Transform):
         """Return the longest deterministic prefix, which a cache may hold, and the rest."""
         steps = list(self.steps)
         first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
-        return compose_again(steps[:first]), compose_again(steps[first:])
+        with order_checked_before():
+            return Compose(steps[:first]), Compose(steps[first:])
 
     def to_config_list(self) -> list[dict[str, Any]]:
         """Return the steps as a list of ``{name: fields}``."""
@@ -96,7 +110,7 @@ class RandomApply(Transform):
             raise ConfigError(f"RandomApply: {type(self.transform).__name__} does not turn clouds into clouds")
         self.keeps_clouds = self.transform.keeps_clouds  # type: ignore[misc]
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
         chosen = streams.uniform(0.0, 1.0) < self.probability
         return {"chosen": chosen, "seed": streams.seeds()}
@@ -110,11 +124,12 @@ class RandomApply(Transform):
         return PointCloud.cat(clouds)
 
 
-def compose_again(steps: Sequence[Transform]) -> Compose:
-    """Compose steps whose order was checked before: its warning was given then."""
+@contextmanager
+def order_checked_before() -> Iterator[None]:
+    """Compose steps again whose order was warned about when they were first composed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PipelineOrderWarning)
-        return Compose(steps)
+        yield
 
 
 def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Generator]:

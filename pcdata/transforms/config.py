@@ -69,7 +69,9 @@ def steps_from_node(document: YamlDocument, node: yaml.Node | None, what: str) -
 def _step_from_node(document: YamlDocument, node: yaml.Node) -> Transform | None:
     """Build one step written as ``Name`` or ``{Name: fields}``."""
     if isinstance(node, yaml.ScalarNode):
-        name, name_node, fields_node = str(node.value), node, None
+        name = str(node.value)
+        name_node: yaml.Node = node
+        fields_node: yaml.Node | None = None
     elif not isinstance(node, yaml.MappingNode):
         document.fault(node, "a step must be a name, or a name with its fields, not a list")
         return None
@@ -78,7 +80,8 @@ def _step_from_node(document: YamlDocument, node: yaml.Node) -> Transform | None
         if len(entries) != 1:
             document.fault(node, f"a step is one name with its fields, got {len(entries)} names: {sorted(entries)}")
             return None
-        ((name, (name_node, fields_node)),) = entries.items()
+        ((name, place),) = entries.items()
+        name_node, fields_node = place
     cls = REGISTRY.get(name)
     if cls is None:
         hint = near_matches(name, REGISTRY) or f"; known: {', '.join(sorted(REGISTRY))}"
@@ -92,10 +95,15 @@ def _build(
 ) -> Transform | None:
     before = len(document.faults)
     entries = document.mapping(fields_node, cls.__name__)
-    fields = {key: _field_value(document, cls, key, value) for key, (_, value) in entries.items()}
-    if len(document.faults) > before:
-        return None
+    fields: dict[str, Any] = {}
+    for key, (_, value) in entries.items():
+        known = len(document.faults)
+        read = _field_value(document, cls, key, value)
+        if len(document.faults) == known:
+            fields[key] = read
     for path, message in field_faults(cls, fields):
+        if str(path[0]) in entries and str(path[0]) not in fields:
+            continue  # not missing: it could not be read, and that was said
         place = ".".join(map(str, (cls.__name__, *path)))
         document.fault(_place(cls, entries, fields_node, name_node, path), f"{place}: {message}")
     if len(document.faults) > before:
@@ -109,7 +117,7 @@ def _build(
 
 def _field_value(document: YamlDocument, cls: type[Transform], key: str, node: yaml.Node) -> Any:
     """Read one field; fields that hold transforms are steps themselves."""
-    declared = field_types(cls).get(key) if key in field_names(cls) else None
+    declared = field_types(cls).get(key) if key in field_names(cls) else None  # type: ignore[arg-type]
     if declared is Transform:
         return _step_from_node(document, node)
     if declared == Sequence[Transform]:

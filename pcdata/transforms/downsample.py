@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -41,6 +43,7 @@ class VoxelDownsample(Transform):
         """Decide the voxel size of every cloud."""
         if self.num_points is not None:
             return {"voxel_size": find_voxel_size(data.points, data.ptr, num_points=self.num_points)}
+        assert self.voxel_size is not None  # check_fields
         return {"voxel_size": torch.full((data.num_clouds,), self.voxel_size, dtype=torch.float64, device=data.device)}
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
@@ -156,7 +159,7 @@ def _reduce(values: Tensor, kind: Kind, inverse: Tensor, count: int) -> Tensor:
     """Reduce one field voxel by voxel, by its kind and dtype."""
     if kind is Kind.DIRECTION:
         return voxel_mean_direction(values, inverse, count)
-    columns = values.reshape(len(values), -1)
+    columns = values.reshape(len(values), math.prod(values.shape[1:]))
     if values.is_floating_point():
         reduced = voxel_mean(columns, inverse, count)
     else:

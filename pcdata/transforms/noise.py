@@ -23,7 +23,7 @@ class RandomJitter(Transform):
     sigma: NonNegative = 0.001  # standard deviation per axis
     clip: Positive | None = 0.005  # the largest change per axis; None = unlimited
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw a seed per cloud: with it the noise can be drawn again exactly."""
         return {"seed": streams.seeds()}
 
@@ -86,7 +86,7 @@ class RandomColorJitter(Transform):
         if self.hue > 0.5:
             raise ConfigError(f"RandomColorJitter: hue is in turns, at most 0.5, got {self.hue}")
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:  # type: ignore[override]
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw four numbers per cloud."""
         limits = torch.tensor([self.brightness, self.contrast, self.saturation, self.hue], dtype=torch.float64)
         middle = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64)

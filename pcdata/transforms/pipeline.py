@@ -12,7 +12,7 @@ import yaml
 from pcdata.errors import ConfigError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform
-from pcdata.transforms.compose import Compose, compose_again
+from pcdata.transforms.compose import Compose, order_checked_before
 from pcdata.transforms.config import read_config, steps_from_node
 from pcdata.transforms.yaml_nodes import YamlDocument, yaml_text
 
@@ -52,7 +52,8 @@ class Pipeline(Transform, abstract=True):
                         f"depth, not {section}"
                     )
         self._from_depth = Compose([*self.depth, *self.cloud, *self.augment])
-        self._from_cloud = compose_again([*self.cloud, *self.augment])
+        with order_checked_before():
+            self._from_cloud = Compose([*self.cloud, *self.augment])
         self.is_random = self._from_depth.is_random  # type: ignore[misc]
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
@@ -68,7 +69,8 @@ class Pipeline(Transform, abstract=True):
         count = len(self._from_depth.split()[0])
         depth = list(self.depth)[:count]
         cloud = list(self.cloud)[: count - len(depth)]
-        return Pipeline(depth=depth, cloud=cloud, augment=list(self.augment)[: count - len(depth) - len(cloud)])
+        with order_checked_before():
+            return Pipeline(depth=depth, cloud=cloud, augment=list(self.augment)[: count - len(depth) - len(cloud)])
 
     def random_suffix(self) -> Compose:
         """The steps from the first random one on: what runs on cached clouds."""
@@ -77,7 +79,8 @@ class Pipeline(Transform, abstract=True):
     def fingerprint(self) -> str:
         """SHA-256 of the deterministic prefix, section by section: equal for caches that hold the same clouds."""
         prefix = self.deterministic_prefix()
-        parts = [Compose(list(getattr(prefix, section))).fingerprint() for section in SECTIONS]
+        with order_checked_before():
+            parts = [Compose(list(getattr(prefix, section))).fingerprint() for section in SECTIONS]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     def difference(self, other: Pipeline) -> str:

@@ -116,7 +116,12 @@ class YamlDocument:
             return _Loader("").construct_object(node, deep=True)
         except yaml.MarkedYAMLError as error:
             self.fault_at(error.problem_mark, f"cannot read this value: {error.problem}")
-        except (ValueError, TypeError, OverflowError) as error:  # dates and tagged numbers that are none
+        except (
+            ValueError,
+            TypeError,
+            OverflowError,
+            RecursionError,
+        ) as error:  # dates and tagged numbers that are none
             self.fault(node, f"cannot read this value: {error}")
         return None
 

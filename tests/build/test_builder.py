@@ -1,0 +1,366 @@
+"""Builds: all or nothing, nobody's files are touched, and what was built is what the pipeline gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from pcdata import CachedCloudDataset, PointCloud, open_source
+from pcdata.build import build_dataset
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PcdataError
+from pcdata.io.manifest import Manifest, key_of
+
+FORMATS = ["hdf5", "npz", "pt"]
+
+
+class Clouds:
+    """Clouds, or exceptions, under given ids."""
+
+    def __init__(self, samples):
+        self.samples = samples
+        self.ids = list(samples)
+
+    def __repr__(self):
+        return "Clouds()"
+
+    def load(self, sample_id):
+        value = self.samples[sample_id]
+        if isinstance(value, BaseException):
+            raise value
+        return value
+
+
+def cloud(count: int = 40, **changes: object) -> PointCloud:
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(count))
+    here = torch.eye(4, dtype=torch.float64)[None]
+    fields = {"points": points, "frame_id": "base", "frames": {"base": here}}
+    return PointCloud(**(fields | changes))
+
+
+def tree(folder) -> dict[str, bytes | None]:
+    """Everything below a folder, hidden names too."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+# -- what is built -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_dataset_holds_what_the_deterministic_steps_give(tmp_path, source, configure, form):
+    config = configure(f"output: {{format: {form}}}")
+    report = build_dataset(config, source, tmp_path / "out")
+    assert [sample.id for sample in report.samples] == source.ids
+    prefix = config.pipeline.deterministic_prefix()
+    dataset = CachedCloudDataset(tmp_path / "out", augment=None)
+    for stored, name in zip(dataset, source.ids, strict=True):
+        wanted = prefix(source.load(name))
+        assert stored.fields().keys() == wanted.fields().keys()
+        assert all(torch.equal(stored.fields()[field], wanted.fields()[field]) for field in wanted.fields())
+        assert torch.equal(stored.source_from_cloud, wanted.source_from_cloud)
+        assert {entry["sample_id"] for entry in stored.meta} == {name}
+
+
+def test_the_fingerprint_stored_is_that_of_the_prefix(tmp_path, source, configure):
+    config = configure()
+    build_dataset(config, source, tmp_path / "out")
+    manifest = Manifest.read(tmp_path / "out")
+    assert manifest.fingerprint == config.pipeline.fingerprint() == config.pipeline.deterministic_prefix().fingerprint()
+    assert manifest.pipeline == config.pipeline.to_config()
+    assert set(manifest.versions) == {"pcdata", "torch", "numpy", "python"}
+
+
+@pytest.mark.parametrize("settings", ["hdf5", "hdf5, compression: gzip", "npz", "pt"])
+def test_building_twice_gives_the_same_bytes(tmp_path, source, configure, settings):
+    for name in ("one", "two"):
+        build_dataset(configure(f"output: {{format: {settings}, keep_raw: true}}"), source, tmp_path / name)
+    assert tree(tmp_path / "one") == tree(tmp_path / "two")
+
+
+def test_counts_are_told_per_step_and_captures_that_are_clouds_say_so(tmp_path, source, configure):
+    report = build_dataset(configure(), source, tmp_path / "out")
+    sample = report.samples[0]
+    assert sample.entered_at == "depth"
+    assert [step for step, _ in sample.counts] == ["Deproject", "ToFrame", "FarthestPointSample"]
+    assert sample.counts[-1][1] == 2 * 32  # both views
+    depth = source.load(sample.id).depth
+    assert sample.counts[0][1] == int(((depth >= 0.1) & (depth <= 3.0)).sum())
+    assert build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "b").samples[0].entered_at == "cloud"
+
+
+def test_progress_is_told_after_every_sample(tmp_path, source, configure):
+    told = []
+    build_dataset(configure(), source, tmp_path / "out", progress=lambda *news: told.append(news))
+    assert told == [(i + 1, 3, name) for i, name in enumerate(source.ids)]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_any_sample_id_can_be_stored(tmp_path, configure, form):
+    ids = ["a/b/c", "../up", "..", ".hidden", "with space", "ünïcode-点", "x" * 300, "%2F", "a.b.c", "~", "new\nline"]
+    build_dataset(configure(f"output: {{format: {form}}}"), Clouds({name: cloud() for name in ids}), tmp_path / "out")
+    dataset = CachedCloudDataset(tmp_path / "out", augment=None)
+    assert dataset.ids == ids
+    assert [one.meta[0]["sample_id"] for one in dataset] == ids
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_dataset_can_be_moved(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "here")
+    (tmp_path / "here").rename(tmp_path / "there")
+    assert len(list(CachedCloudDataset(tmp_path / "there"))) == 3
+
+
+def test_missing_parents_of_the_folder_are_made(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "a" / "b" / "out")
+    assert len(CachedCloudDataset(tmp_path / "a" / "b" / "out")) == 3
+
+
+# -- keep_raw ------------------------------------------------------------------------------------------------------
+
+
+def test_keep_raw_delivers_captures_that_open_source_reads_back(tmp_path, source, configure):
+    build_dataset(configure("output: {format: npz, keep_raw: true}"), source, tmp_path / "out")
+    for name in source.ids:
+        frame = source.load(name)
+        for v in range(2):
+            raw = open_source(tmp_path / "out" / "raw" / key_of(name) / f"view{v}")
+            read = raw.load(raw.ids[0])
+            assert torch.equal(read.depth[0], frame.depth[v])
+            assert torch.equal(read.colors[0], frame.colors[v])
+            assert torch.equal(read.world_from_camera[0], frame.world_from_camera[v])
+            assert torch.equal(read.camera.intrinsics[0], frame.camera.intrinsics[v])
+            assert read.frame_id == frame.frame_id
+
+
+def test_keep_raw_of_clouds_is_refused(tmp_path, configure):
+    with pytest.raises(CaptureError, match="keep_raw"):
+        build_dataset(configure("output: {keep_raw: true}"), Clouds({"a": cloud()}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+# -- all or nothing ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(
+    "fault", [CaptureError("cannot be trusted"), OSError(5, "bad sector"), KeyboardInterrupt(), SystemExit(3)], ids=repr
+)
+def test_a_failure_in_the_middle_leaves_nothing(tmp_path, configure, form, fault):
+    samples = {"good": cloud(), "bad one": fault, "later": cloud()}
+    with pytest.raises(type(fault)) as caught:
+        build_dataset(configure(f"output: {{format: {form}}}"), Clouds(samples), tmp_path / "deep" / "er" / "out")
+    assert not list(tmp_path.iterdir())
+    if isinstance(fault, Exception):
+        assert any("'bad one' of Clouds()" in note for note in caught.value.__notes__)
+
+
+def test_a_step_that_fails_leaves_nothing_and_names_step_and_sample(tmp_path, configure):
+    short = Clouds({"ok": cloud(), "empty": cloud(0)})
+    with pytest.raises(PcdataError) as caught:
+        build_dataset(configure(), short, tmp_path / "out")
+    notes = "\n".join(caught.value.__notes__)
+    assert "FarthestPointSample" in notes
+    assert "'empty'" in notes
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        cloud(meta=[{"score": float("nan")}]),
+        cloud(labels=torch.full((40,), 2**40)),
+        cloud().with_extra("f", torch.zeros(40, dtype=torch.bfloat16), "invariant"),
+    ],
+    ids=["NaN", "labels", "dtype"],
+)
+def test_a_cloud_that_cannot_be_stored_is_a_cache_error_that_names_it(tmp_path, configure, bad):
+    with pytest.raises(CacheError) as caught:
+        build_dataset(configure(), Clouds({"a": cloud(), "odd": bad}), tmp_path / "out")
+    assert any("'odd'" in note for note in caught.value.__notes__)
+    assert not list(tmp_path.iterdir())
+
+
+def test_progress_that_raises_leaves_nothing(tmp_path, source, configure):
+    def progress(done: int, total: int, name: str) -> None:
+        raise RuntimeError("closed window")
+
+    with pytest.raises(RuntimeError, match="closed window"):
+        build_dataset(configure(), source, tmp_path / "out", progress=progress)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_source_without_captures_is_refused(tmp_path, configure):
+    with pytest.raises(CaptureError, match="no captures"):
+        build_dataset(configure(), Clouds({}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_ids_that_repeat_are_refused_before_any_work(tmp_path, configure):
+    twice = Clouds({"a": RuntimeError("must not be loaded")})
+    twice.ids = ["a", "a"]
+    with pytest.raises(CaptureError, match="'a' comes more than once"):
+        build_dataset(configure(), twice, tmp_path / "out")
+
+
+def test_wrong_arguments_say_how_to_get_the_right_ones(tmp_path, source, configure):
+    with pytest.raises(DTypeError, match="load_config"):
+        build_dataset("config.yaml", source, tmp_path / "out")
+    with pytest.raises(DTypeError, match="load_config"):
+        build_dataset(configure().pipeline, source, tmp_path / "out")
+    with pytest.raises(DTypeError, match="open_source"):
+        build_dataset(configure(), "captures/", tmp_path / "out")
+
+
+def test_a_pipeline_without_deprojection_is_refused(tmp_path, source):
+    from pcdata.build import config_from_yaml
+
+    with pytest.raises(ConfigError, match="Deproject"):
+        build_dataset(config_from_yaml(""), source, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+# -- what is there already -----------------------------------------------------------------------------------------
+
+
+def test_an_existing_folder_is_refused_with_both_ways_out(tmp_path, source, configure):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years")
+    with pytest.raises(CacheError, match=r"exists already.*another folder.*--overwrite"):
+        build_dataset(configure(), source, tmp_path / "out")
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years"
+
+
+def test_an_existing_empty_folder_is_used(tmp_path, source, configure):
+    (tmp_path / "out").mkdir()
+    build_dataset(configure(), source, tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert len(CachedCloudDataset(tmp_path / "out")) == 3
+
+
+def test_overwrite_never_replaces_what_is_no_dataset(tmp_path, source, configure):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years")
+    (tmp_path / "file").write_text("more")
+    for name in ("out", "file"):
+        with pytest.raises(CacheError, match="not a pcdata dataset, so it is not overwritten"):
+            build_dataset(configure(), source, tmp_path / name, overwrite=True)
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years"
+    assert (tmp_path / "file").read_text() == "more"
+
+
+def test_overwrite_never_deletes_a_file_somebody_put_into_a_dataset(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "out")
+    (tmp_path / "out" / "checkpoint.pt").write_bytes(b"a week of training")
+    before = tree(tmp_path)
+    with pytest.raises(CacheError, match=r"checkpoint\.pt"):
+        build_dataset(configure(), source, tmp_path / "out", overwrite=True)
+    assert tree(tmp_path) == before
+
+
+def test_overwrite_never_replaces_a_folder_with_somebody_else_s_dataset_json(tmp_path, source, configure):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "dataset.json").write_text('{"my": "own"}')
+    with pytest.raises(CacheError, match="schema"):
+        build_dataset(configure(), source, tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out" / "dataset.json").exists()
+
+
+def test_overwrite_replaces_a_dataset_whole(tmp_path, source, configure):
+    build_dataset(configure("output: {format: npz}"), source, tmp_path / "out")
+    build_dataset(configure("output: {format: pt}"), Clouds({"a": cloud()}), tmp_path / "out", overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert CachedCloudDataset(tmp_path / "out").ids == ["a"]
+    assert not list((tmp_path / "out").rglob("*.npz"))
+
+
+@pytest.mark.parametrize("fault", [CaptureError("bad"), KeyboardInterrupt()], ids=repr)
+def test_a_failed_overwrite_leaves_the_old_dataset_untouched(tmp_path, source, configure, fault):
+    build_dataset(configure(), source, tmp_path / "out")
+    before = tree(tmp_path)
+    with pytest.raises(type(fault)):
+        build_dataset(configure(), Clouds({"a": cloud(), "b": fault}), tmp_path / "out", overwrite=True)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)
+@pytest.mark.parametrize("failing_rename", [1, 2])
+def test_a_failure_while_the_datasets_are_swapped_brings_the_old_one_back(
+    tmp_path, source, configure, monkeypatch, fault, failing_rename
+):
+    build_dataset(configure(), source, tmp_path / "out")
+    before = tree(tmp_path)
+    calls = []
+    rename = os.replace
+
+    def replace(a, b):
+        calls.append(b)
+        if len(calls) == failing_rename:
+            raise fault
+        rename(a, b)
+
+    monkeypatch.setattr("pcdata.build.builder.os.replace", replace)
+    with pytest.raises((CacheError, KeyboardInterrupt)):
+        build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "out", overwrite=True)
+    assert len(calls) >= failing_rename
+    assert tree(tmp_path) == before
+
+
+def test_a_link_to_a_dataset_leads_to_the_new_one_after_overwriting(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "disk" / "out")
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "out")
+    build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "link", overwrite=True)
+    assert (tmp_path / "link").is_symlink()
+    assert CachedCloudDataset(tmp_path / "link").ids == ["a"]
+    assert sorted(path.name for path in tmp_path.rglob("*") if "." in path.name[:1]) == []
+
+
+def test_the_current_folder_can_be_the_target(tmp_path, source, configure, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    build_dataset(configure(), source, ".")
+    assert len(CachedCloudDataset(tmp_path / "here")) == 3
+
+
+def test_a_target_below_a_file_is_a_cache_error(tmp_path, source, configure):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(CacheError, match="cannot"):
+        build_dataset(configure(), source, tmp_path / "file" / "out")
+    assert tree(tmp_path) == {"file": b"x"}
+
+
+# -- what other tools see ------------------------------------------------------------------------------------------
+
+
+def test_an_hdf5_dataset_is_one_file_with_a_group_per_scene(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "out")
+    assert sorted(os.listdir(tmp_path / "out")) == ["clouds.h5", "dataset.json", "load.py", "pipeline.yaml"]
+    with h5py.File(tmp_path / "out" / "clouds.h5", "r") as file:
+        assert list(file) == source.ids
+        frame = source.load(source.ids[0])
+        group = file[source.ids[0]]
+        assert np.array_equal(group["intrinsics"][()], frame.camera.intrinsics.numpy())
+        assert np.array_equal(group["extrinsics"][()], frame.world_from_camera.numpy())
+        assert group["points"].shape == group["colors"].shape == (64, 3)
+        assert 0 <= group["colors"][()].min() <= group["colors"][()].max() <= 1
+
+
+def test_the_manifest_is_readable_by_people_and_other_programs(tmp_path, source, configure):
+    build_dataset(configure("output: {format: npz, compression: gzip}"), source, tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "dataset.json").read_text())
+    assert (content["format"], content["compression"]) == ("npz", "gzip")
+    assert [sample["id"] for sample in content["samples"]] == source.ids
+    assert all(re.fullmatch("[0-9a-f]{64}", sample["digest"]) for sample in content["samples"])
+
+
+def test_the_stored_yaml_makes_the_same_pipeline(tmp_path, source, configure):
+    from pcdata.transforms import Pipeline
+
+    config = configure()
+    build_dataset(config, source, tmp_path / "out")
+    again = Pipeline.load(str(tmp_path / "out" / "pipeline.yaml"))
+    assert again.to_config() == config.pipeline.to_config()

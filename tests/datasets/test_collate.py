@@ -1,0 +1,74 @@
+"""Collate functions lose nothing, and say what is wrong with a batch that cannot be made."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pcdata import PointCloud, collate_fixed, collate_packed, collate_padded
+from pcdata.errors import DTypeError, FrameError, ShapeError
+
+ALL = [collate_packed, collate_padded, collate_fixed]
+
+
+def cloud(count: int, start: float = 0.0, **changes: object) -> PointCloud:
+    points = start + torch.arange(count * 3.0).reshape(count, 3)
+    fields = {"points": points, "frame_id": "base", "labels": torch.arange(count), "colors": points / 100}
+    return PointCloud(**(fields | changes))
+
+
+def test_packed_is_the_concatenation_cut_by_ptr():
+    clouds = [cloud(3), cloud(0), cloud(5, 9.0)]
+    batch = collate_packed(clouds)
+    assert batch.ptr.tolist() == [0, 3, 3, 8]
+    for one, back in zip(clouds, batch.unbatch(), strict=True):
+        assert torch.equal(one.points, back.points)
+        assert torch.equal(one.labels, back.labels)
+
+
+def test_padded_has_each_cloud_where_the_mask_is_true_and_fill_elsewhere():
+    clouds = [cloud(3), cloud(0), cloud(5, 9.0)]
+    batch = collate_padded(clouds)
+    assert batch.points.shape == (3, 5, 3)
+    assert batch.mask.sum(1).tolist() == [3, 0, 5]
+    for one, points, labels, mask in zip(clouds, batch.points, batch.labels, batch.mask, strict=True):
+        assert torch.equal(points[mask], one.points)
+        assert torch.equal(labels[mask], one.labels)
+        assert not points[~mask].any()
+        assert (labels[~mask] == -1).all()
+
+
+def test_fixed_is_a_plain_stack():
+    batch = collate_fixed([cloud(4), cloud(4, 7.0)])
+    assert torch.equal(batch.points, torch.stack([cloud(4).points, cloud(4, 7.0).points]))
+    assert batch.mask.all()
+
+
+def test_fixed_refuses_other_counts_and_says_what_to_do():
+    with pytest.raises(ShapeError, match=r"3 to 5 points.*FarthestPointSample.*collate_padded"):
+        collate_fixed([cloud(3), cloud(5)])
+
+
+@pytest.mark.parametrize("collate", ALL)
+def test_a_batch_of_nothing_is_an_error(collate):
+    with pytest.raises(ShapeError, match="at least one"):
+        collate([])
+
+
+@pytest.mark.parametrize("collate", ALL)
+def test_clouds_in_two_frames_are_not_mixed(collate):
+    with pytest.raises(FrameError, match=r"'camera'.*'base'"):
+        collate([cloud(3), cloud(3, frame_id="camera")])
+
+
+@pytest.mark.parametrize("collate", ALL)
+def test_clouds_with_different_fields_are_named(collate):
+    with pytest.raises(ShapeError, match="colors"):
+        collate([cloud(3), cloud(3, colors=None)])
+
+
+@pytest.mark.parametrize("collate", ALL)
+@pytest.mark.parametrize("wrong", [torch.zeros(3, 3), {"points": torch.zeros(3, 3)}, None])
+def test_anything_but_clouds_is_refused_by_the_name_of_its_type(collate, wrong):
+    with pytest.raises(DTypeError, match=f"{collate.__name__}.*{type(wrong).__name__}"):
+        collate([cloud(3), wrong])

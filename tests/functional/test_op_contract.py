@@ -1,0 +1,300 @@
+"""The laws that every registered operation keeps; a new operation joins by an entry in EXAMPLES."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import pcdata.functional  # noqa: F401 - registers the operations
+from pcdata.checks import parse_spec
+from pcdata.dispatch import OPERATIONS
+from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, PcdataError, ShapeError
+from pcdata.functional.ragged import ptr_from_counts
+from pcdata.rng import seeded
+
+COUNTS = (60, 25, 90)
+
+
+def points(count: int, seed: int) -> Tensor:
+    """Half of them on a plane, with a few repeats."""
+    cloud = torch.rand(count, 3, generator=seeded(seed)) * 0.2
+    cloud[::2, 2] = 0.1
+    cloud[5::7] = cloud[4:-1:7][: len(cloud[5::7])] if count > 6 else cloud[5::7]
+    return cloud
+
+
+def one_cloud(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed)}
+
+
+def with_queries(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "queries": points(count // 2 + 1, seed + 50)}
+
+
+def two_clouds(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points_a": points(count, seed), "points_b": points(count // 2 + 1, seed + 50)}
+
+
+INTRINSICS = torch.tensor([[[30.0, 0.1, 8.2], [0.0, 31.0, 6.1], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+LENS = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=torch.float64)
+
+
+def depth_image(count: int, seed: int) -> dict[str, Tensor]:
+    """A 12 x 16 image with ``count`` readings."""
+    depth = torch.zeros(192)
+    depth[torch.randperm(192, generator=seeded(seed))[:count]] = 0.5
+    depth *= 1 + torch.rand(192, generator=seeded(seed + 1))
+    intrinsics = INTRINSICS.clone()
+    intrinsics[:, 0, 0] += seed
+    return {"depth": depth.reshape(1, 12, 16), "intrinsics": intrinsics, "distortion": LENS}
+
+
+def in_front_of_a_camera(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed) + 0.5, "intrinsics": INTRINSICS, "distortion": LENS}
+
+
+@dataclass(frozen=True)
+class Example:
+    """One way to call an operation.
+
+    ``gives`` says what each output is, so that outputs of single clouds can be packed as the batch packs them:
+    ``row`` and ``cloud`` values follow one another, ``ptr`` are row pointers, ``index`` are rows of the points (their
+    number stands for none), ``group`` are rows of the output that ``ptr`` cuts.
+    """
+
+    name: str
+    cloud: Callable[[int, int], dict[str, Tensor]]
+    gives: tuple[str, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+EXAMPLES = [
+    Example("ball_query", one_cloud, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
+    Example("ball_query", with_queries, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
+    Example("chamfer_distance", two_clouds, ("cloud",)),
+    Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
+    Example("deproject_depth", depth_image, ("row", "ptr", "row")),
+    Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
+    Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
+    Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
+    Example("knn", one_cloud, ("index", "row"), {"k": 4}),
+    Example("knn", with_queries, ("index", "row"), {"k": 40}),
+    Example("project_points", in_front_of_a_camera, ("row", "row")),
+    Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
+    Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
+    Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
+    Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),
+]
+
+each_example = pytest.mark.parametrize(
+    "example", EXAMPLES, ids=lambda example: f"{example.name}-{example.cloud.__name__}"
+)
+
+
+def row_pointers(example: Example) -> dict[str, str]:
+    """Row pointer argument -> the tensor argument whose rows it cuts."""
+    specs = {key: parse_spec(text) for key, text in OPERATIONS[example.name].specs.items()}
+    tensors = {spec.dims[0]: key for key, spec in specs.items() if not spec.is_ptr}
+    return {key: tensors[spec.dims[0]] for key, spec in specs.items() if spec.is_ptr}
+
+
+def packed(example: Example, clouds: list[dict[str, Tensor]], *, with_ptr: bool = True) -> dict[str, Tensor]:
+    """The arguments for clouds one after another."""
+    together = {key: torch.cat([cloud[key] for cloud in clouds]) for key in clouds[0]}
+    for ptr, rows in row_pointers(example).items():
+        if rows in together:
+            together[ptr] = ptr_from_counts([len(cloud[rows]) for cloud in clouds]) if with_ptr else None
+    return together
+
+
+def clouds_of(example: Example, counts=COUNTS) -> list[dict[str, Tensor]]:
+    return [example.cloud(count, seed) for seed, count in enumerate(counts)]
+
+
+def call(example: Example, arguments: dict[str, Any], **options: Any) -> tuple[Tensor, ...]:
+    result = OPERATIONS[example.name].public(**arguments, **{**example.options, **options})
+    result = result if isinstance(result, tuple) else (result,)
+    assert len(result) == len(example.gives)
+    return result
+
+
+def outcome(example: Example, arguments: dict[str, Any]) -> tuple[Tensor, ...] | type[PcdataError]:
+    try:
+        return call(example, arguments)
+    except PcdataError as error:
+        assert str(error).startswith(f"{example.name}: ")  # noqa: PT017 - passing is fine too
+        return type(error)
+
+
+def packed_results(
+    example: Example, clouds: list[dict[str, Tensor]], results: list[tuple[Tensor, ...]]
+) -> list[Tensor]:
+    """Pack the outputs of single clouds as the batch does."""
+    outputs = []
+    for place, kind in enumerate(example.gives):
+        values = [result[place] for result in results]
+        if kind == "ptr":
+            outputs.append(ptr_from_counts([int(value[-1]) for value in values]))
+            continue
+        if kind == "index":
+            sizes = [len(cloud["points"]) for cloud in clouds]
+            starts = ptr_from_counts(sizes).tolist()
+            values = [
+                torch.where(value == size, starts[-1], value + start)
+                for value, size, start in zip(values, sizes, starts)
+            ]
+        if kind == "group":
+            made = [int(result[example.gives.index("ptr")][-1]) for result in results]
+            values = [value + start for value, start in zip(values, ptr_from_counts(made).tolist())]
+        outputs.append(torch.cat(values))
+    return outputs
+
+
+def assert_equal(one, other) -> None:
+    assert len(one) == len(other)
+    for place, (a, b) in enumerate(zip(one, other)):
+        assert a.dtype == b.dtype
+        assert torch.equal(a, b), f"output {place} differs"
+
+
+def test_every_operation_has_an_example():
+    assert {example.name for example in EXAMPLES} == set(OPERATIONS)
+
+
+def test_every_argument_of_every_contract_is_in_an_example():
+    for name, operation in OPERATIONS.items():
+        used = set()
+        for example in EXAMPLES:
+            if example.name == name:
+                used |= set(packed(example, clouds_of(example)))
+        assert used == set(operation.specs), name
+
+
+@each_example
+def test_the_input_stays_as_it_was_and_the_answer_repeats(example):
+    arguments = packed(example, clouds_of(example))
+    before = {key: value.clone() for key, value in arguments.items()}
+    state = torch.get_rng_state()
+    first = call(example, arguments)
+    for key, value in arguments.items():
+        assert torch.equal(value, before[key])
+    assert_equal(first, call(example, arguments))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@each_example
+@pytest.mark.parametrize("counts", [COUNTS, (30, 0, 40), (50, 1, 2), (0, 0)], ids=str)
+def test_a_batch_equals_its_clouds_one_after_another(example, counts):
+    clouds = clouds_of(example, counts)
+    batch = outcome(example, packed(example, clouds))
+    singles = [outcome(example, packed(example, [cloud])) for cloud in clouds]
+    errors = [single for single in singles if isinstance(single, type)]
+    if errors:
+        assert batch is errors[0]
+    else:
+        assert_equal(batch, packed_results(example, clouds, singles))
+
+
+@each_example
+def test_no_row_pointers_mean_one_cloud(example):
+    cloud = clouds_of(example, (60,))
+    assert_equal(call(example, packed(example, cloud)), call(example, packed(example, cloud, with_ptr=False)))
+
+
+@each_example
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_few_points_pass_or_raise_a_typed_error(example, count):
+    outcome(example, packed(example, clouds_of(example, (count,))))
+
+
+@each_example
+def test_points_that_are_all_the_same_pass_or_raise_a_typed_error(example):
+    clouds = clouds_of(example, (40, 30))
+    for cloud in clouds:
+        for key in cloud:
+            if "points" in key or key == "queries":
+                cloud[key] = torch.full_like(cloud[key], 0.3)
+    batch = outcome(example, packed(example, clouds))
+    if not isinstance(batch, type):
+        assert_equal(batch, packed_results(example, clouds, [call(example, packed(example, [one])) for one in clouds]))
+
+
+@each_example
+def test_wrong_tensors_are_refused_by_name(example):
+    good = packed(example, clouds_of(example))
+    for key, value in good.items():
+        spec = parse_spec(OPERATIONS[example.name].specs[key])
+
+        def refused(bad: Any, error: type[PcdataError], key: str = key) -> None:
+            with pytest.raises(error, match=rf"^{example.name}: .*{key}"):
+                call(example, {**good, key: bad})
+
+        refused(value.to(torch.int32 if spec.is_ptr else torch.float16), DTypeError)
+        refused(value[None], ShapeError)
+        refused(value.tolist(), DTypeError)
+        refused(value.numpy(), DTypeError)
+        if value.dtype.is_floating_point:
+            for bad in (torch.nan, torch.inf, -torch.inf):
+                spoiled = value.clone()
+                spoiled.flatten()[-1:] = bad
+                refused(spoiled, NonFiniteError)
+        if key != next(iter(good)):
+            refused(value.to("meta"), DeviceError)
+
+
+@each_example
+def test_wrong_row_pointers_are_refused(example):
+    good = packed(example, clouds_of(example))
+    for key, rows in row_pointers(example).items():
+        if rows not in good:
+            continue
+        count = len(good[rows])
+        for wrong in ([0, count + 1, count, count], [1, 2, 3, count], [0, 1, 2, count - 1], [0, 1, 2, count + 1]):
+            with pytest.raises(ShapeError, match=rf"^{example.name}: {key}"):
+                call(example, {**good, key: torch.tensor(wrong)})
+
+
+@each_example
+def test_the_reference_is_what_auto_gives(example):
+    arguments = packed(example, clouds_of(example))
+    assert_equal(call(example, arguments), call(example, arguments, backend="torch"))
+
+
+@each_example
+@pytest.mark.parametrize("backend", ["toch", "CUDA", "", None])
+def test_an_unknown_backend_is_refused(example, backend):
+    arguments = packed(example, clouds_of(example))
+    with pytest.raises(BackendError, match=rf"^{example.name}: unknown backend {backend!r}; known: 'auto', 'torch'"):
+        call(example, arguments, backend=backend)
+
+
+@each_example
+def test_it_runs_in_inference_mode_and_on_slices(example):
+    arguments = packed(example, clouds_of(example))
+    expected = call(example, arguments)
+    with torch.inference_mode():
+        assert_equal(expected, call(example, arguments))
+    # Rows of a wider tensor: not contiguous.
+    strided = {
+        key: torch.cat([value, value], dim=-1)[..., : value.shape[-1]] if value.ndim > 1 else value
+        for key, value in arguments.items()
+    }
+    assert_equal(expected, call(example, strided))
+
+
+@each_example
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device to compare the CPU with")
+def test_cuda_agrees_with_the_cpu(example):
+    arguments = packed(example, clouds_of(example))
+    on_gpu = call(example, {key: value.to("cuda") for key, value in arguments.items()})
+    for cpu, gpu in zip(call(example, arguments), on_gpu):
+        assert gpu.device.type == "cuda"
+        if cpu.dtype.is_floating_point:
+            torch.testing.assert_close(gpu.cpu(), cpu, atol=1e-6, rtol=1e-6)
+        else:
+            assert torch.equal(gpu.cpu(), cpu)

@@ -1,0 +1,158 @@
+"""dataset.json: keys that are safe file names, and nothing hostile or damaged gets through."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pcdata.errors import CacheError
+from pcdata.io.manifest import FILE_NAME, SCHEMA, Manifest, Sample, key_of
+
+GOOD = {
+    "format": "npz",
+    "compression": "none",
+    "fingerprint": "f" * 64,
+    "pipeline": {"depth": [], "cloud": [], "augment": []},
+    "samples": [{"id": "a", "key": "a", "num_points": 3, "digest": "d"}],
+    "versions": {"pcdata": "0.1.0"},
+    "schema": SCHEMA,
+}
+
+
+def _refused(folder: Path, content: object) -> str:
+    text = content if isinstance(content, (str, bytes)) else json.dumps(content)
+    (folder / FILE_NAME).write_bytes(text.encode() if isinstance(text, str) else text)
+    with pytest.raises(CacheError) as caught:
+        Manifest.read(folder)
+    assert str(folder / FILE_NAME) in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_is_written_is_read(tmp_path):
+    ids = ["a/b", "ü", "..", "x" * 300, "a b"]
+    samples = [Sample(name, key_of(name), number, "d" * 64) for number, name in enumerate(ids)]
+    manifest = Manifest("hdf5", "lzf", "f" * 64, {"depth": [], "cloud": []}, samples, {"torch": "2"})
+    manifest.write(tmp_path)
+    assert Manifest.read(tmp_path) == manifest
+    assert Manifest.read(str(tmp_path)) == manifest
+
+
+def test_the_example_of_these_tests_is_valid(tmp_path):
+    (tmp_path / FILE_NAME).write_text(json.dumps(GOOD))
+    assert Manifest.read(tmp_path).samples == [Sample("a", "a", 3, "d")]
+
+
+@given(st.text(min_size=1), st.text(min_size=1))
+def test_keys_are_safe_file_names_and_differ_when_ids_differ(one, other):
+    for sample_id in (one, other):
+        key = key_of(sample_id)
+        assert re.fullmatch(r"[A-Za-z0-9_.%~-]{1,200}", key)
+        assert not key.startswith(".")
+    assert (key_of(one) == key_of(other)) == (one == other)
+
+
+@given(st.text(min_size=150, max_size=400), st.text(min_size=1, max_size=3))
+def test_long_ids_that_differ_at_the_end_alone_have_different_keys(stem, end):
+    assert key_of(stem) != key_of(stem + end)
+    assert len(key_of(stem + end)) <= 200
+
+
+@pytest.mark.parametrize("sample_id", ["scene_0001", "a.b-C_9"])
+def test_plain_ids_are_their_own_key(sample_id):
+    assert key_of(sample_id) == sample_id
+
+
+@pytest.mark.parametrize("sample_id", ["", None, 5])
+def test_an_id_that_is_no_text_has_no_key(sample_id):
+    with pytest.raises(CacheError, match="sample id"):
+        key_of(sample_id)
+
+
+def test_a_name_that_is_not_utf8_has_a_key():
+    assert key_of(b"scan-\xe9".decode("utf-8", "surrogateescape")) != key_of("scan-é")
+
+
+@pytest.mark.parametrize("key", ["../x", "..", "/etc/passwd", "a/b", "A", "", "a\0", "a.npz/../../x"])
+def test_a_key_that_is_not_that_of_its_id_is_refused(tmp_path, key):
+    assert "key" in _refused(tmp_path, {**GOOD, "samples": [{**GOOD["samples"][0], "key": key}]})
+
+
+def test_an_id_that_climbs_out_cannot_bring_its_own_key(tmp_path):
+    assert "key" in _refused(tmp_path, {**GOOD, "samples": [{**GOOD["samples"][0], "id": "../x", "key": "../x"}]})
+
+
+def test_two_samples_of_one_key_are_refused(tmp_path):
+    assert "share a key" in _refused(tmp_path, {**GOOD, "samples": GOOD["samples"] * 2})
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"schema": "pcdata.dataset/999"}, "rebuild"),
+        ({"schema": None}, "schema"),
+        ({"format": "parquet"}, "hdf5, npz, pt"),
+        ({"format": ["npz"]}, ""),
+        ({"format": None}, "format"),
+        ({"compression": "zstd"}, "compression"),
+        ({"compression": "lzf"}, "compression"),  # npz has none
+        ({"fingerprint": 5}, "fingerprint"),
+        ({"pipeline": []}, "pipeline"),
+        ({"pipeline": None}, "pipeline"),
+        ({"versions": "1.0"}, "versions"),
+        ({"samples": []}, "no samples"),
+        ({"samples": None}, ""),
+        ({"samples": 5}, ""),
+        ({"samples": ["a"]}, ""),
+        ({"samples": {"a": 1}}, ""),
+        ({"samples": [{"id": "a"}]}, ""),
+        ({"samples": [{**GOOD["samples"][0], "more": 1}]}, "more"),
+        ({"samples": [{**GOOD["samples"][0], "id": 5, "key": "5"}]}, "id"),
+        ({"samples": [{**GOOD["samples"][0], "id": "", "key": ""}]}, "id"),
+        ({"samples": [{**GOOD["samples"][0], "num_points": "3"}]}, "num_points"),
+        ({"samples": [{**GOOD["samples"][0], "num_points": True}]}, "num_points"),
+        ({"samples": [{**GOOD["samples"][0], "digest": None}]}, "digest"),
+        ({"surprise": 1}, "surprise"),
+    ],
+    ids=str,
+)
+def test_wrong_contents_are_refused(tmp_path, change, word):
+    assert word in _refused(tmp_path, {**GOOD, **change})
+
+
+@pytest.mark.parametrize("name", [name for name in GOOD if name != "versions"])
+def test_a_missing_entry_is_refused(tmp_path, name):
+    _refused(tmp_path, {key: value for key, value in GOOD.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    "content", ["", "no json", "[]", "null", "[" * 200_000, '{"a":' * 200_000, b"\xff\xfe\x00", b"\0" * 99, "1" * 5000]
+)
+def test_text_that_is_no_json_object_is_refused(tmp_path, content):
+    _refused(tmp_path, content)
+
+
+def test_a_cut_file_is_refused_wherever_it_is_cut(tmp_path):
+    text = json.dumps(GOOD)
+    for cut in range(0, len(text) - 1, 7):
+        _refused(tmp_path, text[:cut])
+
+
+def test_a_folder_without_one_says_how_to_make_one(tmp_path):
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(CacheError, match="pcdata build"):
+            Manifest.read(folder)
+    (tmp_path / FILE_NAME).mkdir()
+    with pytest.raises(CacheError, match="pcdata build"):
+        Manifest.read(tmp_path)
+
+
+def test_an_absurdly_large_file_is_refused_unread(tmp_path):
+    with open(tmp_path / FILE_NAME, "wb") as file:
+        file.truncate(2**40)  # sparse: reading it would never end
+    with pytest.raises(CacheError, match="too many"):
+        Manifest.read(tmp_path)

@@ -1,0 +1,75 @@
+"""Importing pcdata is cheap and loads nothing that is not needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pcdata
+
+HEAVY = ["open3d", "torch_cluster", "matplotlib", "h5py", "kornia", "scipy", "pydantic"]
+
+
+def in_a_new_process(code: str) -> str:
+    """Run code in a fresh interpreter that finds the same pcdata, and return what it prints."""
+    root = str(Path(pcdata.__file__).parent.parent)
+    path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_importing_pcdata_loads_not_even_torch():
+    loaded = in_a_new_process("import sys, json, pcdata; print(json.dumps(sorted(sys.modules)))")
+    packages = {name.split(".")[0] for name in json.loads(loaded)}
+    assert not packages & {*HEAVY, "torch", "numpy", "yaml"}
+
+
+def test_importing_the_parts_loads_nothing_heavy():
+    # torch itself may load what is installed, so only what comes on top of it counts.
+    code = """
+import json, sys, torch
+before = set(sys.modules)
+import pcdata.functional, pcdata.structures, pcdata.synthetic, pcdata.transforms
+print(json.dumps(sorted(set(sys.modules) - before)))
+"""
+    packages = {name.split(".")[0] for name in json.loads(in_a_new_process(code))}
+    assert not packages & set(HEAVY)
+
+
+def test_transforms_are_imported_in_a_blink():
+    code = (
+        "import time, torch; start = time.perf_counter(); import pcdata, pcdata.transforms;"
+        "print(time.perf_counter() - start)"
+    )
+    # Another process may have had the core: one quick import of three is proof enough.
+    assert any(float(in_a_new_process(code)) < 0.3 for _ in range(3))
+
+
+def test_every_public_name_resolves():
+    for name in pcdata.__all__:
+        assert getattr(pcdata, name) is not None
+    assert sorted(pcdata.__all__) == dir(pcdata)
+    assert len(set(pcdata.__all__)) == len(pcdata.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'VoxelDownsampel'"):
+        _ = pcdata.VoxelDownsampel
+
+
+@pytest.mark.parametrize(
+    "package", ["functional", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"]
+)
+def test_every_public_name_of_a_package_resolves(package):
+    module = getattr(pcdata, package)
+    for name in getattr(module, "__all__", []):
+        assert getattr(module, name) is not None

@@ -1,0 +1,119 @@
+"""Imports go one way: every module imports only from the layers before its own."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import pcdata
+
+ROOT = Path(pcdata.__file__).parent
+
+# Each layer may import from those before it. Packages on one line are siblings: they do not import each other, unless
+# ALLOWED_SIBLINGS says so.
+LAYERS = [
+    {"errors"},
+    {"checks", "rng", "extras"},
+    {"dispatch"},
+    {"functional"},
+    {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
+    {"structures"},
+    {"io", "transforms", "synthetic"},
+    {"datasets"},
+    {"build"},
+    {"report"},
+    {"demo", "cli", "__main__"},
+]
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+# checks raises the errors of the layer before; the thin command line starts the demo.
+ALLOWED_SIBLINGS = {("cli", "demo"), ("__main__", "cli")}
+
+# What may be imported besides pcdata and the standard library, by package; everywhere else nothing is limited here.
+OUTSIDE = {
+    "errors": set(),
+    "extras": set(),
+    "checks": {"torch", "numpy"},
+    "rng": {"torch", "numpy"},
+    "dispatch": {"torch", "numpy", "typing_extensions"},
+    "functional": {"torch", "numpy"},
+    "kernels": {"torch", "numpy"},
+    "structures": {"torch", "numpy"},
+}
+OUTSIDE_OF_ONE_MODULE = {"kernels/torch_cluster.py": {"torch_cluster"}}
+
+MODULES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py"))
+
+
+def package_of(module: str) -> str:
+    """The first name under pcdata: ``functional`` for ``functional/depth.py``, ``rng`` for ``rng.py``."""
+    return module.split("/")[0].removesuffix(".py")
+
+
+def imported_names(module: str, *, loading_only: bool = False) -> set[str]:
+    """Absolute dotted names that a module imports; with ``loading_only`` those that loading it imports."""
+    tree = ast.parse((ROOT / module).read_text(encoding="utf-8"))
+    if loading_only:
+        tree = ast.Module([node for node in tree.body if not _is_for_type_checkers(node)], [])
+    names = set()
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if loading_only and isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            continue
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative imports hide the layer"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        waiting += ast.iter_child_nodes(node)
+    return names
+
+
+def _is_for_type_checkers(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+
+
+def test_every_module_has_a_layer():
+    packages = {package_of(module) for module in MODULES} - {"__init__"}
+    assert packages == set(LEVEL)
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name != "__init__.py"])
+def test_imports_come_from_the_layers_before(module):
+    own = package_of(module)
+    for name in imported_names(module):
+        parts = name.split(".")
+        if parts[0] != "pcdata" or len(parts) == 1:
+            continue
+        other = parts[1]
+        if other not in LEVEL:  # from pcdata import __version__
+            assert other.startswith("__") or LEVEL[own] >= LEVEL["report"], f"{module} imports {name} from the top"
+        elif other != own and (own, other) not in ALLOWED_SIBLINGS:
+            assert LEVEL[other] < LEVEL[own], f"{module} imports {name}: {other} is not before {own}"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if package_of(name) in OUTSIDE])
+def test_the_lower_layers_need_torch_and_numpy_alone(module):
+    allowed = OUTSIDE[package_of(module)] | OUTSIDE_OF_ONE_MODULE.get(module, set())
+    outside = {name.split(".")[0] for name in imported_names(module)} - {"pcdata"} - set(sys.stdlib_module_names)
+    assert outside <= allowed
+
+
+HEAVY = {"open3d", "torch_cluster", "matplotlib", "kornia", "scipy", "h5py", "pydantic"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_heavy_packages_are_imported_where_they_are_used(module):
+    """io may load h5py and scipy with itself; nothing else loads a heavy package before it is called for."""
+    loaded = {name.split(".")[0] for name in imported_names(module, loading_only=True)}
+    assert not loaded & (HEAVY - ({"h5py", "scipy", "pydantic"} if package_of(module) in {"io", "build"} else set()))
+
+
+def test_numpy_and_torch_global_generators_are_never_drawn_from():
+    for module in MODULES:
+        text = (ROOT / module).read_text(encoding="utf-8")
+        for call in ("np.random.", "numpy.random.", "torch.manual_seed(", "import random\n", "random.seed("):
+            assert call not in text, f"{module} uses {call}"

@@ -1,0 +1,116 @@
+"""One or more instances of every registered transform, with input that it can work on.
+
+A new transform joins the contract suite by an entry here; without one the suite fails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from pcdata import transforms as T
+from pcdata.structures import DepthFrame, PointCloud
+from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts
+
+QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
+BOX = {"lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
+
+
+@dataclass(frozen=True)
+class Example:
+    """A transform, and how to make input of given counts for it."""
+
+    transform: T.Transform
+    make: Callable[[Sequence[int]], PointCloud | DepthFrame] = cloud_in_base
+    displacement: float = 0.0  # metres that a point may move beyond what source_from_cloud undoes (noise, averages)
+
+
+def _of(*transforms: T.Transform, **others: object) -> list[Example]:
+    return [Example(transform, **others) for transform in transforms]  # type: ignore[arg-type]
+
+
+EXAMPLES: dict[str, list[Example]] = {
+    "Center": _of(T.Center()),
+    "ClusterObjects": _of(
+        T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
+        T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
+    ),
+    "Compose": [
+        Example(
+            T.Compose([T.CropWorkspace(frame="base", **BOX), T.NormalizeUnitSphere(), T.RandomRotation(axis=None)])
+        ),
+        Example(T.Compose([T.ToFrame(frame="base"), T.RemovePlane(), T.Center()]), cloud_in_camera),
+        Example(
+            T.Compose([T.RandomTranslation(), T.RandomJitter(clip=0.004), T.RandomSample(num_points=20)]),
+            displacement=0.004 * math.sqrt(3),
+        ),
+    ],
+    "CropWorkspace": _of(
+        T.CropWorkspace(frame="base", **BOX),
+        T.CropWorkspace(frame="base", frame_from_box=QUARTER_TURN, lower=(0.1, 0.0, -0.5), upper=(0.5, 0.3, 0.5)),
+    ),
+    "Deproject": _of(T.Deproject(), make=frame_with_counts),
+    "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(max_neighbors=8, orient="none")),
+    "FarthestPointSample": _of(
+        T.FarthestPointSample(num_points=32),
+        *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+    ),
+    "MaskDepth": _of(
+        T.MaskDepth(near=0.6, far=0.9),
+        T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
+        T.MaskDepth(require_mask=True),
+        make=frame_with_counts,
+    ),
+    "MergeViews": _of(T.MergeViews()),
+    "NormalizeUnitSphere": _of(T.NormalizeUnitSphere()),
+    "NormalizeWorkspace": _of(T.NormalizeWorkspace(frame="base", **BOX)),
+    "RandomApply": [
+        Example(T.RandomApply(transform=T.RandomRotation())),
+        Example(T.RandomApply(transform=T.RandomPointDropout(), probability=0.8)),
+        Example(T.RandomApply(transform=T.Compose([T.RandomFlip(), T.RandomScale()]), probability=0.7)),
+        Example(T.RandomApply(transform=T.RemovePlane(), probability=0.4)),
+    ],
+    "RandomColorJitter": _of(T.RandomColorJitter(), T.RandomColorJitter(brightness=0.9, hue=0.5)),
+    "RandomFlip": _of(T.RandomFlip(), T.RandomFlip(probability=(0.5, 0.5, 0.5), about="centroid")),
+    "RandomJitter": [
+        Example(T.RandomJitter(), displacement=0.005 * math.sqrt(3)),
+        Example(T.RandomJitter(sigma=0.0001, clip=None), displacement=0.0001 * 8 * math.sqrt(3)),
+    ],
+    "RandomPointCount": _of(
+        T.RandomPointCount(num_points=50),
+        T.RandomPointCount(num_points=100, spread=0.5, if_short="repeat"),
+        T.RandomPointCount(num_points=100, spread=0.5, if_short="zeros"),
+    ),
+    "RandomPointDropout": _of(T.RandomPointDropout(), T.RandomPointDropout(low=0.5, high=1.0)),
+    "RandomRotation": _of(
+        T.RandomRotation(),
+        T.RandomRotation(axis=(1.0, 2.0, -0.5), degrees=30.0, about="centroid"),
+        T.RandomRotation(axis=None, about="centroid"),
+    ),
+    "RandomSample": _of(
+        T.RandomSample(num_points=32),
+        *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+    ),
+    "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
+    "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RemovePlane": _of(
+        T.RemovePlane(distance=0.005),
+        T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, seed=4),
+    ),
+    "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
+    "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),
+    "SplitObjects": _of(T.SplitObjects()),
+    "ToFrame": [
+        Example(T.ToFrame(frame="base"), cloud_in_camera),
+        Example(T.ToFrame(frame="camera")),
+        Example(T.ToFrame(frame="table", start="base", matrix=QUARTER_TURN)),
+    ],
+    "VoxelDownsample": [
+        Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
+        Example(T.VoxelDownsample(num_points=40), displacement=0.1 * math.sqrt(3)),
+    ],
+}
+
+ALL = [example for examples in EXAMPLES.values() for example in examples]
+NAMES = [f"{name}-{i}" for name, examples in EXAMPLES.items() for i in range(len(examples))]

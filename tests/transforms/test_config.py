@@ -1,0 +1,212 @@
+"""Pipelines as YAML: what can be written, and where each fault is."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcdata import transforms as T
+from pcdata.errors import ConfigError
+from pcdata.transforms.config import load_pipeline, pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
+
+
+def faults(text: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        pipeline_from_yaml(text, name="p.yaml")
+    return str(caught.value).splitlines()
+
+
+GOOD = """\
+- Deproject
+- ToFrame: {frame: base}
+- CropWorkspace:
+    frame: base
+    lower: [-0.5, -0.5, 0]
+    upper: [0.5, 0.5, 1]
+- RandomApply:
+    probability: 0.3
+    transform: {RandomFlip: {about: centroid}}
+- Compose:
+    steps:
+      - Center:
+      - NormalizeUnitSphere
+"""
+
+
+def test_names_fields_and_steps_within_steps_are_read():
+    pipeline = pipeline_from_yaml(GOOD)
+    assert [type(step).__name__ for step in pipeline.steps] == [
+        "Deproject", "ToFrame", "CropWorkspace", "RandomApply", "Compose",
+    ]  # fmt: skip
+    assert pipeline.steps[2].lower == (-0.5, -0.5, 0.0)
+    assert pipeline.steps[3].transform.about == "centroid"
+    assert len(pipeline.steps[4].steps) == 2
+    assert pipeline_from_yaml(pipeline_to_yaml(pipeline)).fingerprint() == pipeline.fingerprint()
+
+
+def test_an_empty_file_is_an_empty_pipeline():
+    assert len(pipeline_from_yaml("")) == len(pipeline_from_yaml("# nothing\n")) == 0
+
+
+@pytest.mark.parametrize("text", ["5e-3", "5E-3", "0.005", "5.0e-3", "+.5e-2", ".005"])
+def test_small_numbers_may_be_written_as_engineers_write_them(text):
+    assert pipeline_from_yaml(f"- VoxelDownsample: {{voxel_size: {text}}}").steps[0].voxel_size == 0.005
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(min_value=1e-300, max_value=1e300))
+def test_every_number_comes_back_bit_for_bit(value):
+    pipeline = T.Compose([T.VoxelDownsample(voxel_size=value)])
+    assert pipeline_from_yaml(pipeline_to_yaml(pipeline)).steps[0].voxel_size == value
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.text(min_size=1, max_size=8))
+def test_every_name_comes_back_as_it_was(name):
+    pipeline = T.Compose([T.ToFrame(frame=name)])
+    assert pipeline_from_yaml(pipeline_to_yaml(pipeline)).steps[0].frame == name
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("- Deprojct", "p.yaml:1:3: unknown transform 'Deprojct'; did you mean 'Deproject'?"),
+        ("- randomflip: {}", "p.yaml:1:3: unknown transform 'randomflip'; did you mean 'RandomFlip' or "),
+        ("- Center\n- {RandomScale: {hihg: 2}}", "p.yaml:2:18: RandomScale.hihg: no such field; did you mean 'high'?"),
+        (
+            "- VoxelDownsample:\n    voxel_sise: {a: 1}",
+            "p.yaml:2:5: VoxelDownsample.voxel_sise: no such field; did you mean 'voxel_size'?",
+        ),
+        ("- Center: {axis: 1}", "p.yaml:1:12: Center.axis: no such field; Center has []"),
+        ("- CropWorkspace:\n    frame: base", "p.yaml:2:5: CropWorkspace.lower: Field required"),
+        ("- ToFrame", "p.yaml:1:3: ToFrame.frame: Field required"),
+        (
+            "- VoxelDownsample:\n    voxel_size: small",
+            "p.yaml:2:17: VoxelDownsample.voxel_size: Input should be a valid number (got 'small')",
+        ),
+        (
+            "- VoxelDownsample: {voxel_size: '0.01'}",
+            "p.yaml:1:33: VoxelDownsample.voxel_size: Input should be a valid number (got '0.01')",
+        ),
+        (
+            "- RandomSample: {num_points: yes}",
+            "p.yaml:1:30: RandomSample.num_points: Input should be a valid integer (got True)",
+        ),
+        (
+            "- RandomSample: {num_points: 10.0}",
+            "p.yaml:1:30: RandomSample.num_points: Input should be a valid integer (got 10.0)",
+        ),
+        (
+            "- VoxelDownsample: {voxel_size: .inf}",
+            "p.yaml:1:33: VoxelDownsample.voxel_size: Input should be a finite number (got inf)",
+        ),
+        (
+            "- NormalizeWorkspace: {frame: base, lower: [0, x, 0], upper: [1, 1, 1]}",
+            "p.yaml:1:48: NormalizeWorkspace.lower.1: Input should be a valid number (got 'x')",
+        ),
+        (
+            "- RandomApply: {transform: {RandomFlip: {about: me}}}",
+            "p.yaml:1:49: RandomFlip.about: Input should be 'origin' or 'centroid' (got 'me')",
+        ),
+        ("- RandomApply: {transform: Flip}", "p.yaml:1:28: unknown transform 'Flip'; known: Center, Cl"),
+        ("- MaskDepth: {near: 1, near: 2}", "p.yaml:1:24: MaskDepth: 'near' is given twice"),
+        ("- Center: &c\n- *c", "p.yaml:2:3: YAML aliases (*name) are not allowed; write the value out"),
+        (
+            "- Center:\n  RandomFlip:",
+            "p.yaml:1:3: a step is one name with its fields, got 2 names: ['Center', 'RandomFlip']",
+        ),
+        ("- {}", "p.yaml:1:3: a step is one name with its fields, got 0 names: []"),
+        ("- [Center]", "p.yaml:1:3: a step must be a name, or a name with its fields, not a list"),
+        ("- MaskDepth: [1]", "p.yaml:1:14: MaskDepth must be a mapping of names to values, not a list"),
+        ("- MaskDepth: 3", "p.yaml:1:14: MaskDepth must be a mapping of names to values, not the single value '3'"),
+        ("Center: {}", "p.yaml:1:1: a pipeline must be a list, each entry starting with '- ', not a mapping"),
+        (
+            "Center",
+            "p.yaml:1:1: a pipeline must be a list, each entry starting with '- ', not the single value 'Center'",
+        ),
+        ("- MaskDepth: {near: 2.0, far: 1.0}", "p.yaml:1:3: MaskDepth: near must be below far, got near=2.0, far=1.0"),
+        ("- MaskDepth: {near: !!int x}", "p.yaml:1:21: cannot read this value: invalid literal for int()"),
+        ("- MaskDepth: {near: 2024-13-45}", "p.yaml:1:21: cannot read this value: month must be in 1..12"),
+        ("- ToFrame: {frame: !!python/name:os.system x}", "p.yaml:1:20: cannot read this value: could not determine"),
+        ("- Center\n- {a: b", "p.yaml:2:8: not valid YAML: expected ',' or '}'"),
+        ("- Center: {}\n---\n- Center", "p.yaml:2:1: not valid YAML: but found another document"),
+        ("- Deproject\n- Deproject", "p.yaml: Compose: step 2, Deproject, takes a DepthFrame"),
+        ("- \x00", "p.yaml: not valid YAML: unacceptable character"),
+        ("[" * 700, "p.yaml: not a configuration: nested too deeply"),
+        ("#" * 1_000_001, "p.yaml: 1000001 characters are no configuration"),
+    ],
+    ids=lambda value: value[:40] if len(value) < 400 else "long",
+)
+def test_each_fault_is_told_with_its_place(text, expected):
+    assert faults(text)[0].startswith(expected)
+
+
+def test_one_fault_is_told_once():
+    for text in ("- [Center]", "- Deprojct", "- MaskDepth: 3", "- MaskDepth: {near: 1, near: 2}", "- {}"):
+        assert len(faults(text)) == 1
+
+
+def test_all_faults_are_told_at_once_in_the_order_of_the_file():
+    told = faults(
+        "- Deprojct\n"
+        "- MaskDepth: {near: -1, fra: 2}\n"
+        "- CropWorkspace: {frame: base, lower: [0, 0], upper: [1, 1, 1]}\n"
+        "- RandomApply:\n"
+        "    probability: 2\n"
+        "    transform: Flip\n"
+        "- Center: {}\n"
+        "- Center\n"
+    )
+    assert [line.split(": ")[0] for line in told] == [
+        "p.yaml:1:3", "p.yaml:2:21", "p.yaml:2:25", "p.yaml:3:39", "p.yaml:5:18", "p.yaml:6:16",
+    ]  # fmt: skip
+
+
+def test_plain_data_may_use_one_list_twice():
+    lower, upper = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
+    box = {"frame": "base", "lower": lower, "upper": upper}
+    pipeline = pipeline_from_config([{"CropWorkspace": box}, {"NormalizeWorkspace": box}])
+    assert pipeline.steps[0].lower == pipeline.steps[1].lower == (0.0, 0.0, 0.0)
+    assert pipeline_from_config(["Center"]).fingerprint() == T.Compose([T.Center()]).fingerprint()
+    with pytest.raises(ConfigError, match="plain data only"):
+        pipeline_from_config([{"VoxelDownsample": {"voxel_size": object()}}])
+
+
+def test_a_file_is_named_in_its_faults(tmp_path):
+    path = tmp_path / "steps.yaml"
+    path.write_text("- Center\n- Cente\n")
+    with pytest.raises(ConfigError, match=r"steps\.yaml:2:3: unknown transform 'Cente'"):
+        load_pipeline(path)
+    with pytest.raises(ConfigError, match=r"missing\.yaml: cannot read this configuration"):
+        load_pipeline(tmp_path / "missing.yaml")
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match=r"steps\.yaml: cannot read"):
+        load_pipeline(path)
+
+
+def test_fields_given_in_python_are_checked_the_same_way():
+    with pytest.raises(ConfigError) as caught:
+        T.CropWorkspace(frame="base", lower=[0, 0], upper="high")
+    assert str(caught.value).splitlines() == [
+        "CropWorkspace.lower.2: Field required",
+        "CropWorkspace.upper: Input should be a valid tuple (got 'high')",
+    ]
+    with pytest.raises(TypeError, match="voxel_sise"):
+        T.VoxelDownsample(voxel_sise=1)
+    with pytest.raises(TypeError, match="positional"):
+        T.VoxelDownsample(0.01)
+
+
+def test_arrays_and_lists_become_plain_values_that_cannot_change():
+    import numpy as np
+
+    lower = [0.0, 0.0, 0.0]
+    step = T.CropWorkspace(frame="base", lower=lower, upper=np.ones(3, dtype=np.float32))
+    lower[0] = 9.0
+    assert (step.lower, step.upper) == ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    assert T.RandomSample(num_points=np.int64(5)).num_points == 5
+    labels = [1, 2]
+    mask = T.MaskDepth(drop_labels=labels)
+    labels.append(3)
+    assert mask.drop_labels == (1, 2)
