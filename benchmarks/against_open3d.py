@@ -24,7 +24,7 @@ import open3d as o3d
 import torch
 
 import pcdata
-from pcdata import functional as F  # noqa: N812
+from pcdata import functional as F
 from pcdata.report import text_table
 
 HERE = Path(__file__).parent
@@ -85,7 +85,7 @@ def cases(
         different = int((kept == ours.numpy()).sum())
         return "identical" if different == 0 else f"{different} differ"
 
-    planes, inliers = F.ransac_plane(points)
+    _, inliers = F.ransac_plane(points)
     above = points[~inliers]
     above_cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(above.double().numpy()))
 

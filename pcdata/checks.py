@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ class TensorSpec:
         return f"{names} ({', '.join(self.dims)}{',' if len(self.dims) == 1 else ''})"
 
 
-@lru_cache(maxsize=None)
+@cache
 def parse_spec(text: str) -> TensorSpec:
     """Parse a contract string; see the module docstring for the grammar."""
     if text.startswith("ptr "):
@@ -120,7 +121,7 @@ def all_finite(values: Tensor) -> bool:
 def check_ptr_values(where: str, name: str, ptr: Tensor, num_rows: int | None) -> None:
     """Require row pointers that start at 0, never decrease, and end at ``num_rows`` (None: any end)."""
     bounds = ptr.tolist()
-    if bounds[0] != 0 or any(later < earlier for earlier, later in zip(bounds, bounds[1:])):
+    if bounds[0] != 0 or any(later < earlier for earlier, later in pairwise(bounds)):
         raise ShapeError(f"{where}: {name} must start at 0 and never decrease, got {_short(bounds)}")
     if num_rows is not None and bounds[-1] != num_rows:
         raise ShapeError(f"{where}: {name} must end at the number of rows, {num_rows}, but ends at {bounds[-1]}")

@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser("demo", help="run the whole job on an embedded synthetic capture")
     demo.add_argument("out", nargs="?", default="pcdata_demo", metavar="OUT", help="folder (default: pcdata_demo)")
-    demo.add_argument("--scenes", type=_positive, default=8, metavar="N", help="captures to build from (default: 8)")
+    demo.add_argument("--scenes", type=_positive, default=4, metavar="N", help="captures to build from (default: 4)")
     demo.set_defaults(run=_demo)
 
     build = commands.add_parser("build", help="build a dataset from captures")

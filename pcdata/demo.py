@@ -36,7 +36,7 @@ class DemoResult:
 
 
 def run_demo(
-    folder: str | Path, *, num_scenes: int = 8, num_workers: int = 2, progress: Progress | None = None
+    folder: str | Path, *, num_scenes: int = 4, num_workers: int = 2, progress: Progress | None = None
 ) -> DemoResult:
     """Build ``folder/dataset`` from synthetic captures, load one epoch back and draw ``folder/demo.png``.
 

@@ -50,7 +50,7 @@ def captures(tmp_path) -> Path:
     folder.mkdir()
     for number in range(4):
         points = torch.rand(50, 3, generator=torch.Generator().manual_seed(number)) + 0.2
-        write_ply(PointCloud(points=points, frame_id="camera"), folder / f"scan{number}.ply")
+        write_ply(folder / f"scan{number}.ply", PointCloud(points=points, frame_id="camera"))
     return folder
 
 
@@ -361,7 +361,7 @@ def test_a_signal_that_arrives_inside_a_destructor_is_not_lost(config, captures,
 def test_a_killed_build_leaves_nothing(config, tmp_path, number):
     many = tmp_path / "many"
     many.mkdir()
-    write_ply(PointCloud(points=torch.rand(50, 3) + 0.2, frame_id="camera"), many / "scan0.ply")
+    write_ply(many / "scan0.ply", PointCloud(points=torch.rand(50, 3) + 0.2, frame_id="camera"))
     for copy in range(1, 3000):
         os.link(many / "scan0.ply", many / f"scan{copy}.ply")
     with started("build", config, "--source", many, "--out", tmp_path / "result" / "out") as process:

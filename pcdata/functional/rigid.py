@@ -61,11 +61,15 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
 def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Map (N,3) points by one affine (B,4,4) matrix per cloud, computed in float64, returned in the points' dtype."""
     matrix = matrix.double()
-    if len(ptr) == 2:
-        return (points.double() @ matrix[0, :3, :3].T + matrix[0, :3, 3]).to(points.dtype)
-    rows = cloud_of_rows(ptr)
-    linear, shift = matrix[rows, :3, :3], matrix[rows, :3, 3]
-    return (torch.einsum("nij,nj->ni", linear, points.double()) + shift).to(points.dtype)
+    # One number per entry for a single cloud, one per row for a batch: the same sums either way, bit for bit.
+    cloud: int | Tensor = 0 if len(ptr) == 2 else cloud_of_rows(ptr)
+    x, y, z = points.double().unbind(1)
+    moved = [
+        ((x * matrix[cloud, axis, 0] + y * matrix[cloud, axis, 1]) + z * matrix[cloud, axis, 2])
+        + matrix[cloud, axis, 3]
+        for axis in range(3)
+    ]
+    return torch.stack(moved, dim=1).to(points.dtype)
 
 
 def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:

@@ -66,7 +66,7 @@ def read_pcd(
     )
 
 
-def write_pcd(cloud: PointCloud, path: str | os.PathLike[str], *, encoding: str = "binary") -> None:
+def write_pcd(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
     """Write one cloud in metres as PCD 0.7; colours are rounded to 8 bits, as the format has them.
 
     Written: points, normals, colours (``rgb``), labels, invariant extra fields, viewpoint. Not written, because the

@@ -55,7 +55,7 @@ def read_ply(
     )
 
 
-def write_ply(cloud: PointCloud, path: str | os.PathLike[str], *, encoding: str = "binary") -> None:
+def write_ply(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
     """Write one cloud in metres as PLY; colours are rounded to 8 bits.
 
     Written: points, normals, colours, labels, invariant extra fields (many columns become ``name_0``, ``name_1``, ...).

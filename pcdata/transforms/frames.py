@@ -19,7 +19,10 @@ from pcdata.transforms.fields import Matrix4, Name
 
 
 class ToFrame(SpatialTransform):
-    """Bring clouds into a named coordinate frame, by the capture's own poses or by a matrix from a calibration."""
+    """Bring clouds into a named coordinate frame, by the capture's own poses or by a matrix from a calibration.
+
+    Clouds that are in the frame already stay as they are; a matrix refuses them, since it would be applied twice.
+    """
 
     needs_metres = True
 
@@ -49,6 +52,8 @@ class ToFrame(SpatialTransform):
         """Find the matrix from the cloud's frame to the wanted one."""
         if self.matrix is not None:
             return {"matrix": torch.tensor(self.matrix, dtype=torch.float64).repeat(data.num_clouds, 1, 1)}
+        if self.frame == data.frame_id:
+            return {"matrix": torch.eye(4, dtype=torch.float64).repeat(data.num_clouds, 1, 1)}
         for name in (self.frame, data.frame_id):
             if name not in data.frames:
                 raise FrameError(
@@ -114,7 +119,7 @@ class MergeViews(Transform):
             frames={data.frame_id: identity},
             unit=METRE,
             meta=[_merged_meta(data, start, stop) for start, stop in itertools.pairwise(bounds)],
-            history=[data.history[start] for start in bounds[:-1]],
+            history=[_merged_history(data, start, stop) for start, stop in itertools.pairwise(bounds)],
         )
 
 
@@ -139,3 +144,24 @@ def _merged_meta(data: PointCloud, start: int, stop: int) -> dict[str, Any]:
     cameras = [camera for entry in data.meta[start:stop] for camera in entry.get("cameras", [])]
     merged = {**data.meta[start], "points_per_view": counts[start:stop]}
     return {**merged, "cameras": cameras} if cameras else merged
+
+
+def _merged_history(data: PointCloud, start: int, stop: int) -> list[dict[str, Any]]:
+    """Join the views' histories step by step: points are added up, params that differ are listed per view.
+
+    Views that went different ways keep the first one's history.
+    """
+    histories = data.history[start:stop]
+    if len({tuple(step.get("step") for step in steps) for steps in histories}) > 1:
+        return list(histories[0])
+    merged = []
+    for steps in zip(*histories):
+        counts = {
+            name: sum(step[name] for step in steps)
+            for name in ("points_before", "points")
+            if all(name in step for step in steps)
+        }
+        params = [step.get("params") for step in steps]
+        joined = {} if all(one == params[0] for one in params) else {"params": {"per_view": params}}
+        merged.append({**steps[0], **joined, **counts})
+    return merged

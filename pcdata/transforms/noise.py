@@ -21,7 +21,7 @@ class RandomJitter(Transform):
     is_random = True
 
     sigma: NonNegative = 0.001  # standard deviation per axis
-    clip: Positive | None = 0.005  # the largest change per axis; None = unlimited
+    clip: Positive | None = None  # the largest change per axis; None = unlimited
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw a seed per cloud: with it the noise can be drawn again exactly."""

@@ -131,7 +131,7 @@ def test_the_sensor_position_and_orientation_are_kept(tmp_path: Path) -> None:
     assert cloud.viewpoint is not None
     assert cloud.viewpoint.tolist() == [[0.5, -1, 2]]
     assert cloud.meta[0]["viewpoint"] == [0.5, -1, 2, 0, 1, 0, 0]
-    write_pcd(cloud, tmp_path / "again.pcd")
+    write_pcd(tmp_path / "again.pcd", cloud)
     assert read_pcd(tmp_path / "again.pcd").meta[0]["viewpoint"] == [0.5, -1, 2, 0, 1, 0, 0]
 
 
@@ -288,7 +288,7 @@ def test_a_written_cloud_reads_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, encoding: str, cloud: PointCloud
 ) -> None:
     path = tmp_path_factory.mktemp("pcd") / "c.pcd"
-    write_pcd(cloud, path, encoding=encoding)
+    write_pcd(path, cloud, encoding=encoding)
     back = read_pcd(path)
     expected, found = cloud.fields(), back.fields()
     assert torch.equal(found.pop("source_index"), torch.arange(cloud.num_points))
@@ -306,19 +306,19 @@ def test_what_the_format_cannot_hold_is_not_written(tmp_path: Path) -> None:
     single = PointCloud(points=points, frame_id="camera")
     path = tmp_path / "c.pcd"
     with pytest.raises(ShapeError, match="unbatch"):
-        write_pcd(PointCloud.cat([single, single]), path)
+        write_pcd(path, PointCloud.cat([single, single]))
     with pytest.raises(UnitError, match="in_source_frame"):
-        write_pcd(PointCloud(points=points, frame_id="camera", unit="normalized"), path)
+        write_pcd(path, PointCloud(points=points, frame_id="camera", unit="normalized"))
     with pytest.raises(CaptureError, match="move with the cloud"):
-        write_pcd(single.with_extra("viewpoint", points, Kind.POSITION), path)
+        write_pcd(path, single.with_extra("viewpoint", points, Kind.POSITION))
     with pytest.raises(CaptureError, match="something else"):
-        write_pcd(single.with_extra("rgb", points, Kind.INVARIANT), path)
+        write_pcd(path, single.with_extra("rgb", points, Kind.INVARIANT))
     with pytest.raises(CaptureError, match="colors must lie in"):
-        write_pcd(PointCloud(points=points, frame_id="camera", colors=points * 255), path)
+        write_pcd(path, PointCloud(points=points, frame_id="camera", colors=points * 255))
     with pytest.raises(NonFiniteError):
-        write_pcd(PointCloud(points=points * torch.nan, frame_id="camera"), path)
+        write_pcd(path, PointCloud(points=points * torch.nan, frame_id="camera"))
     with pytest.raises(CaptureError, match="did you mean 'binary"):
-        write_pcd(single, path, encoding="binari")
+        write_pcd(path, single, encoding="binari")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -338,7 +338,7 @@ def test_open3d_reads_what_is_written_here(tmp_path: Path, encoding: str) -> Non
         normals=torch.nn.functional.normalize(points, dim=1),
         labels=torch.arange(500),
     )
-    write_pcd(cloud, tmp_path / "c.pcd", encoding=encoding)
+    write_pcd(tmp_path / "c.pcd", cloud, encoding=encoding)
     found = o3d.io.read_point_cloud(str(tmp_path / "c.pcd"))
     assert np.array_equal(np.asarray(found.points).astype(np.float32), points.numpy())
     assert np.array_equal(np.asarray(found.normals).astype(np.float32), cloud.normals.numpy())  # type: ignore[union-attr]

@@ -203,7 +203,7 @@ def test_a_written_cloud_reads_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, encoding: str, cloud: PointCloud
 ) -> None:
     path = tmp_path_factory.mktemp("ply") / "c.ply"
-    write_ply(cloud, path, encoding=encoding)
+    write_ply(path, cloud, encoding=encoding)
     expected, found = cloud.fields(), read_ply(path).fields()
     assert torch.equal(found.pop("source_index"), torch.arange(cloud.num_points))
     assert set(found) == set(expected)
@@ -217,15 +217,15 @@ def test_what_the_format_cannot_hold_is_not_written(tmp_path: Path) -> None:
     single = PointCloud(points=points, frame_id="camera")
     path = tmp_path / "c.ply"
     with pytest.raises(ShapeError, match="unbatch"):
-        write_ply(PointCloud.cat([single, single]), path)
+        write_ply(path, PointCloud.cat([single, single]))
     with pytest.raises(DTypeError, match="do not fit any integer type"):
-        write_ply(single.with_fields(labels=torch.tensor([2**40, 0])), path)
+        write_ply(path, single.with_fields(labels=torch.tensor([2**40, 0])))
     with pytest.raises(CaptureError, match="PLY uses already"):
-        write_ply(single.with_extra("red", torch.ones(2), Kind.INVARIANT), path)
+        write_ply(path, single.with_extra("red", torch.ones(2), Kind.INVARIANT))
     with pytest.raises(DTypeError):
-        write_ply(single.with_extra("half", torch.ones(2).half(), Kind.INVARIANT), path)
+        write_ply(path, single.with_extra("half", torch.ones(2).half(), Kind.INVARIANT))
     with pytest.raises(CaptureError, match="ASCII"):
-        write_ply(single.with_extra("größe", torch.ones(2), Kind.INVARIANT), path)
+        write_ply(path, single.with_extra("größe", torch.ones(2), Kind.INVARIANT))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -238,7 +238,7 @@ def test_open3d_reads_what_is_written_here(tmp_path: Path, encoding: str) -> Non
     colors = torch.randint(0, 256, (300, 3), generator=generator) / 255
     normals = torch.nn.functional.normalize(points, dim=1)
     cloud = PointCloud(points=points, frame_id="camera", colors=colors, normals=normals, labels=torch.arange(300))
-    write_ply(cloud, tmp_path / "c.ply", encoding=encoding)
+    write_ply(tmp_path / "c.ply", cloud, encoding=encoding)
     found = o3d.io.read_point_cloud(str(tmp_path / "c.ply"))
     assert np.array_equal(np.asarray(found.points).astype(np.float32), points.numpy())
     assert np.array_equal(np.asarray(found.normals).astype(np.float32), normals.numpy())

@@ -85,8 +85,8 @@ def graspnet_frame(root: Path, **changes: Any) -> Path:
 def clouds(tmp_path: Path) -> Path:
     root = tmp_path / "clouds"
     root.mkdir()
-    write_pcd(PointCloud(points=torch.rand(5, 3), frame_id="x"), root / "b.pcd")
-    write_ply(PointCloud(points=torch.rand(4, 3), frame_id="x"), root / "a.ply")
+    write_pcd(root / "b.pcd", PointCloud(points=torch.rand(5, 3), frame_id="x"))
+    write_ply(root / "a.ply", PointCloud(points=torch.rand(4, 3), frame_id="x"))
     (root / "README.md").write_text("notes do not matter")
     return root
 

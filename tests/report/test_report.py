@@ -53,7 +53,7 @@ def test_build_text_of_a_pipeline_without_steps_is_still_a_report():
 
 def test_capture_text_of_a_cloud_file_tells_its_extent(tmp_path):
     points = torch.tensor([[0.0, -1.0, 0.5], [2.0, 1.0, 0.25]])
-    write_ply(PointCloud(points=points, frame_id="camera"), tmp_path / "one.ply")
+    write_ply(tmp_path / "one.ply", PointCloud(points=points, frame_id="camera"))
     text = capture_text(open_source(tmp_path))
     for part in ("clouds", "one", "x 0.000 to 2.000", "y -1.000 to 1.000", "z 0.250 to 0.500"):
         assert part in text

@@ -168,3 +168,13 @@ def test_merged_normals_face_the_camera_that_saw_each_point():
     flat = (truth[:, 2] > 0.999) & (cloud.points[:, 2].abs() < 1e-4)  # the table top
     angle = rigid.angle_between(cloud.normals[flat], truth[flat])
     assert float(angle.median()) < 1e-3
+
+
+def test_the_history_of_a_merged_cloud_counts_all_its_views():
+    frame = tabletop(3, num_objects=2, num_views=2, size=(48, 64)).frame
+    views = ToFrame(frame="base")(Deproject()(frame))
+    merged = MergeViews()(views)
+    steps = {step["step"]: step for step in merged.history[0]}
+    assert steps["Deproject"]["points"] == views.num_points
+    assert steps["ToFrame"]["points_before"] == steps["ToFrame"]["points"] == views.num_points
+    assert len(steps["ToFrame"]["params"]["per_view"]) == 2
