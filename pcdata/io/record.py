@@ -104,7 +104,7 @@ def cloud_from_record(record: Record) -> PointCloud:
         tensors["labels"] = labels[:, 0].long()
     try:
         return PointCloud(
-            **tensors,
+            **tensors,  # type: ignore[arg-type]  # names were checked above
             extra=extra,
             frames=frames,
             frame_id=info["frame_id"],

@@ -4,6 +4,16 @@ from pcdata.structures.camera import Camera
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
 from pcdata.structures.fields import Kind
 from pcdata.structures.padded import PaddedClouds
-from pcdata.structures.point_cloud import METRE, NORMALIZED, PointCloud
+from pcdata.structures.point_cloud import METRE, NORMALIZED, ImageLayout, PointCloud
 
-__all__ = ["CAMERA_FRAME", "METRE", "NORMALIZED", "Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"]
+__all__ = [
+    "CAMERA_FRAME",
+    "METRE",
+    "NORMALIZED",
+    "Camera",
+    "DepthFrame",
+    "ImageLayout",
+    "Kind",
+    "PaddedClouds",
+    "PointCloud",
+]

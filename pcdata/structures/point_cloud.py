@@ -12,6 +12,7 @@ from torch import Tensor
 from pcdata.checks import check_ptr_values, check_tensors
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
+from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
 from pcdata.structures.fields import CORE_KINDS, Kind
 from pcdata.structures.padded import PaddedClouds, pad_rows
@@ -20,6 +21,14 @@ METRE = "m"
 NORMALIZED = "normalized"
 
 Step = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImageLayout:
+    """The depth images that the clouds of a batch still lie on, row after row in pixel order."""
+
+    size: tuple[int, int]  # (height, width) of every image
+    intrinsics: Tensor  # (B, 3, 3) float64, pixels
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,6 +53,7 @@ class PointCloud:
     source_frame: str = ""  # the frame that source_from_cloud leads to; "" = frame_id at construction
     frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) float64 frame_from_source
     unit: str = METRE  # "m", or "normalized" after a normalisation
+    layout: ImageLayout | None = None  # set by Deproject, kept while rows are only dropped and moved rigidly
     meta: Sequence[Mapping[str, Any]] = ()  # per cloud, JSON-able: what was found (planes, counts, sample id)
     history: Sequence[Sequence[Step]] = ()  # per cloud, JSON-able: what was done, in order
 
@@ -168,6 +178,14 @@ class PointCloud:
         """Return the kind of a per-point field."""
         return CORE_KINDS[name] if name in CORE_KINDS else self.kinds[name]
 
+    def image_grid(self) -> ImageGrid | None:
+        """Where the points sit in their depth images, for the operations' ``grid=``; None once they left them."""
+        if self.layout is None or self.source_index is None:
+            return None
+        height, width = self.layout.size
+        pixel_index = self.source_index % (height * width)
+        return ImageGrid(pixel_index, self.layout.size, self.layout.intrinsics, self.source_from_cloud)
+
     def viewpoint_per_point(self) -> Tensor | None:
         """(N, 3): where the sensor stood that saw each point, or None when unknown."""
         if "viewpoint" in self.extra:
@@ -189,7 +207,8 @@ class PointCloud:
             else:
                 extra[name] = value
         kinds = {name: kind for name, kind in self.kinds.items() if name in extra}
-        return replace(self, **core, extra=extra, kinds=kinds)  # type: ignore[arg-type]
+        layout = None if {"points", "source_index"} & values.keys() else self.layout
+        return replace(self, **core, extra=extra, kinds=kinds, layout=layout)  # type: ignore[arg-type]
 
     def with_extra(self, name: str, value: Tensor, kind: Kind | str) -> PointCloud:
         """Add or replace one extra per-point field of the given kind."""
@@ -202,15 +221,17 @@ class PointCloud:
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
 
-        Rows of a cloud must stay within that cloud.
+        Rows of a cloud must stay within that cloud. A mask keeps their order, and so the image they lie on.
         """
-        return self._rebuilt({name: value[index] for name, value in self.fields().items()}, ptr=ptr)
+        layout = self.layout if index.dtype is torch.bool else None
+        rows = torch.nonzero(index).squeeze(1) if index.dtype is torch.bool else index
+        return self._rebuilt({name: value[rows] for name, value in self.fields().items()}, ptr=ptr, layout=layout)
 
-    def _rebuilt(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
+    def _rebuilt(self, rows: Mapping[str, Tensor], *, layout: ImageLayout | None, **others: Any) -> PointCloud:
         """Replace all per-point fields at once, and any other attributes."""
         core = {name: value for name, value in rows.items() if name in CORE_KINDS}
         extra = {name: value for name, value in rows.items() if name not in CORE_KINDS}
-        return replace(self, **core, extra=extra, **others)  # type: ignore[arg-type]
+        return replace(self, **core, extra=extra, layout=layout, **others)  # type: ignore[arg-type]
 
     def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:
         """Move every positional and directional field by one affine (B, 4, 4) matrix per cloud.
@@ -239,6 +260,7 @@ class PointCloud:
             viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
         return self._rebuilt(
             moved,
+            layout=self.layout if self.layout is not None and rigid.is_rigid(matrix) else None,
             viewpoint=viewpoint,
             source_from_cloud=self.source_from_cloud @ torch.linalg.inv(matrix),
             frame_id=self.frame_id if frame_id is None else frame_id,
@@ -260,6 +282,7 @@ class PointCloud:
         rows = {name: value[start:stop] for name, value in self.fields().items()}
         return self._rebuilt(
             rows,
+            layout=_layout_of([self.layout], slice(b, b + 1)),
             ptr=torch.tensor([0, stop - start], device=self.device),
             viewpoint=None if self.viewpoint is None else self.viewpoint[b : b + 1],
             source_from_cloud=self.source_from_cloud[b : b + 1],
@@ -287,6 +310,7 @@ class PointCloud:
         known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
         return first._rebuilt(
             rows,
+            layout=_layout_of([cloud.layout for cloud in clouds]),
             ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
             viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
             source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
@@ -335,6 +359,7 @@ class PointCloud:
         rows = {name: move(value) for name, value in self.fields().items()}
         return self._rebuilt(
             rows,
+            layout=None if self.layout is None else replace(self.layout, intrinsics=move(self.layout.intrinsics)),
             ptr=move(self.ptr),
             viewpoint=None if self.viewpoint is None else move(self.viewpoint),
             source_from_cloud=move(self.source_from_cloud),
@@ -349,6 +374,14 @@ class PointCloud:
         sizes = f"{counts[0]} points" if len(counts) == 1 else f"{len(counts)} clouds of {min(counts)}-{max(counts)}"
         carried = ", ".join(name for name in self.fields() if name != "points")
         return f"PointCloud({sizes} in {self.frame_id!r} [{self.unit}]{': ' + carried if carried else ''})"
+
+
+def _layout_of(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None)) -> ImageLayout | None:
+    """Join the layouts of batches, or take part of one; None when one has none or the images differ in size."""
+    known = [layout for layout in layouts if layout is not None]
+    if len(known) < len(layouts) or len({layout.size for layout in known}) > 1:
+        return None
+    return ImageLayout(size=known[0].size, intrinsics=torch.cat([layout.intrinsics for layout in known])[clouds])
 
 
 def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:

@@ -39,7 +39,7 @@ class ClusterObjects(Transform):
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
-        raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points)
+        raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=data.image_grid())
         cloud = cloud_of_rows(data.ptr)
         member = raw >= 0
         # One id per (cloud, cluster), ascending by cloud then label, as unique sorts them.
@@ -60,7 +60,7 @@ class ClusterObjects(Transform):
         labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data))
         if self.keep == "all":
             return labelled
-        return labelled.select(rows_of_mask(labels >= 0), ptr_after_mask(labels >= 0, data.ptr))
+        return labelled.select(labels >= 0, ptr_after_mask(labels >= 0, data.ptr))
 
 
 class SplitObjects(Transform):

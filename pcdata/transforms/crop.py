@@ -11,7 +11,7 @@ from pcdata.functional import rigid
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import SelectTransform, rows_of_mask
+from pcdata.transforms.base import SelectTransform
 from pcdata.transforms.fields import Matrix4, Name, Vec3
 
 
@@ -54,4 +54,4 @@ class CropWorkspace(SelectTransform):
             points = rigid.transform_points(points, cloud.ptr, box_from_frame)
         lower, upper = points.new_tensor(self.lower), points.new_tensor(self.upper)
         inside = ((points >= lower) & (points <= upper)).all(dim=1)
-        return rows_of_mask(inside), ptr_after_mask(inside, cloud.ptr)
+        return inside, ptr_after_mask(inside, cloud.ptr)

@@ -12,7 +12,7 @@ from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.ragged import cloud_of_rows
 from pcdata.rng import Streams
-from pcdata.structures import CAMERA_FRAME, DepthFrame, Kind, PointCloud
+from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import Metres
 
@@ -90,6 +90,7 @@ class Deproject(Transform):
             source_index=source_index,
             extra=extra,
             kinds=dict.fromkeys(extra, Kind.INVARIANT),
+            layout=None if camera.distortion is not None else ImageLayout(size=data.size, intrinsics=camera.intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,
             meta=[_view_meta(data, view) for view in range(data.num_views)],

@@ -112,6 +112,7 @@ class MergeViews(Transform):
         identity = torch.eye(4, dtype=torch.float64, device=device).repeat(groups, 1, 1)
         return replace(
             merged,
+            layout=None,
             ptr=data.ptr[params["group_ptr"].to(device)],
             viewpoint=None,
             source_from_cloud=identity,

@@ -27,7 +27,9 @@ class EstimateNormals(Transform):
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Estimate from the points of each cloud alone."""
-        normals = estimate_normals(data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors)
+        normals = estimate_normals(
+            data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=data.image_grid()
+        )
         if self.orient == "viewpoint":
             viewpoint = data.viewpoint_per_point()
             if viewpoint is None:

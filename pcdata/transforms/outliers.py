@@ -8,7 +8,7 @@ from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import SelectTransform, rows_of_mask
+from pcdata.transforms.base import SelectTransform
 from pcdata.transforms.fields import Count, Metres, Positive
 
 
@@ -23,9 +23,9 @@ class RemoveStatisticalOutliers(SelectTransform):
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""
         outlier = statistical_outlier_mask(
-            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio
+            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
         )
-        return rows_of_mask(~outlier), ptr_after_mask(~outlier, cloud.ptr)
+        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)
 
 
 class RemoveRadiusOutliers(SelectTransform):
@@ -39,5 +39,7 @@ class RemoveRadiusOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""
-        outlier = radius_outlier_mask(cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius)
-        return rows_of_mask(~outlier), ptr_after_mask(~outlier, cloud.ptr)
+        outlier = radius_outlier_mask(
+            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
+        )
+        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)

@@ -15,7 +15,7 @@ from pcdata.functional.planes import ransac_plane
 from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, segment_sum
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SelectTransform, rows_of_mask
+from pcdata.transforms.base import Params, SelectTransform
 from pcdata.transforms.fields import Count, Metres, Name, Vec3
 
 
@@ -64,7 +64,7 @@ class RemovePlane(SelectTransform):
             plane = planes.double()[cloud_of_rows(data.ptr)]
             keep &= (plane[:, :3] * data.points).sum(1) + plane[:, 3] > 0
         return {
-            "index": rows_of_mask(keep),
+            "index": keep,
             "ptr": ptr_after_mask(keep, data.ptr),
             "planes": planes,
             "num_inliers": segment_sum(inlier.long(), data.ptr),
