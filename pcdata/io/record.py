@@ -24,6 +24,7 @@ from pcdata.structures import PointCloud
 SCHEMA = "pcdata.cloud/1"
 
 _POINT_FIELDS = ("points", "colors", "normals", "labels", "source_index")
+_CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
 _EXTRA, _FRAMES = "extra.", "frames."
 _DERIVED = ("intrinsics", "extrinsics")
 
@@ -95,6 +96,9 @@ def cloud_from_record(record: Record) -> PointCloud:
     frames = {
         unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
     }
+    unknown = tensors.keys() - {*_POINT_FIELDS, *_CLOUD_FIELDS}
+    if unknown:
+        raise CacheError(f"no cloud has the arrays {sorted(unknown)}")
     if any(matrix.dtype != torch.float64 for matrix in frames.values()):
         raise CacheError(f"frames must be float64, got {[str(matrix.dtype) for matrix in frames.values()]}")
     if "labels" in tensors:

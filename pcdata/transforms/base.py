@@ -201,7 +201,7 @@ class SelectTransform(Transform, abstract=True):
     """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
-        """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the ``ptr`` (B+1,) of the result."""
+        """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,)."""
         raise NotImplementedError
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
