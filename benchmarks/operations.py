@@ -3,8 +3,9 @@
     PCDATA_TEST_DATA=... python benchmarks/operations.py        # prints the table, writes results/operations_*.json
 
 Method: ours and theirs run in turn; each runs once to warm up (the results of that run are compared), then
-``--repeats`` times, a peer that takes longer than five seconds only once. Medians and interquartile ranges are kept. Parameters are
-equal, and Open3D's RANSAC may not stop early (probability 1.0). Peers that are not installed are left out and named.
+``--repeats`` times, a peer that takes longer than five seconds only once. Medians and interquartile ranges are kept.
+Parameters are equal, and Open3D's RANSAC may not stop early (probability 1.0). Peers that are not installed are left
+out and named.
 """
 
 from __future__ import annotations
