@@ -1,0 +1,1 @@
+"""Neighbour kernels: kNN, ball query, statistical outliers, normals."""

@@ -1,0 +1,1 @@
+"""Cell kernels: radius outliers, DBSCAN."""

@@ -1,0 +1,1 @@
+"""Sampling kernels: deprojection, planes, voxels, farthest points."""
