@@ -10,6 +10,7 @@ import ctypes
 import functools
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -68,19 +69,9 @@ def call(function: str, *arguments: Any) -> None:
         KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
     """
     raised: list[BaseException] = []
-
-    def poll() -> int:
-        # Python runs pending signal handlers between the bytecodes of this very function.
-        return 0
-
-    def guarded_poll() -> int:
-        try:
-            return poll()
-        except BaseException as error:  # a handler's exception must not be lost in a C callback
-            raised.append(error)
-            return 1
-
-    context = _Context(torch.get_num_threads(), _Poll(guarded_poll))
+    polls = _polls(raised)
+    next(polls)
+    context = _Context(torch.get_num_threads(), _Poll(polls.__next__))
     status = getattr(library(), function)(ctypes.byref(context), *map(_argument, arguments))
     if raised:
         raise raised[0]
@@ -90,6 +81,23 @@ def call(function: str, *arguments: Any) -> None:
         raise KeyboardInterrupt
     if status != _OK:
         raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
+
+
+def _polls(raised: list[BaseException]) -> Iterator[int]:
+    """Yield 0 while the core may go on and 1 once a signal handler raised; its exception is kept in ``raised``.
+
+    Python runs pending handlers where a frame is entered or resumed. A generator is resumed inside its ``try``; the
+    entry of a function would lie before it, and ctypes drops what a callback raises.
+    """
+    stop = 0
+    while True:
+        try:
+            yield stop
+        except GeneratorExit:
+            return
+        except BaseException as error:
+            raised.append(error)
+            stop = 1
 
 
 def _argument(value: Any) -> Any:
