@@ -27,10 +27,10 @@ R = TypeVar("R")
 REFERENCE = "torch"
 
 # Backend name -> module that registers its kernels when imported and defines `unavailable() -> str | None`.
-BACKEND_MODULES = {"torch_cluster": "pcdata.kernels.torch_cluster"}
+BACKEND_MODULES = {"cpu": "pcdata.kernels.cpu", "torch_cluster": "pcdata.kernels.torch_cluster"}
 
 # What `auto` tries, best first. torch_cluster is chosen only by name: it covers few calls.
-AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": (REFERENCE,), "cuda": (REFERENCE,)}
+AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": ("cpu", REFERENCE), "cuda": (REFERENCE,)}
 
 
 @dataclass

@@ -48,11 +48,8 @@ class Cells:
         low = points.new_full((len(ptr) - 1, 3), torch.inf).scatter_reduce_(0, index, points, "amin").double()
         side = float(torch.tensor(radius, dtype=torch.float32)) / math.sqrt(3.0) * (1 - _MARGIN)
         scaled = (points - low[cloud]) / side
-        if len(points) and float(scaled.max()) >= _MAX_CELLS_PER_AXIS:
-            raise ConfigError(
-                f"{where}: a radius of {radius:g} cuts a cloud into {float(scaled.max()):.2g} cells along an axis, "
-                f"more than {_MAX_CELLS_PER_AXIS:.2g}; are both in the same unit, or is a stray point far out?"
-            )
+        if len(points):
+            require_cells(where, radius, float(scaled.max()))
         # Room of _REACH on both sides, so that a neighbour's coordinate never runs into the next column.
         coordinate = scaled.long() + _REACH
         spans = tuple(int(axis.max()) + _REACH + 1 if len(axis) else 1 for axis in coordinate.unbind(1))
@@ -85,6 +82,19 @@ class Cells:
             first = torch.searchsorted(self.keys[2], base + lowest)
             last = torch.searchsorted(self.keys[2], base + _REACH, right=True)
             yield expand_ranges(first, last - first, owner)
+
+
+def require_cells(where: str, radius: float, largest: float) -> None:
+    """Require that the largest cell coordinate of a cloud is one that cells can have.
+
+    Raises:
+        ConfigError: a cloud is more than 2^36 cells wide.
+    """
+    if largest >= _MAX_CELLS_PER_AXIS:
+        raise ConfigError(
+            f"{where}: a radius of {radius:g} cuts a cloud into {largest:.2g} cells along an axis, "
+            f"more than {_MAX_CELLS_PER_AXIS:.2g}; are both in the same unit, or is a stray point far out?"
+        )
 
 
 def _find(keys: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ def deproject_depth(
     height, width = depth.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion).float()
     valid = depth > 0
-    _check_rays("deproject_depth", rays, valid)
+    check_rays("deproject_depth", rays, valid)
     z = depth[valid]
     points = torch.cat([rays[valid] * z[:, None], z[:, None]], dim=1)
     pixel_index = valid.reshape(len(depth), height * width).nonzero()[:, 1]
@@ -118,7 +118,7 @@ def range_to_depth(
     check_lengths("range_to_depth", "ray_length", ray_length)
     height, width = ray_length.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion)
-    _check_rays("range_to_depth", rays, ray_length > 0)
+    check_rays("range_to_depth", rays, ray_length > 0)
     depth = ray_length.double() / (1 + rays.square().sum(-1)).sqrt()
     return torch.where(ray_length > 0, depth, 0.0).float()
 
@@ -157,6 +157,20 @@ def check_lengths(where: str, name: str, lengths: Tensor) -> None:
         )
 
 
+def check_rays(where: str, rays: Tensor, needed: Tensor) -> None:
+    """Require a ray (V, H, W, 2) wherever one is needed (V, H, W).
+
+    Raises:
+        CaptureError: with the number of pixels that have none.
+    """
+    lost = needed & rays[..., 0].isnan()
+    if bool(lost.any()):
+        raise CaptureError(
+            f"{where}: the lens model cannot be inverted at {int(lost.sum())} pixels that have a reading (they lie "
+            "beyond the radius where it folds back); check the order of the coefficients, or set those pixels to 0"
+        )
+
+
 def _check_camera(where: str, intrinsics: Tensor, distortion: Tensor | None, views: int | None = None) -> None:
     specs = {"intrinsics": f"{'V' if views is None else views} 3 3 : float", "distortion": "V D : float"}
     if views is not None:
@@ -165,15 +179,6 @@ def _check_camera(where: str, intrinsics: Tensor, distortion: Tensor | None, vie
     check_intrinsics(where, intrinsics)
     if distortion is not None:
         check_distortion(where, distortion)
-
-
-def _check_rays(where: str, rays: Tensor, needed: Tensor) -> None:
-    lost = needed & rays[..., 0].isnan()
-    if bool(lost.any()):
-        raise CaptureError(
-            f"{where}: the lens model cannot be inverted at {int(lost.sum())} pixels that have a reading (they lie "
-            "beyond the radius where it folds back); check the order of the coefficients, or set those pixels to 0"
-        )
 
 
 def _pinhole(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

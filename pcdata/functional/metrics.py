@@ -36,6 +36,13 @@ def chamfer_distance(
     """
     assert ptr_a is not None  # @op fills both
     assert ptr_b is not None
+    require_points(ptr_a, ptr_b)
+    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
+    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
+
+
+def require_points(ptr_a: Tensor, ptr_b: Tensor) -> None:
+    """Require that no cloud of either side of a chamfer distance is empty."""
     for name, ptr in (("points_a", ptr_a), ("points_b", ptr_b)):
         empty = (counts_from_ptr(ptr) == 0).nonzero().squeeze(1).tolist()
         if empty:
@@ -43,8 +50,6 @@ def chamfer_distance(
                 f"chamfer_distance: cloud {empty[0]} of {name} is empty ({len(empty)} of {len(ptr) - 1} are); "
                 "the distance to nothing is undefined, so drop that pair"
             )
-    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
-    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
 
 
 def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool) -> Tensor:
@@ -57,6 +62,10 @@ def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: 
     if not squared:
         apart = distance > 0
         distance = torch.where(apart, torch.where(apart, distance, 1.0).sqrt(), 0.0)
-    total = distance.new_zeros(len(ptr) - 1, dtype=torch.float64)
-    total = total.index_add(0, cloud_of_rows(queries_ptr), distance.double())
-    return total / counts_from_ptr(queries_ptr)
+    return mean_per_cloud(distance, queries_ptr)
+
+
+def mean_per_cloud(values: Tensor, ptr: Tensor) -> Tensor:
+    """Average (N,) values per cloud into (B,) float64, with a gradient; no cloud may be empty."""
+    total = values.new_zeros(len(ptr) - 1, dtype=torch.float64)
+    return total.index_add(0, cloud_of_rows(ptr), values.double()) / counts_from_ptr(ptr)

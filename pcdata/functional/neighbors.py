@@ -47,14 +47,14 @@ def knn(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: k is less than 1.
     """
-    ptr = _checked("knn", points, ptr, queries, queries_ptr, grid)
+    ptr = check_neighbors("knn", points, ptr, queries, queries_ptr, grid)
     require_count("knn", "k", k)
     num_queries = len(points if queries is None else queries)
     index = torch.empty((num_queries, k), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, k), dtype=torch.float32, device=points.device)
     for near in nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr):
         index[near.query] = near.index
-        distance[near.query] = near.squared.sqrt()
+        distance[near.query] = near.distance
     return index, distance
 
 
@@ -90,7 +90,7 @@ def ball_query(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
     """
-    ptr = _checked("ball_query", points, ptr, queries, queries_ptr, grid)
+    ptr = check_neighbors("ball_query", points, ptr, queries, queries_ptr, grid)
     require_count("ball_query", "max_neighbors", max_neighbors)
     require_length("ball_query", "radius", radius)
     num_queries = len(points if queries is None else queries)
@@ -101,12 +101,12 @@ def ball_query(
         points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=float(radius)
     ):
         index[near.query] = near.index
-        distance[near.query] = near.squared.sqrt()
+        distance[near.query] = near.distance
         count[near.query] = near.found.sum(1)
     return index, distance, count
 
 
-def _checked(
+def check_neighbors(
     where: str,
     points: Tensor,
     ptr: Tensor | None,
@@ -114,6 +114,7 @@ def _checked(
     queries_ptr: Tensor | None,
     grid: ImageGrid | None,
 ) -> Tensor:
+    """Require what the specs of knn and ball_query cannot say; return the row pointers."""
     assert ptr is not None  # @op fills it
     if queries is None and queries_ptr is not None:
         raise ShapeError(f"{where}: queries_ptr was given without queries; pass both, or neither to query the points")

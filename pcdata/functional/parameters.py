@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
@@ -40,7 +41,8 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
 
     Raises:
         ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
-            intrinsics are not one per cloud.
+            intrinsics or motions are not one per cloud.
+        ConfigError: ``camera_from_points`` is not rigid.
         DeviceError: it is on another device.
     """
     if grid is None:
@@ -53,13 +55,36 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
             f"{where}: grid has {tuple(pixel.shape)} pixels and {tuple(grid.intrinsics.shape)} intrinsics for "
             f"{len(points)} points in {len(ptr) - 1} clouds; drop the grid, or select it together with the points"
         )
+    if grid.camera_from_points is not None:
+        _check_rigid(where, grid.camera_from_points, len(ptr) - 1, points.device)
     if len(pixel) == 0:
         return
     rises = pixel[1:] > pixel[:-1]
-    inner_start = ptr[1:-1][(counts_from_ptr(ptr)[1:] > 0) & (ptr[1:-1] > 0)]
-    rises[inner_start - 1] = True
-    if not bool(rises.all()) or int(pixel.min()) < 0 or int(pixel.max()) >= height * width:
+    filled = counts_from_ptr(ptr) > 0
+    first, last = ptr[:-1][filled], ptr[1:][filled] - 1
+    rises[first[1:] - 1] = True
+    # Where pixels rise, only the ends of a cloud can lie outside the image.
+    if not bool(rises.all()) or int(pixel[first].min()) < 0 or int(pixel[last].max()) >= height * width:
         raise ShapeError(
             f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
             "the points were reordered or repeated since they were read, so pass grid=None"
+        )
+
+
+def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.device) -> None:
+    name = f"{where}: grid.camera_from_points"
+    if motion.shape != (num_clouds, 4, 4):
+        raise ShapeError(f"{name} must be ({num_clouds}, 4, 4), one per cloud, got {tuple(motion.shape)}")
+    if motion.device != device:
+        raise DeviceError(f"{name} is on {motion.device} but points is on {device}; move one with .to()")
+    wide = motion.double()
+    rotation, last = wide[:, :3, :3], wide[:, 3]
+    off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device=device)).abs().amax((1, 2))
+    off = torch.maximum(off, (last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1))
+    # Kernels allow for motions that stretch lengths by up to 5e-5; NaN fails too.
+    wrong = (~(off <= 2e-5) | ~torch.isfinite(wide).all(2).all(1)).nonzero().squeeze(1).tolist()
+    if wrong:
+        raise ConfigError(
+            f"{name}[{wrong[0]}] is not rigid: rotation^T rotation is off the identity by {float(off[wrong[0]]):.2g}; "
+            "a window of a scaled or sheared cloud proves nothing, so pass grid=None"
         )

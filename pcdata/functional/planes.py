@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -64,6 +65,29 @@ def ransac_plane(
     Source: Fischler & Bolles, CACM 24(6), 1981.
     """
     assert ptr is not None
+    return search_planes(points, ptr, _TORCH_WORK, distance, num_hypotheses, seed, up, max_tilt)
+
+
+@dataclass(frozen=True)
+class PlaneWork:
+    """The parts of :func:`ransac_plane` that touch every point; a kernel brings its own."""
+
+    count_inliers: Callable[[Tensor, Tensor, float], Tensor]  # points (N, 3), planes (P, 4), distance -> (P,) int64
+    inlier_mask: Callable[[Tensor, Tensor, float], Tensor]  # points (N, 3), plane (4,), distance -> (N,) bool
+    fit: Callable[[Tensor, Tensor], Tensor | None]  # points (N, 3), chosen (N,) bool -> plane (4,), as fit_plane
+
+
+def search_planes(
+    points: Tensor,
+    ptr: Tensor,
+    work: PlaneWork,
+    distance: float,
+    num_hypotheses: int,
+    seed: int | Sequence[int] | Tensor,
+    up: Tensor | Sequence[float] | None,
+    max_tilt: float | None,
+) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
+    """Run :func:`ransac_plane` with the given work: draws, decisions and refinement are the same for all kernels."""
     num_clouds = len(ptr) - 1
     _check_parameters(distance, num_hypotheses, max_tilt, up)
     seeds = _seed_per_cloud(seed, num_clouds)
@@ -77,8 +101,9 @@ def ransac_plane(
         allowed = _tilt_test(ups[cloud], max_tilt)
         own = points[start:stop]
         hypotheses = _draw_planes(own, num_hypotheses, seeds[cloud])
-        winner = _best_plane(own, hypotheses, allowed(hypotheses), distance, f"ransac_plane: cloud {cloud}")
-        plane, inlier_mask[start:stop] = _refine(own, winner, distance, allowed)
+        where = f"ransac_plane: cloud {cloud}"
+        winner = _best_plane(own, hypotheses, allowed(hypotheses), distance, where, work)
+        plane, inlier_mask[start:stop] = _refine(own, winner, distance, allowed, work)
         planes[cloud] = _face(plane, ups[cloud])
     return planes.to(points.device), inlier_mask
 
@@ -113,12 +138,20 @@ def fit_plane(points: Tensor) -> Tensor | None:
     wide = points.double()
     centre = wide.mean(dim=0)
     centred = wide - centre
-    covariance = ((centred.T @ centred) / len(points)).cpu()
+    return plane_of_moments(centre.cpu(), ((centred.T @ centred) / len(points)).cpu(), wide.abs().max().cpu())
+
+
+def plane_of_moments(
+    centre: Tensor,  # (3,) float64
+    covariance: Tensor,  # (3, 3) float64
+    largest: Tensor,  # () absolute coordinate
+) -> Tensor | None:  # (4,) float64
+    """Return the plane of :func:`fit_plane` from the moments of the points, all on the CPU."""
     variance, directions = torch.linalg.eigh(covariance)
-    if float(variance[1].clamp(min=0).sqrt()) <= _flat_height(wide.abs().max().cpu()):
+    if float(variance[1].clamp(min=0).sqrt()) <= _flat_height(largest):
         return None
     normal = directions[:, 0]
-    return torch.cat([normal, -(normal @ centre.cpu())[None]])
+    return torch.cat([normal, -(normal @ centre)[None]])
 
 
 def _draw_planes(points: Tensor, count: int, seed: int) -> Tensor:
@@ -145,7 +178,9 @@ def _draw_triples(num_points: int, count: int, seed: int) -> Tensor:
     return torch.stack([first, second, third], dim=1)
 
 
-def _best_plane(points: Tensor, planes: Tensor, allowed: Tensor, distance: float, where: str) -> Tensor:
+def _best_plane(
+    points: Tensor, planes: Tensor, allowed: Tensor, distance: float, where: str, work: PlaneWork
+) -> Tensor:
     """Return the allowed plane with the most inliers, the earliest among equals."""
     is_plane = ~planes[:, 0].isnan()
     competes = is_plane & allowed
@@ -157,7 +192,7 @@ def _best_plane(points: Tensor, planes: Tensor, allowed: Tensor, distance: float
         )
         raise NoPlaneError(f"{where}: {reason}")
     candidates = planes[competes]
-    counts = _count_inliers(points, candidates, distance)
+    counts = work.count_inliers(points, candidates, distance)
     best = int(counts.argmax())  # the first of equals, as torch documents
     if int(counts[best]) < 3:
         raise NoPlaneError(
@@ -185,15 +220,15 @@ def _count_inliers(points: Tensor, planes: Tensor, distance: float) -> Tensor:
 
 
 def _refine(
-    points: Tensor, plane: Tensor, distance: float, allowed: Callable[[Tensor], Tensor]
+    points: Tensor, plane: Tensor, distance: float, allowed: Callable[[Tensor], Tensor], work: PlaneWork
 ) -> tuple[Tensor, Tensor]:
     """Refit to the inliers until they no longer change; return the last allowed plane and its inliers."""
-    inliers = _inlier_mask(points, plane, distance)
+    inliers = work.inlier_mask(points, plane, distance)
     for _ in range(_MAX_REFINEMENTS):
-        refitted = fit_plane(points[inliers])
+        refitted = work.fit(points, inliers)
         if refitted is None or not bool(allowed(refitted)):
             break
-        refitted_inliers = _inlier_mask(points, refitted, distance)
+        refitted_inliers = work.inlier_mask(points, refitted, distance)
         if int(refitted_inliers.sum()) < 3:
             break
         settled = torch.equal(refitted_inliers, inliers)
@@ -265,3 +300,6 @@ def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> list[
     if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
         raise ConfigError("ransac_plane: up must be finite and not zero")
     return list((directions / lengths[:, None]).unbind(0))
+
+
+_TORCH_WORK = PlaneWork(_count_inliers, _inlier_mask, lambda points, inliers: fit_plane(points[inliers]))

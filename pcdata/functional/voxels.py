@@ -7,7 +7,7 @@ The grid is Open3D's: per cloud, it starts half a voxel below the lowest corner,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
@@ -54,7 +54,7 @@ def voxel_downsample(
         UnitError: an extent of 2^53 voxels or more.
     """
     assert ptr is not None
-    sizes = _sizes_per_cloud("voxel_downsample", voxel_size, ptr)
+    sizes = sizes_per_cloud("voxel_downsample", voxel_size, ptr)
     cloud, origin, scaled = _scale_to_grid(points, ptr, sizes)
     voxel = scaled.floor()
     inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
@@ -86,15 +86,28 @@ def find_voxel_size(
     """
     assert ptr is not None
     require_count("find_voxel_size", "num_points", num_points)
-    bounds = ptr.tolist()
-    sizes = [_search_size(points[a:b], num_points, cloud) for cloud, (a, b) in enumerate(pairwise(bounds))]
+    return search_voxel_sizes(points, ptr, num_points, count_voxels, count_distinct)
+
+
+def search_voxel_sizes(
+    points: Tensor,
+    ptr: Tensor,
+    num_points: int,
+    voxels: Callable[[Tensor, float], int],  # count_voxels or its kernel
+    distinct: Callable[[Tensor], int],  # count_distinct or its kernel
+) -> Tensor:  # (B,) float64
+    """Run :func:`find_voxel_size` with the given ways to count: the search is the same for all kernels."""
+    sizes = [
+        _search_size(points[start:stop], num_points, cloud, voxels, distinct)
+        for cloud, (start, stop) in enumerate(pairwise(ptr.tolist()))
+    ]
     return torch.tensor(sizes, dtype=torch.float64, device=points.device)
 
 
 def count_voxels(points: Tensor, voxel_size: float) -> int:
     """Return how many points :func:`voxel_downsample` leaves of one cloud."""
     ptr = torch.tensor([0, len(points)], device=points.device)
-    cloud, _, scaled = _scale_to_grid(points, ptr, _sizes_per_cloud("count_voxels", voxel_size, ptr))
+    cloud, _, scaled = _scale_to_grid(points, ptr, sizes_per_cloud("count_voxels", voxel_size, ptr))
     return _rank(_voxel_keys(cloud, scaled.floor(), 1))[1]
 
 
@@ -153,23 +166,29 @@ def voxel_majority(
     return torch.where(best < 0, -1, names[winner]) if len(names) else best
 
 
-def _search_size(points: Tensor, num_points: int, cloud: int) -> float:
+def _search_size(
+    points: Tensor,
+    num_points: int,
+    cloud: int,
+    voxels: Callable[[Tensor, float], int],
+    distinct: Callable[[Tensor], int],
+) -> float:
     """Bisect on a logarithmic scale between a size that leaves enough points and one that leaves too few."""
-    distinct = count_distinct(points) if len(points) >= num_points else len(points)
-    if distinct < num_points:
+    available = distinct(points) if len(points) >= num_points else len(points)
+    if available < num_points:
         raise TooFewPointsError(
-            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {distinct} distinct ones"
+            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {available} distinct ones"
         )
     extent = float((points.amax(0).double() - points.amin(0)).max())
     too_large = 3.0 * extent or 1.0  # everything lies in one voxel
     if num_points == 1:
         return too_large
     enough = extent / math.sqrt(num_points)  # right for a surface, up to a factor
-    while (count := count_voxels(points, enough)) < num_points:
+    while (count := voxels(points, enough)) < num_points:
         enough, too_large = enough / 2, enough
     while count > num_points and too_large > enough * (1 + _SIZE_TOLERANCE):
         middle = math.sqrt(enough * too_large)
-        middle_count = count_voxels(points, middle)
+        middle_count = voxels(points, middle)
         if middle_count >= num_points:
             enough, count = middle, middle_count
         else:
@@ -177,7 +196,13 @@ def _search_size(points: Tensor, num_points: int, cloud: int) -> float:
     return enough
 
 
-def _sizes_per_cloud(where: str, voxel_size: float | Sequence[float] | Tensor, ptr: Tensor) -> Tensor:
+def sizes_per_cloud(where: str, voxel_size: float | Sequence[float] | Tensor, ptr: Tensor) -> Tensor:
+    """Return the (B,) float64 voxel sizes of the clouds from one number or one per cloud.
+
+    Raises:
+        ShapeError: the number of sizes is not the number of clouds.
+        ConfigError: a size that is not positive.
+    """
     sizes = torch.as_tensor(voxel_size, dtype=torch.float64, device=ptr.device)
     num_clouds = len(ptr) - 1
     if sizes.ndim == 0:

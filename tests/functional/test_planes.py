@@ -114,7 +114,8 @@ def test_scoring_is_strict_too():
 def test_among_equal_hypotheses_the_earliest_wins():
     points = slab(50, [0.0, 0.0, 1.0], 0.5, noise=0.0)
     hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
-    best = planes_module._best_plane(points, hypotheses, torch.ones(3, dtype=torch.bool), 0.01, "test")
+    allowed = torch.ones(3, dtype=torch.bool)
+    best = planes_module._best_plane(points, hypotheses, allowed, 0.01, "test", planes_module._TORCH_WORK)
     assert torch.equal(best, hypotheses[1])
 
 

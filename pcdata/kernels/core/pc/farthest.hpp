@@ -1,0 +1,261 @@
+// Exact farthest point sampling that visits only the points a pick can change.
+#pragma once
+
+#include "pc/common.hpp"
+#include "pc/geometry.hpp"
+#include "pc/lanes.hpp"
+#include "pc/spatial_sort.hpp"
+
+namespace pc {
+
+// Points in spatial order are cut into leaves of 32, leaves into groups of 16, groups into groups of 16, and so on: an
+// implicit tree without pointers. Every node knows its box, and its farthest point as one number, the key: the bits of
+// the squared distance to the nearest pick (they sort like the distance), then the complement of the row, so that the
+// larger key is the farther point and, among equals, the lower row.
+//
+// A pick can only change a point nearer to it than that point's distance so far. The distance from the pick to a box
+// is computed with the float operations of the point distance, in the same order; rounding is monotonic, so it is never
+// above the distance of a point in the box, and skipping a box that is not nearer than its farthest point is exact.
+class FarthestSampler {
+ public:
+  static constexpr int kLeaf = 32;  // two AVX-512 registers; 20 bytes a point, and 1.2 more for the nodes
+  static constexpr int kFan = kLanes;  // children tested at once
+
+  FarthestSampler(ScratchFrame& scratch, const float* points, int64_t count)
+      : points_(points), count_(count), num_leaves_((count + kLeaf - 1) / kLeaf) {
+    leaves_ = scratch.take<Leaf>(num_leaves_);
+    for (int64_t children = num_leaves_; levels_.empty() || children > 1;) {
+      children = (children + kFan - 1) / kFan;
+      levels_.push_back({scratch.take<Group>(children), children});
+    }
+  }
+
+  const float* points() const { return points_; }
+  int64_t count() const { return count_; }
+  int64_t num_leaf_groups() const { return levels_[0].count; }
+
+  // Where a SpatialSort puts its points.
+  void place(const Placed* points, int64_t count, int64_t at) {
+    while (count > 0) {
+      Leaf& leaf = leaves_[at / kLeaf];
+      const int64_t first = at % kLeaf, some = std::min(count, kLeaf - first);
+      float *x = leaf.x + first, *y = leaf.y + first, *z = leaf.z + first;
+      uint32_t* row = leaf.row + first;
+      for (int64_t i = 0; i < some; ++i) {
+        x[i] = points[i].x();
+        y[i] = points[i].y();
+        z[i] = points[i].z();
+        row[i] = points[i].row();
+      }
+      points += some;
+      count -= some;
+      at += some;
+    }
+  }
+
+  // Once all points are placed: measure the leaves of some groups and take row 0 as the first pick. Groups are
+  // independent of one another.
+  void start_leaf_groups(int64_t begin, int64_t end) {
+    const Pick first = pick_of(0);
+    for (int64_t group = begin; group < end; ++group) {
+      for (int child = 0; child < kFan; ++child) {
+        const int64_t index = group * kFan + child;
+        if (index < num_leaves_)
+          start_leaf(levels_[0].groups[group], child, index, first);
+        else
+          levels_[0].groups[group].set_unreachable(child);
+      }
+    }
+  }
+  // Once that is done for all.
+  void start_levels() {
+    for (size_t level = 1; level < levels_.size(); ++level) {
+      const Level& below = levels_[level - 1];
+      for (int64_t group = 0; group < levels_[level].count; ++group) {
+        for (int child = 0; child < kFan; ++child) {
+          const int64_t index = group * kFan + child;
+          if (index < below.count)
+            levels_[level].groups[group].enclose(child, below.groups[index]);
+          else
+            levels_[level].groups[group].set_unreachable(child);
+        }
+      }
+    }
+  }
+
+  // Write further picks (rows), until `wanted` are taken or the work is worth `budget` leaves; return how many there
+  // are now. Call it again to go on.
+  int64_t advance(int64_t* picks, int64_t taken, int64_t wanted, int64_t budget) {
+    const Group& root = levels_.back().groups[0];
+    if (taken == 0) picks[taken++] = 0;
+    while (taken < wanted && budget > 0) {
+      const Pick pick = pick_of(root.farthest());
+      picks[taken++] = pick.row;
+      budget -= visit(levels_.size() - 1, 0, pick);
+    }
+    return taken;
+  }
+
+ private:
+  static constexpr int32_t kTaken = -1;           // below the bits of every distance
+  static constexpr int32_t kUnseen = 0x7F800000;  // infinity
+
+  struct Pick {
+    float x, y, z;
+    uint32_t row;
+    int64_t key;  // of the leaf and of every node above the pick
+  };
+
+  struct alignas(64) Leaf {
+    float x[kLeaf], y[kLeaf], z[kLeaf];
+    int32_t nearest[kLeaf];  // bits of the squared distance to the nearest pick, or kTaken
+    uint32_t row[kLeaf];
+
+    // Take note of a pick; return the key of the leaf's farthest point.
+    int64_t update(const Pick& pick) {
+      Int16 far{};
+      for (int i = 0; i < kLeaf; i += kLanes) {
+        const Float16 squared =
+            squared_distance(load<Float16>(x + i), load<Float16>(y + i), load<Float16>(z + i), pick.x, pick.y, pick.z);
+        // Distances are not negative, so their bits compare as they do.
+        Int16 now = least(reinterpret_cast<Int16>(squared), load<Int16>(nearest + i));
+        now = load<Uint16>(row + i) == pick.row ? Int16{} + kTaken : now;
+        store(nearest + i, now);
+        far = i == 0 ? now : greatest(far, now);
+      }
+      const int32_t farthest = highest_lane<int32_t>(far);
+      Uint16 rows = Uint16{} + UINT32_MAX;
+      for (int i = 0; i < kLeaf; i += kLanes)
+        rows = least(rows, load<Int16>(nearest + i) == farthest ? load<Uint16>(row + i) : Uint16{} + UINT32_MAX);
+      return int64_t{farthest} * (int64_t{1} << 32) + static_cast<uint32_t>(~lowest_lane<uint32_t>(rows));
+    }
+  };
+
+  // The boxes and keys of 16 nodes.
+  struct alignas(64) Group {
+    float low[3][kFan], high[3][kFan];
+    float bound[kFan];  // squared distance of the farthest point
+    int64_t key[kFan];
+
+    void set_key(int child, int64_t value) {
+      key[child] = value;
+      const auto bits = static_cast<int32_t>(value >> 32);
+      bound[child] = bits < 0 ? -1.0f : float_of(bits);  // nothing is nearer than a box of taken points
+    }
+    void set_unreachable(int child) {
+      for (int axis = 0; axis < 3; ++axis) low[axis][child] = high[axis][child] = 0;
+      set_key(child, INT64_MIN);
+    }
+    void enclose(int child, const Group& below) {
+      for (int axis = 0; axis < 3; ++axis) {
+        low[axis][child] = below.low[axis][0];
+        high[axis][child] = below.high[axis][0];
+        for (int i = 1; i < kFan && below.key[i] != INT64_MIN; ++i) {
+          low[axis][child] = std::min(low[axis][child], below.low[axis][i]);
+          high[axis][child] = std::max(high[axis][child], below.high[axis][i]);
+        }
+      }
+      set_key(child, below.farthest());
+    }
+    int64_t farthest() const { return highest_lane<int64_t>(greatest(load<Long8>(key), load<Long8>(key + kFan / 2))); }
+
+    // The children that a pick may change, as a bit mask: boxes nearer than their farthest point. Once only duplicates
+    // of picks are left, a pick changes nothing but itself.
+    uint32_t reached(const Pick& pick) const {
+      if (pick.key >> 32 == 0) return holding(pick);
+      const Float16 dx = gap(0, pick.x), dy = gap(1, pick.y), dz = gap(2, pick.z);
+      return bits_of_lanes(((dx * dx) + (dy * dy)) + (dz * dz) < load<Float16>(bound));
+    }
+    uint32_t holding(const Pick& pick) const {
+      return 1u << (std::find(key, key + kFan, pick.key) - key);
+    }
+    Float16 gap(int axis, float at) const {
+      const Float16 outside = greatest(load<Float16>(low[axis]) - at, at - load<Float16>(high[axis]));
+      return greatest(outside, Float16{});
+    }
+  };
+
+  struct Level {
+    Group* groups;
+    int64_t count;
+  };
+
+  static float float_of(int32_t bits) {
+    float value;
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+  }
+  static int32_t bits_of(float value) {
+    int32_t bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return bits;
+  }
+  template <class T>
+  static void prefetch(const T& what) {
+    for (size_t byte = 0; byte < sizeof(T); byte += 64) __builtin_prefetch(reinterpret_cast<const char*>(&what) + byte);
+  }
+
+  Pick pick_of(int64_t key) const {
+    const uint32_t row = key == 0 ? 0 : ~static_cast<uint32_t>(key);
+    const float* p = points_ + 3 * int64_t{row};
+    return {p[0], p[1], p[2], row, key};
+  }
+
+  void start_leaf(Group& group, int child, int64_t index, const Pick& first) {
+    Leaf& leaf = leaves_[index];
+    const auto filled = static_cast<int>(std::min<int64_t>(kLeaf, count_ - index * kLeaf));
+    std::fill_n(leaf.nearest, filled, kUnseen);
+    for (int i = filled; i < kLeaf; ++i) {  // the last leaf is filled up with a point that counts as taken
+      leaf.x[i] = leaf.x[filled - 1];
+      leaf.y[i] = leaf.y[filled - 1];
+      leaf.z[i] = leaf.z[filled - 1];
+      leaf.nearest[i] = kTaken;
+      leaf.row[i] = UINT32_MAX;
+    }
+    const float* columns[3] = {leaf.x, leaf.y, leaf.z};
+    for (int axis = 0; axis < 3; ++axis) {
+      float low = columns[axis][0], high = low;
+      for (int i = 1; i < kLeaf; ++i) {
+        low = std::min(low, columns[axis][i]);
+        high = std::max(high, columns[axis][i]);
+      }
+      group.low[axis][child] = low;
+      group.high[axis][child] = high;
+    }
+    group.set_key(child, leaf.update(first));
+  }
+
+  // Update what a pick changes below one group; return the number of leaves and groups visited.
+  int64_t visit(size_t at, int64_t index, const Pick& pick) {
+    Group& group = levels_[at].groups[index];
+    const uint32_t reached = group.reached(pick);
+    int64_t visited = 1;
+    for (uint32_t rest = reached; rest != 0; rest &= rest - 1) {
+      const int64_t child = index * kFan + __builtin_ctz(rest);
+      if (at == 0)
+        prefetch(leaves_[child]);
+      else
+        prefetch(levels_[at - 1].groups[child]);
+    }
+    for (uint32_t rest = reached; rest != 0; rest &= rest - 1) {
+      const int child = __builtin_ctz(rest);
+      const int64_t below = index * kFan + child;
+      if (at == 0) {
+        group.set_key(child, leaves_[below].update(pick));
+        ++visited;
+      } else {
+        visited += visit(at - 1, below, pick);
+        group.set_key(child, levels_[at - 1].groups[below].farthest());
+      }
+    }
+    return visited;
+  }
+
+  const float* points_;
+  int64_t count_;
+  int64_t num_leaves_;
+  Leaf* leaves_;
+  std::vector<Level> levels_;  // [0] above the leaves, the last a single group
+};
+
+}  // namespace pc

@@ -1,0 +1,385 @@
+// The search of a cloud that still lies on a depth image: a window of pixels, with proof that nothing nearer lies
+// outside.
+//
+// The proof. Let S be the least X/Z of all points in the columns from u+w+1 on, in the camera's frame, where Z > 0. All
+// of those points lie in the half-space X >= S Z, so a query left of it is at least (S Z0 - X0) / sqrt(1 + S^2) away
+// from them; likewise for the columns up to u-w-1 and for rows. If the k-th distance found in the window of half-width
+// w is less than all four, no point outside can matter. S is measured from the points, not computed from intrinsics, so
+// a grid that does not fit the points (or a lens that bends columns) can only make proofs fail, never make them wrong;
+// queries without a proof go to the box tree.
+#pragma once
+
+#include "pc/common.hpp"
+#include "pc/sixteen.hpp"
+#include "pc/nearest.hpp"
+#include "pc/treesearch.hpp"
+
+namespace pc {
+
+// What Python knows of a batch on depth images; camera null: the points are in the camera's frame.
+struct Grid {
+  const int64_t* pixel;  // (N,) v * width + u, increasing within a cloud
+  int64_t width;
+  const double* camera;  // (B, 4, 4) rigid, camera from points; or null
+};
+
+// A rigid motion into the camera's frame.
+struct CameraFrame {
+  const double* matrix;  // (4, 4), or null for none
+
+  // One row of the matrix times a point, rounded once at the end.
+  float along(int row, float x, float y, float z) const {
+    if (matrix == nullptr) return row == 0 ? x : row == 1 ? y : z;
+    const double* m = matrix + 4 * row;
+    return static_cast<float>(m[0] * x + m[1] * y + m[2] * z + m[3]);
+  }
+};
+
+// The half-spaces that hold all points from some column (or row) on, one per column: normal form a, b.
+struct HalfSpaces {
+  // Distance from a query at (X0, Z0): b Z0 - a X0 to the points from column c on, a X0 - b Z0 to those up to column c.
+  float *from_a, *from_b, *upto_a, *upto_b;
+
+  // Column c stands at place c; `before` and `after` places are added, where there is nothing beyond.
+  void build(ScratchFrame& scratch, const float* least, const float* most, int64_t count, int64_t before,
+             int64_t after) {
+    float* room = scratch.take<float>(4 * (before + count + after));
+    const int64_t stride = before + count + after;
+    from_a = room + before;
+    from_b = from_a + stride;
+    upto_a = from_b + stride;
+    upto_b = upto_a + stride;
+    float slope = kInfinity;
+    for (int64_t c = count + after - 1; c >= -before; --c) {
+      if (c >= 0 && c < count) slope = std::min(slope, least[c]);
+      set(slope, from_a[c], from_b[c]);
+    }
+    slope = -kInfinity;
+    for (int64_t c = -before; c < count + after; ++c) {
+      if (c >= 0 && c < count) slope = std::max(slope, most[c]);
+      set(slope, upto_a[c], upto_b[c]);
+    }
+  }
+
+ private:
+  static void set(float slope, float& a, float& b) {
+    const double length = std::sqrt(1.0 + double{slope} * slope);
+    const bool nothing = slope == kInfinity || slope == -kInfinity;
+    a = nothing ? 0.0f : static_cast<float>(1.0 / length);
+    b = nothing ? slope : static_cast<float>(slope / length);
+  }
+};
+
+// One cloud laid out as the part of its image that it covers, with a margin of points at infinity.
+class OrganisedCloud {
+ public:
+  // False when the cloud cannot be searched by windows with profit: points behind the camera, or far fewer points than
+  // pixels.
+  bool build(const pc_context& context, ScratchFrame& scratch, const float* points, const Grid& grid, int64_t cloud,
+             int64_t begin, int64_t end, int max_reach) {
+    max_reach_ = max_reach;
+    camera_ = {grid.camera == nullptr ? nullptr : grid.camera + 16 * cloud};
+    if (!measure(context, grid, begin, end)) return false;
+    const int64_t rows = height_ + 2 * max_reach;
+    stride_ = (width_ + max_reach + kQueries - 1) / kQueries * kQueries + kQueries + 2 * max_reach;
+    if (rows * stride_ > kMaxPixelsPerPoint * (end - begin) || rows * stride_ >= int64_t{kNoId}) return false;
+    origin_ = max_reach * stride_ + max_reach;
+    float* room = scratch.take<float>(3 * rows * stride_);
+    for (int axis = 0; axis < 3; ++axis) image_[axis] = room + axis * rows * stride_ + origin_;
+    row_of_pixel_ = scratch.take<uint32_t>(rows * stride_) + origin_;
+    parallel_for(context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      for (int axis = 0; axis < 3; ++axis)
+        std::fill(image_[axis] - origin_ + first * stride_, image_[axis] - origin_ + last * stride_, kInfinity);
+    });
+    parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      for_pixels(grid, begin + first, begin + last, [&](int64_t i, int64_t u, int64_t v) {
+        const int64_t at = (v - first_row_) * stride_ + (u - first_column_);
+        for (int axis = 0; axis < 3; ++axis) image_[axis][at] = points[3 * i + axis];
+        row_of_pixel_[at] = static_cast<uint32_t>(i);
+      });
+    });
+    return measure_slopes(context, scratch);
+  }
+
+  // The rows of the cloud, ordered by tiles of 4x4 pixels within tiles of 8x8 and so on: near in the image is mostly
+  // near in space, and it takes no sort. Returns as many keys as there are points.
+  uint64_t* tile_order(const pc_context& context, ScratchFrame& scratch, int64_t num_points) const {
+    const int64_t across = (width_ + kTile - 1) / kTile, tiles = across * ((height_ + kTile - 1) / kTile);
+    std::vector<int64_t> begin(static_cast<size_t>(tiles) + 1, 0);
+    const auto for_points = [&](int64_t tile, auto&& body) {
+      const int64_t u0 = tile % across * kTile, v0 = tile / across * kTile;
+      for (int64_t code = 0; code < kTile * kTile; ++code) {
+        const int64_t u = u0 + even_bits(code), v = v0 + even_bits(code >> 1), at = v * stride_ + u;
+        if (u < width_ && v < height_ && image_[2][at] < kInfinity) body(row_of_pixel_[at]);
+      }
+    };
+    parallel_for(context, tiles, 4, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t tile = first; tile < last; ++tile)
+        for_points(tile, [&](uint32_t) { ++begin[static_cast<size_t>(tile) + 1]; });
+    });
+    for (size_t tile = 0; tile < static_cast<size_t>(tiles); ++tile) begin[tile + 1] += begin[tile];
+    uint64_t* keys = scratch.take<uint64_t>(num_points);
+    parallel_for(context, tiles, 4, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t tile = first; tile < last; ++tile) {
+        uint64_t* next = keys + begin[static_cast<size_t>(tile)];
+        for_points(tile, [&](uint32_t row) { *next++ = row; });
+      }
+    });
+    return keys;
+  }
+
+  int64_t width() const { return width_; }
+  int64_t height() const { return height_; }
+  int64_t stride() const { return stride_; }
+  int max_reach() const { return max_reach_; }
+  const CameraFrame& camera() const { return camera_; }
+  const float* x() const { return image_[0]; }
+  const float* y() const { return image_[1]; }
+  const float* z() const { return image_[2]; }
+  uint32_t row(int64_t pixel) const { return row_of_pixel_[pixel]; }
+  const HalfSpaces& columns() const { return columns_; }
+  const HalfSpaces& lines() const { return lines_; }
+
+ private:
+  // An image with fewer points in it is mostly searched in vain.
+  static constexpr int64_t kMaxPixelsPerPoint = 4;
+  static constexpr int64_t kTile = 64;
+  static constexpr int64_t kRowsPerPiece = 16;
+  static constexpr int64_t kPointsPerPiece = 1 << 14;
+  static constexpr float kMinDepth = 1e-30f, kMaxSlope = 1e18f;  // so that no slope overflows
+
+  // Bits 0, 2, 4, ... of a 12-bit number, moved together.
+  static int64_t even_bits(int64_t v) {
+    v &= 0x555;
+    v = (v | v >> 1) & 0x333;
+    v = (v | v >> 2) & 0xF0F;
+    return (v | v >> 4) & 0x3F;
+  }
+
+  template <class Body>
+  static void for_pixels(const Grid& grid, int64_t begin, int64_t end, Body&& body) {
+    int64_t v = begin < end ? grid.pixel[begin] / grid.width : 0;
+    for (int64_t i = begin; i < end; ++i) {
+      int64_t u = grid.pixel[i] - v * grid.width;
+      if (u >= grid.width) {
+        v = grid.pixel[i] / grid.width;
+        u = grid.pixel[i] - v * grid.width;
+      }
+      body(i, u, v);
+    }
+  }
+
+  // The rectangle of pixels that the cloud covers.
+  bool measure(const pc_context& context, const Grid& grid, int64_t begin, int64_t end) {
+    if (begin == end) return false;
+    first_row_ = grid.pixel[begin] / grid.width;
+    height_ = grid.pixel[end - 1] / grid.width - first_row_ + 1;
+    struct alignas(64) Range {
+      int64_t least, most;
+    };
+    std::vector<Range> ranges(static_cast<size_t>(std::max(context.threads, 1)), Range{grid.width, -1});
+    parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
+      Range range = ranges[static_cast<size_t>(thread)];
+      for_pixels(grid, begin + first, begin + last, [&](int64_t, int64_t u, int64_t) {
+        range = {std::min(range.least, u), std::max(range.most, u)};
+      });
+      ranges[static_cast<size_t>(thread)] = range;
+    });
+    first_column_ = grid.width;
+    int64_t last_column = 0;
+    for (const Range& range : ranges) {
+      first_column_ = std::min(first_column_, range.least);
+      last_column = std::max(last_column, range.most);
+    }
+    width_ = last_column - first_column_ + 1;
+    return true;
+  }
+
+  bool measure_slopes(const pc_context& context, ScratchFrame& scratch) {
+    const int64_t bands = (height_ + kRowsPerPiece - 1) / kRowsPerPiece;
+    float* column = scratch.take<float>(2 * bands * width_);  // least, then most, of each band
+    float* line = scratch.take<float>(2 * height_);
+    std::atomic<bool> in_front{true};
+    parallel_for(context, bands, 1, [&](int64_t band, int64_t, int64_t) {
+      float *least = column + 2 * band * width_, *most = least + width_;
+      std::fill(least, most, kInfinity);
+      std::fill(most, most + width_, -kInfinity);
+      bool fine = true;
+      for (int64_t v = band * kRowsPerPiece, end = std::min(height_, v + kRowsPerPiece); v < end; ++v)
+        fine &= slopes_of_line(v, least, most, line[v], line[height_ + v]);
+      if (!fine) in_front.store(false, std::memory_order_relaxed);
+    });
+    if (!in_front.load()) return false;
+    for (int64_t band = 1; band < bands; ++band)
+      for (int64_t u = 0; u < width_; ++u) {
+        column[u] = std::min(column[u], column[2 * band * width_ + u]);
+        column[width_ + u] = std::max(column[width_ + u], column[(2 * band + 1) * width_ + u]);
+      }
+    columns_.build(scratch, column, column + width_, width_, max_reach_ + 1, max_reach_ + 1 + kQueries);
+    lines_.build(scratch, line, line + height_, height_, max_reach_ + 1, max_reach_ + 1);
+    return true;
+  }
+
+  bool slopes_of_line(int64_t v, float* least, float* most, float& line_least, float& line_most) const {
+    const float *x = image_[0] + v * stride_, *y = image_[1] + v * stride_, *z = image_[2] + v * stride_;
+    float low = kInfinity, high = -kInfinity;
+    int32_t bad = 0;
+    const bool moved = camera_.matrix != nullptr;
+    for (int64_t u = 0; u < width_; ++u) {
+      const bool real = z[u] < kInfinity;
+      const float cx = moved ? camera_.along(0, x[u], y[u], z[u]) : x[u];
+      const float cy = moved ? camera_.along(1, x[u], y[u], z[u]) : y[u];
+      const float cz = moved ? camera_.along(2, x[u], y[u], z[u]) : z[u];
+      const float inverse = 1.0f / cz, across = cx * inverse, down = cy * inverse;
+      // Every comparison is false for NaN, which so counts as bad.
+      const bool fine = cz > kMinDepth && cz < kInfinity && std::fabs(across) < kMaxSlope && std::fabs(down) < kMaxSlope;
+      bad |= real & !fine;
+      least[u] = real && across < least[u] ? across : least[u];
+      most[u] = real && across > most[u] ? across : most[u];
+      low = real && down < low ? down : low;
+      high = real && down > high ? down : high;
+    }
+    line_least = low;
+    line_most = high;
+    return bad == 0;
+  }
+
+  int64_t first_row_ = 0, first_column_ = 0, width_ = 0, height_ = 0, stride_ = 0, origin_ = 0;
+  int max_reach_ = 0;
+  CameraFrame camera_{nullptr};
+  float* image_[3] = {};
+  uint32_t* row_of_pixel_ = nullptr;
+  HalfSpaces columns_{}, lines_{};
+};
+
+// The pixels at each distance from the middle of a window, square ring by square ring, nearest first within a ring.
+class WindowRings {
+ public:
+  explicit WindowRings(int max_reach) {
+    for (int ring = 0; ring <= max_reach; ++ring) {
+      begin_.push_back(offsets_.size());
+      for (int dv = -ring; dv <= ring; ++dv)
+        for (int du = -ring; du <= ring; ++du)
+          if (std::max(std::abs(du), std::abs(dv)) == ring) offsets_.push_back({du, dv});
+      std::stable_sort(offsets_.begin() + static_cast<ptrdiff_t>(begin_.back()), offsets_.end(),
+                       [](Offset a, Offset b) { return a.squared() < b.squared(); });
+    }
+    begin_.push_back(offsets_.size());
+  }
+  struct Offset {
+    int du, dv;
+    int squared() const { return du * du + dv * dv; }
+  };
+  const Offset* begin(int ring) const { return offsets_.data() + begin_[static_cast<size_t>(ring)]; }
+  const Offset* end(int ring) const { return begin(ring + 1); }
+
+ private:
+  std::vector<Offset> offsets_;
+  std::vector<size_t> begin_;
+};
+
+// Searches windows around sixteen pixels side by side.
+class WindowSearch {
+ public:
+  WindowSearch(const OrganisedCloud& cloud, const WindowRings& rings) : cloud_(cloud), rings_(rings) {}
+
+  // The lanes at (u, v) to (u+15, v) that are points.
+  LaneMask points_at(int64_t u, int64_t v) const {
+    return less(Floats::load(cloud_.z() + v * cloud_.stride() + u), Floats(kInfinity));
+  }
+  QueryGroup queries_at(int64_t u, int64_t v, LaneMask lanes) const {
+    const int64_t at = v * cloud_.stride() + u;
+    return QueryGroup(cloud_.x() + at, cloud_.y() + at, cloud_.z() + at, lanes);
+  }
+
+  // Offer windows of growing size, from `reach` on; return the lanes that are proved complete.
+  template <class Nearest>
+  LaneMask run(const QueryGroup& queries, int64_t u, int64_t v, int reach, Nearest& nearest) {
+    u_ = u;
+    v_ = v;
+    for (int ring = 0; ring <= reach; ++ring) offer_ring(queries, ring, nearest);
+    const Place place(cloud_, queries);
+    for (;; offer_ring(queries, ++reach, nearest)) {
+      reach_ = reach;
+      const LaneMask proved = less(nearest.bound(), clear_within(place, reach)) & queries.active;
+      if (proved == queries.active || reach == cloud_.max_reach()) return proved;
+      // Rings cost all lanes: go on only for those that the largest window would prove.
+      if ((less(nearest.bound(), clear_within(place, cloud_.max_reach())) & queries.active & ~proved) == 0)
+        return proved;
+    }
+  }
+
+  // Show again every pixel of the last window: body(x, y, z, row of the point in each lane).
+  template <class Body>
+  void replay(const QueryGroup&, const Floats&, Body&& body) const {
+    for (int ring = 0; ring <= reach_; ++ring)
+      for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
+        const int64_t at = pixel(*offset);
+        body(Floats::load(cloud_.x() + at), Floats::load(cloud_.y() + at), Floats::load(cloud_.z() + at),
+             [&](int lane) { return cloud_.row(at + lane); });
+      }
+  }
+  uint32_t row(uint32_t id) const { return cloud_.row(id); }
+
+ private:
+  // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each
+  // of half a unit in the 24th bit of the largest coordinate.
+  struct Place {
+    Floats x, y, z, slack;
+
+    Place(const OrganisedCloud& cloud, const QueryGroup& queries) : x(queries.x), y(queries.y), z(queries.z) {
+      if (cloud.camera().matrix != nullptr) {
+        alignas(64) float from[3][kQueries], to[3][kQueries];
+        x.store(from[0]);
+        y.store(from[1]);
+        z.store(from[2]);
+        for (int axis = 0; axis < 3; ++axis)
+          for (int lane = 0; lane < kQueries; ++lane)
+            to[axis][lane] = cloud.camera().along(axis, from[0][lane], from[1][lane], from[2][lane]);
+        x = Floats::load(to[0]);
+        y = Floats::load(to[1]);
+        z = Floats::load(to[2]);
+      }
+      const Floats zero(0.0f);
+      slack = (maximum(x, zero - x) + maximum(y, zero - y) + z) * Floats(1e-6f);
+    }
+  };
+
+  template <class Nearest>
+  void offer_ring(const QueryGroup& queries, int ring, Nearest& nearest) const {
+    for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
+      const int64_t at = pixel(*offset);
+      const Floats squared = squared_length(Floats::load(cloud_.x() + at) - queries.x,
+                                            Floats::load(cloud_.y() + at) - queries.y,
+                                            Floats::load(cloud_.z() + at) - queries.z);
+      if (nearest.wants(squared)) nearest.offer(squared, Ids::ascending(static_cast<uint32_t>(at)));
+    }
+  }
+
+  // The squared distance within which every point is in the window, per lane.
+  Floats clear_within(const Place& at, int reach) const {
+    const HalfSpaces &columns = cloud_.columns(), &lines = cloud_.lines();
+    const int64_t right = u_ + reach + 1, left = u_ - reach - 1, below = v_ + reach + 1, above = v_ - reach - 1;
+    const Floats to_right = Floats::load(columns.from_b + right) * at.z - Floats::load(columns.from_a + right) * at.x;
+    const Floats to_left = Floats::load(columns.upto_a + left) * at.x - Floats::load(columns.upto_b + left) * at.z;
+    const Floats to_below = Floats(lines.from_b[below]) * at.z - Floats(lines.from_a[below]) * at.y;
+    const Floats to_above = Floats(lines.upto_a[above]) * at.y - Floats(lines.upto_b[above]) * at.z;
+    const Floats nearest_side = minimum(minimum(to_right, to_left), minimum(to_below, to_above));
+    const Floats clear = maximum(nearest_side - at.slack, Floats(0.0f));
+    return clear * clear * Floats(kMargin);
+  }
+
+  int64_t pixel(const WindowRings::Offset& offset) const {
+    return (v_ + offset.dv) * cloud_.stride() + u_ + offset.du;
+  }
+
+  // Rounding of computed squared distances (4e-7), and motions that are rigid only to 1e-5 (ImageGrid requires it).
+  static constexpr float kMargin = 1.0f - 1e-4f;
+
+  const OrganisedCloud& cloud_;
+  const WindowRings& rings_;
+  int64_t u_ = 0, v_ = 0;
+  int reach_ = 0;
+};
+
+}  // namespace pc

@@ -1,0 +1,72 @@
+// Distances of many points to many planes, and the sums a least-squares plane is made of.
+#pragma once
+
+#include <limits>
+
+#include "pc/common.hpp"
+#include "pc/lanes.hpp"
+
+namespace pc {
+
+// nx*x + ny*y + nz*z + d = 0.
+struct Plane {
+  float x, y, z, d;
+};
+
+// A block of points as one array per coordinate, small enough for the L1 cache beside everything else.
+struct PointBlock {
+  static constexpr int kSize = 1024;
+
+  alignas(64) float x[kSize], y[kSize], z[kSize];
+  int count = 0;
+
+  // Filled up with points that no plane is near.
+  void read(const float* points, int64_t begin, int64_t end) {
+    count = static_cast<int>(end - begin);
+    for (int i = 0; i < count; ++i) {
+      x[i] = points[3 * (begin + i)];
+      y[i] = points[3 * (begin + i) + 1];
+      z[i] = points[3 * (begin + i) + 2];
+    }
+    const int whole = (count + kLanes - 1) / kLanes * kLanes;
+    for (int i = count; i < whole; ++i) x[i] = y[i] = z[i] = std::numeric_limits<float>::quiet_NaN();
+  }
+};
+
+// Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance, in separate float operations like the reference.
+inline Int16 is_near(const Plane& plane, float distance, const Float16& x, const Float16& y, const Float16& z) {
+  const Float16 signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
+  const Int16 magnitude = reinterpret_cast<Int16>(signed_distance) & 0x7FFFFFFF;
+  return reinterpret_cast<Float16>(magnitude) < distance;
+}
+
+// Add to counts[h] the points of a block near planes[h]. Several planes share each load of a point.
+template <int kTogether>
+inline void count_near(const PointBlock& block, const Plane* planes, float distance, int64_t* counts) {
+  Int16 near[kTogether] = {};
+  for (int i = 0; i < block.count; i += kLanes) {
+    const Float16 x = load<Float16>(block.x + i), y = load<Float16>(block.y + i), z = load<Float16>(block.z + i);
+    // A true lane is -1.
+    for (int h = 0; h < kTogether; ++h) near[h] -= is_near(planes[h], distance, x, y, z);
+  }
+  for (int h = 0; h < kTogether; ++h) counts[h] += sum_of_lanes(near[h]);
+}
+
+// Sums over chosen points about a centre, each in eight lanes so that every instruction set adds in the same order.
+struct Moments {
+  Double8 x{}, y{}, z{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
+
+  void add(const Double8& px, const Double8& py, const Double8& pz) {
+    x += px;
+    y += py;
+    z += pz;
+    xx += px * px;
+    xy += px * py;
+    xz += px * pz;
+    yy += py * py;
+    yz += py * pz;
+    zz += pz * pz;
+  }
+};
+
+}  // namespace pc

@@ -1,0 +1,167 @@
+// The search of a box tree for sixteen queries at once.
+#pragma once
+
+#include "pc/boxtree.hpp"
+#include "pc/sixteen.hpp"
+#include "pc/nearest.hpp"
+
+namespace pc {
+
+// Sixteen queries, one per lane, and the box of those that count.
+struct QueryGroup {
+  Floats x, y, z;
+  float low[3], high[3];
+  LaneMask active;
+
+  // Lanes out of `active` may hold anything; they get a finite stand-in, so no arithmetic meets NaN.
+  QueryGroup(const float* qx, const float* qy, const float* qz, LaneMask lanes) : active(lanes) {
+    alignas(64) float copy[3][kQueries];
+    const float* from[3] = {qx, qy, qz};
+    for (int axis = 0; axis < 3; ++axis) {
+      low[axis] = kInfinity;
+      high[axis] = -kInfinity;
+      for (int lane = 0; lane < kQueries; ++lane) {
+        const bool counts = lanes >> lane & 1;
+        const float value = from[axis][lane];
+        copy[axis][lane] = counts ? value : 0.0f;
+        low[axis] = counts && value < low[axis] ? value : low[axis];
+        high[axis] = counts && value > high[axis] ? value : high[axis];
+      }
+    }
+    x = Floats::load(copy[0]);
+    y = Floats::load(copy[1]);
+    z = Floats::load(copy[2]);
+  }
+  explicit QueryGroup(const Leaf& leaf) : QueryGroup(leaf.x, leaf.y, leaf.z, real_slots(leaf)) {}
+
+  static LaneMask real_slots(const Leaf& leaf) {
+    LaneMask mask = 0;
+    for (int lane = 0; lane < kQueries; ++lane) mask |= LaneMask{leaf.row[lane] != kNoId} << lane;
+    return mask;
+  }
+  // `limit` in the lanes that count, off in the others.
+  Floats limits(float limit) const {
+    alignas(64) float value[kQueries];
+    for (int lane = 0; lane < kQueries; ++lane) value[lane] = active >> lane & 1 ? limit : kOff;
+    return Floats::load(value);
+  }
+};
+
+// Walks up from a leaf to the root; on the way looks into every sibling that is near enough, nearest first. A box is
+// passed by only when its computed gap exceeds what is wanted: rounding is monotone and a gap takes the operations of a
+// point distance in the same order, so it never exceeds the computed distance of a point inside. No tolerance needed.
+class TreeSearch {
+ public:
+  // Offer to `nearest` all points of the cloud that can matter, from leaf `start` on.
+  template <class Nearest>
+  void run(const CloudTree& tree, const QueryGroup& queries, int64_t start, Nearest& nearest) {
+    tree_ = tree;
+    visited_.clear();
+    visit(queries, start, nearest);
+    int64_t child = start;
+    for (int level = 0; level < tree_.num_levels; ++level) {
+      descend(queries, level, child / kFanOut, static_cast<int>(child % kFanOut), nearest);
+      child /= kFanOut;
+    }
+  }
+
+  // The leaf reached by always taking the nearest box.
+  int64_t leaf_near(const CloudTree& tree, const QueryGroup& queries) const {
+    int64_t node = 0;
+    for (int level = tree.num_levels - 1; level >= 0; --level) {
+      alignas(64) float gap[kFanOut];
+      box_gaps(queries, tree.level[level][node]).store(gap);
+      node = node * kFanOut + (std::min_element(gap, gap + kFanOut) - gap);
+    }
+    return node;
+  }
+
+  uint32_t row(uint32_t id) const { return id; }
+
+  // Show again every point that run() has shown, and is at most `reach` away from some lane: body(x, y, z, row of the point in each lane).
+  template <class Body>
+  void replay(const QueryGroup& queries, const Floats& reach, Body&& body) const {
+    for (const int64_t index : visited_) {
+      if (!lanes_near(queries, tree_.level[0][index / kFanOut], index % kFanOut, reach)) continue;
+      const Leaf& leaf = tree_.leaf[index];
+      for (int i = 0; i < kLeafSize && leaf.row[i] != kNoId; ++i)
+        body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), [&](int) { return leaf.row[i]; });
+    }
+  }
+
+ private:
+  template <class Nearest>
+  void visit(const QueryGroup& queries, int64_t index, Nearest& nearest) {
+    visited_.push_back(index);
+    const Leaf& leaf = tree_.leaf[index];
+    for (int i = 0; i < kLeafSize; ++i) {
+      const Floats squared = squared_length(Floats(leaf.x[i]) - queries.x, Floats(leaf.y[i]) - queries.y,
+                                            Floats(leaf.z[i]) - queries.z);
+      if (nearest.wants(squared)) nearest.offer(squared, Ids::same(leaf.row[i]));
+    }
+  }
+
+  template <class Nearest>
+  void descend(const QueryGroup& queries, int level, int64_t block, int skip, Nearest& nearest) {
+    const Boxes& boxes = tree_.level[level][block];
+    const Floats gaps = box_gaps(queries, boxes);
+    // A gap of infinity is a missing box, or one too far for any distance in it to fit a float.
+    LaneMask near = less_equal(gaps, Floats(nearest.widest())) & less(gaps, Floats(kInfinity));
+    if (skip >= 0) near &= ~(LaneMask{1} << skip);
+    if (near == 0) return;
+    Child children[kFanOut];
+    const int count = sort_by_gap(gaps, near, children);
+    for (int i = 0; i < count; ++i) {
+      const int slot = children[i].slot;
+      if (!lanes_near(queries, boxes, slot, nearest.bound())) continue;
+      const int64_t node = block * kFanOut + slot;
+      if (level == 0)
+        visit(queries, node, nearest);
+      else
+        descend(queries, level - 1, node, -1, nearest);
+    }
+  }
+
+  struct Child {
+    float gap;
+    int slot;
+  };
+
+  static int sort_by_gap(const Floats& gaps, LaneMask near, Child (&children)[kFanOut]) {
+    alignas(64) float gap[kFanOut];
+    gaps.store(gap);
+    int count = 0;
+    for (; near != 0; near &= near - 1) {
+      const int slot = __builtin_ctz(near);
+      int at = count++;
+      for (; at > 0 && children[at - 1].gap > gap[slot]; --at) children[at] = children[at - 1];
+      children[at] = {gap[slot], slot};
+    }
+    return count;
+  }
+
+  // Squared gaps between the group's box and sixteen boxes.
+  static Floats box_gaps(const QueryGroup& queries, const Boxes& boxes) {
+    Floats gap[3];
+    for (int axis = 0; axis < 3; ++axis)
+      gap[axis] = maximum(maximum(Floats::load(boxes.low[axis]) - Floats(queries.high[axis]),
+                                  Floats(queries.low[axis]) - Floats::load(boxes.high[axis])),
+                          Floats(0.0f));
+    return squared_length(gap[0], gap[1], gap[2]);
+  }
+
+  // The lanes whose query has less than `reach` between itself and one box.
+  static LaneMask lanes_near(const QueryGroup& queries, const Boxes& boxes, int64_t slot, const Floats& reach) {
+    const Floats* at[3] = {&queries.x, &queries.y, &queries.z};
+    Floats gap[3];
+    for (int axis = 0; axis < 3; ++axis)
+      gap[axis] = maximum(maximum(Floats(boxes.low[axis][slot]) - *at[axis], *at[axis] - Floats(boxes.high[axis][slot])),
+                          Floats(0.0f));
+    return less_equal(squared_length(gap[0], gap[1], gap[2]), reach);
+  }
+
+  CloudTree tree_{};
+  std::vector<int64_t> visited_;
+};
+
+}  // namespace pc

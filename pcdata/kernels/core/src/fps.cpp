@@ -1,0 +1,69 @@
+// Farthest point sampling of ragged batches.
+#include "pc/farthest.hpp"
+
+namespace pc {
+namespace {
+
+constexpr int64_t kGroupsPerPiece = 32;
+// Leaves visited before Ctrl-C is looked for: about 50 ms at 25 ns each.
+constexpr int64_t kBudget = int64_t{1} << 21;
+
+struct Task {
+  FarthestSampler sampler;
+  int64_t room;       // where its points start among those of all clouds
+  int64_t* picks;
+  int64_t wanted;
+  int64_t taken;
+};
+
+void start(Task& task, SpatialSort& sort) {
+  FarthestSampler& sampler = task.sampler;
+  sort.serial(sampler.points(), sampler.count(), task.room,
+              [&](const Placed* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+  sampler.start_leaf_groups(0, sampler.num_leaf_groups());
+  sampler.start_levels();
+}
+
+void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, SpatialSort& sort) {
+  sort.parallel(context, scratch, sampler.points(), sampler.count(),
+                [&](const Placed* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+  parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
+               [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
+  sampler.start_levels();
+}
+
+void sample(const pc_context& context, const float* points, const int64_t* ptr, int64_t num_clouds,
+            const int64_t* wanted, int64_t* picks) {
+  ScratchFrame scratch;
+  std::vector<Task> open;
+  int64_t room = 0;
+  for (int64_t cloud = 0; cloud < num_clouds; picks += wanted[cloud++]) {
+    if (wanted[cloud] == 0) continue;
+    const int64_t count = ptr[cloud + 1] - ptr[cloud];
+    open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), room, picks, wanted[cloud], 0});
+    room += count;
+  }
+  SpatialSort sort(scratch, room);
+  if (open.size() == 1)
+    start_in_parallel(context, scratch, open[0].sampler, sort);
+  else
+    parallel_for(context, static_cast<int64_t>(open.size()), 1,
+                 [&](int64_t i, int64_t, int64_t) { start(open[static_cast<size_t>(i)], sort); });
+  while (!open.empty()) {
+    parallel_for(context, static_cast<int64_t>(open.size()), 1, [&](int64_t i, int64_t, int64_t) {
+      Task& task = open[static_cast<size_t>(i)];
+      task.taken = task.sampler.advance(task.picks, task.taken, task.wanted, kBudget);
+    });
+    open.erase(std::remove_if(open.begin(), open.end(), [](const Task& t) { return t.taken == t.wanted; }), open.end());
+  }
+}
+
+}  // namespace
+}  // namespace pc
+
+// points (N, 3); ptr, (num_clouds+1,); wanted (num_clouds,), at most the points there are; picks (sum of wanted,): rows
+// within each pick's own cloud. A cloud holds less than 2^31 points.
+PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                     int64_t num_clouds, const int64_t* wanted, int64_t* picks) {
+  return pc::guarded([&] { pc::sample(*context, points, ptr, num_clouds, wanted, picks); });
+}

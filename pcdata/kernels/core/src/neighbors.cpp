@@ -1,0 +1,86 @@
+// Nearest neighbours and neighbours within a radius, exact, on ragged batches.
+#include "pc/search.hpp"
+
+namespace pc {
+namespace {
+
+// Writes neighbours ascending by (squared distance, row); missing ones are (num_points, infinity).
+struct WriteNeighbors {
+  int64_t k, num_points;
+  int64_t* index;   // (Q, k)
+  float* distance;  // (Q, k)
+  int64_t* count;   // (Q,) or null
+
+  template <class Search, class Nearest>
+  void operator()(const Search& search, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) const {
+    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      const int64_t query = row[lane];
+      int64_t found = 0;
+      for (int i = 0; i < k; ++i) {
+        const uint64_t key = nearest.key(i, lane);
+        const bool real = NearKey::id(key) != kNoId;
+        index[query * k + i] = real ? search.row(NearKey::id(key)) : num_points;
+        distance[query * k + i] = real ? std::sqrt(NearKey::squared(key)) : kInfinity;
+        found += real;
+      }
+      if (count != nullptr) count[query] = found;
+    }
+  }
+};
+
+// Writes the squared distance to the nearest point, infinity where there is none.
+struct WriteNearest {
+  float* squared;  // (Q,)
+
+  template <class Search>
+  void operator()(const Search&, const QueryGroup& group, const NearestDistances& nearest, const uint32_t* row) const {
+    alignas(64) float value[kQueries];
+    nearest.squared(0).store(value);
+    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      squared[row[lane]] = value[lane];
+    }
+  }
+};
+
+template <class Nearest>
+void find_neighbors(const pc_context& context, float limit, const Clouds& clouds, const Clouds* queries,
+                    const Grid* grid, const WriteNeighbors& task) {
+  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limit, task);
+  if (queries != nullptr)
+    search.run(clouds, *queries);
+  else
+    search.run(clouds, grid);
+}
+
+}  // namespace
+}  // namespace pc
+
+// queries null: the points; pixel null: no grid; neighbours have d2 <= limit; count may be null.
+PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                               const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
+                               const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
+                               float* distance, int64_t* count) {
+  using namespace pc;
+  return guarded([&] {
+    const Grid grid{pixel, width, camera};
+    const Clouds clouds{points, ptr, num_clouds}, from{queries, queries_ptr, num_clouds};
+    const WriteNeighbors task{k, ptr[num_clouds], index, distance, count};
+    const auto find = k <= NearestKeys::kMax ? find_neighbors<NearestKeys> : find_neighbors<NearestMany>;
+    find(*context, static_cast<float>(limit), clouds, queries == nullptr ? nullptr : &from,
+         pixel == nullptr ? nullptr : &grid, task);
+  });
+}
+
+// squared (Q,) float: from every query to the nearest point of its cloud.
+PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,
+                                     int64_t num_clouds, const float* queries, const int64_t* queries_ptr,
+                                     float* squared) {
+  using namespace pc;
+  return guarded([&] {
+    const WriteNearest task{squared};
+    BatchSearch<NearestDistances, WriteNearest>(*context, 1, kInfinity, task)
+        .run({points, ptr, num_clouds}, {queries, queries_ptr, num_clouds});
+  });
+}

@@ -1,0 +1,72 @@
+// Statistical outliers: the mean distance to the nearest neighbours, and which means are unusual for their cloud.
+//
+// Source: Rusu et al., Towards 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
+#include "pc/search.hpp"
+
+namespace pc {
+namespace {
+
+// Writes the mean distance from each query to its k nearest (fewer, in a smaller cloud), summed nearest first.
+struct MeanDistance {
+  int64_t k;
+  double* mean;  // (N,)
+
+  template <class Search, class Nearest>
+  void operator()(const Search&, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) const {
+    Doubles total(0.0), found(0.0);
+    for (int i = 0; i < k; ++i) {
+      const Floats squared = nearest.squared(i);
+      const LaneMask real = less(squared, Floats(kInfinity));
+      total = total + keep(real, square_root(widen(squared)));
+      found = found + keep(real, Doubles(1.0));
+    }
+    alignas(64) double value[kQueries];
+    (total / found).store(value);
+    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      mean[row[lane]] = value[lane];
+    }
+  }
+};
+
+// Sums run from the first row to the last, as in the reference: the mask hangs on the last bit where all means are equal.
+void mark_outliers(const double* mean, int64_t count, double std_ratio, bool* outlier) {
+  double sum = 0, spread = 0;
+  for (int64_t i = 0; i < count; ++i) sum += mean[i];
+  const double average = sum / double(count);
+  for (int64_t i = 0; i < count; ++i) {
+    const double off = mean[i] - average;
+    spread += mean[i] > 0 ? off * off : 0;
+  }
+  // NaN for one point: every comparison is then false.
+  const double threshold = average + std_ratio * std::sqrt(spread / double(count - 1));
+  for (int64_t i = 0; i < count; ++i) outlier[i] = !(mean[i] > 0 && mean[i] < threshold);
+}
+
+template <class Nearest>
+void mean_distances(const pc_context& context, const Clouds& clouds, const Grid* grid, const MeanDistance& task) {
+  BatchSearch<Nearest, MeanDistance>(context, task.k, kInfinity, task).run(clouds, grid);
+}
+
+}  // namespace
+}  // namespace pc
+
+// mean (N,) double is working space; outlier (N,) bool. pixel null: no grid.
+PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,
+                                          int64_t num_clouds, int64_t num_neighbors, double std_ratio,
+                                          const int64_t* pixel, int64_t width, const double* camera, double* mean,
+                                          bool* outlier) {
+  using namespace pc;
+  return guarded([&] {
+    const Grid grid{pixel, width, camera};
+    const Grid* organised = pixel == nullptr ? nullptr : &grid;
+    const MeanDistance task{num_neighbors, mean};
+    if (num_neighbors <= NearestDistances::kMax)
+      mean_distances<NearestDistances>(*context, {points, ptr, num_clouds}, organised, task);
+    else
+      mean_distances<NearestMany>(*context, {points, ptr, num_clouds}, organised, task);
+    parallel_for(*context, num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
+      mark_outliers(mean + ptr[b], ptr[b + 1] - ptr[b], std_ratio, outlier + ptr[b]);
+    });
+  });
+}

@@ -1,0 +1,8 @@
+"""The compiled CPU backend: importing it registers every kernel of the core beside its reference."""
+
+from __future__ import annotations
+
+from pcdata.kernels import cpu_neighbors, cpu_regions, cpu_sampling
+from pcdata.kernels.native import unavailable
+
+__all__ = ["cpu_neighbors", "cpu_regions", "cpu_sampling", "unavailable"]

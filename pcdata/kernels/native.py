@@ -1,0 +1,128 @@
+"""The compiled CPU core: finding it, choosing the instruction set, calling it.
+
+The core is a plain C library reached through ctypes, which releases the GIL during a call. It starts its own threads
+per call, ``torch.get_num_threads()`` of them, so it is safe after fork and serial inside DataLoader workers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+INTERFACE_VERSION = 1
+INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
+
+# Names an instruction set to use instead of the best one; for tests and for measuring.
+FORCE_VARIABLE = "PCDATA_INSTRUCTION_SET"
+
+_OK, _OUT_OF_MEMORY, _INTERRUPTED = 0, 1, 2
+
+_Poll = ctypes.CFUNCTYPE(ctypes.c_int32)
+
+
+class _Context(ctypes.Structure):
+    _fields_ = [("threads", ctypes.c_int32), ("poll", _Poll)]
+
+
+def unavailable() -> str | None:
+    """Return None when the core can be called, else why not and what to do."""
+    try:
+        library()
+    except OSError as error:
+        return str(error)
+    return None
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Load the best library that this processor runs.
+
+    Raises:
+        OSError: there is none, or it belongs to another version of pcdata.
+    """
+    folder = _folder()
+    baseline = ctypes.CDLL(str(folder / "libpcdata_baseline.so"))
+    best = INSTRUCTION_SETS[baseline.pc_best_instruction_set()]
+    name = os.environ.get(FORCE_VARIABLE, best)
+    if name not in INSTRUCTION_SETS or INSTRUCTION_SETS.index(name) > INSTRUCTION_SETS.index(best):
+        raise OSError(f"{FORCE_VARIABLE}={name!r}: this processor runs {', '.join(_runnable(best))}")
+    path = folder / f"libpcdata_{name}.so"
+    chosen = ctypes.CDLL(str(path)) if path.exists() else baseline
+    if chosen.pc_interface_version() != INTERFACE_VERSION:
+        raise OSError(f"{path} belongs to another version of pcdata; reinstall pcdata")
+    return chosen
+
+
+def call(function: str, *arguments: Any) -> None:
+    """Call ``function(context, *arguments)``; tensors go as pointers, ints as int64, floats as double.
+
+    Raises:
+        MemoryError: the core could not get memory.
+        KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
+    """
+    raised: list[BaseException] = []
+    polls = _polls(raised)
+    next(polls)
+    context = _Context(torch.get_num_threads(), _Poll(polls.__next__))
+    status = getattr(library(), function)(ctypes.byref(context), *map(_argument, arguments))
+    if raised:
+        raise raised[0]
+    if status == _OUT_OF_MEMORY:
+        raise MemoryError(f"{function}: out of memory")
+    if status == _INTERRUPTED:
+        raise KeyboardInterrupt
+    if status != _OK:
+        raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
+
+
+def _polls(raised: list[BaseException]) -> Iterator[int]:
+    """Yield 0 while the core may go on and 1 once a signal handler raised; its exception is kept in ``raised``.
+
+    Python runs pending handlers where a frame is entered or resumed. A generator is resumed inside its ``try``; the
+    entry of a function would lie before it, and ctypes drops what a callback raises.
+    """
+    stop = 0
+    while True:
+        try:
+            yield stop
+        except GeneratorExit:
+            return
+        except BaseException as error:
+            raised.append(error)
+            stop = 1
+
+
+def _argument(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        assert value.is_contiguous() and value.device.type == "cpu"
+        return ctypes.c_void_p(value.data_ptr())
+    if isinstance(value, float):
+        return ctypes.c_double(value)
+    if value is None:
+        return ctypes.c_void_p(None)
+    return ctypes.c_int64(int(value))
+
+
+def _folder() -> Path:
+    """Find the libraries beside this file, or, for an editable install, beside the other installed packages."""
+    beside = Path(__file__).parent / "_core"
+    candidates = [beside, *(Path(entry) / "pcdata" / "kernels" / "_core" for entry in sys.path if entry)]
+    for folder in candidates:
+        if (folder / "libpcdata_baseline.so").exists():
+            return folder
+    raise OSError(
+        "the compiled core is not installed (no C++ compiler was found when pcdata was installed); install one "
+        "(on Debian or Ubuntu: apt-get install g++) and reinstall pcdata"
+    )
+
+
+def _runnable(best: str) -> tuple[str, ...]:
+    return INSTRUCTION_SETS[: INSTRUCTION_SETS.index(best) + 1]

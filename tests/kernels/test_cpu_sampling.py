@@ -1,0 +1,344 @@
+"""The compiled sampling kernels give the reference's results bit for bit: any cloud, thread count, instruction set."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pcdata.dispatch import why_unavailable
+from pcdata.functional.depth import deproject_depth
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.sampling import farthest_point_sample
+from pcdata.functional.voxels import find_voxel_size, voxel_downsample
+from pcdata.kernels import native
+
+REASON = why_unavailable("cpu")
+pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
+
+few = settings(max_examples=40, deadline=None)
+
+
+@pytest.fixture(params=[(1, None), (7, None), *((2, name) for name in native.INSTRUCTION_SETS)], ids=str)
+def machine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A number of threads, and the library of one instruction set (None: the best)."""
+    threads, name = request.param
+    if name is not None:
+        folder = native._folder()
+        best = ctypes.CDLL(str(folder / "libpcdata_baseline.so")).pc_best_instruction_set()
+        path = folder / f"libpcdata_{name}.so"
+        if native.INSTRUCTION_SETS.index(name) > best or not path.exists():
+            pytest.skip(f"this processor does not run {name}")
+        library = ctypes.CDLL(str(path))
+        monkeypatch.setattr(native, "library", lambda: library)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    yield
+    torch.set_num_threads(before)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def organised(rows: int, columns: int) -> Tensor:
+    """A tilted table with a ball on it and millimetre depth, in scan order."""
+    v, u = torch.meshgrid(torch.arange(rows) / rows, torch.arange(columns) / columns, indexing="ij")
+    ball = (0.04 - (u - 0.5) ** 2 - (v - 0.5) ** 2).clamp(min=0).sqrt()
+    z = ((0.8 - 0.2 * v - ball) * 1000).round() / 1000
+    return torch.stack([(u - 0.5) * z, (v - 0.5) * z, z], dim=-1).reshape(-1, 3)
+
+
+def line(count: int) -> Tensor:
+    return torch.arange(float(count))[:, None] * torch.tensor([1.0, 2.0, -1.0])
+
+
+# name -> points and points per cloud
+CLOUDS: dict[str, tuple[Tensor, list[int]]] = {
+    "organised": (organised(60, 80), [4800]),
+    "shuffled": (organised(60, 80)[torch.randperm(4800, generator=torch.Generator().manual_seed(0))], [4800]),
+    "duplicates": (torch.randint(3, (500, 3), generator=torch.Generator().manual_seed(0)).float(), [500]),
+    "all the same": (torch.ones(100, 3), [100]),
+    "collinear": (line(300), [300]),
+    "a kilometre in millimetres": (random(900, 3) * 1e6, [900]),
+    "a million metres": (torch.cat([random(500, 3), torch.tensor([[1e6, -1e6, 1e6]])]), [501]),
+    "beyond the square root of float32": (random(300, 3) * 1e30, [300]),
+    "so small that squares vanish": (random(300, 3) * 1e-24, [300]),
+    "signed zeros": (torch.tensor([[0.0, -0.0, 0.0], [-0.0, 0.0, -0.0], [1.0, -0.0, 0.0]]), [3]),
+    "one point": (torch.tensor([[1.0, 2.0, 3.0]]), [1]),
+    "ragged": (random(1500, 3), [0, 700, 1, 0, 33, 766, 0]),
+    "large": (organised(500, 600), [300_000]),
+    "large and small": (torch.cat([random(5, 3), organised(400, 500), random(40, 3)]), [5, 200_000, 40]),
+    "empty": (torch.empty(0, 3), [0]),
+}
+
+
+def outcome(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """The result, or the error's type and text: kernels must raise what the reference raises."""
+    try:
+        return function(*args, **kwargs)
+    except Exception as error:
+        return type(error), str(error)
+
+
+def assert_equal_to_reference(function: Callable[..., Any], *args: Any, **kwargs: Any) -> None:
+    ours = outcome(function, *args, **kwargs, backend="cpu")
+    reference = outcome(function, *args, **kwargs, backend="torch")
+    assert_same(ours, reference)
+
+
+def assert_same(ours: Any, reference: Any) -> None:
+    if isinstance(reference, Tensor):
+        assert isinstance(ours, Tensor), ours
+        assert ours.dtype == reference.dtype
+        assert torch.equal(ours, reference)
+    elif isinstance(reference, tuple):
+        assert len(ours) == len(reference)
+        for one, other in zip(ours, reference):
+            assert_same(one, other)
+    else:
+        assert ours == reference
+
+
+def extent_of(points: Tensor) -> float:
+    return float((points.double().amax(0) - points.double().amin(0)).max()) if len(points) else 1.0
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_farthest_points_equal_the_reference(name, machine):
+    points, counts = CLOUDS[name]
+    wanted = [count if count <= 900 else 60 for count in counts]
+    assert_equal_to_reference(farthest_point_sample, points, ptr_from_counts(counts), num_samples=wanted)
+
+
+@few
+@given(
+    st.lists(st.integers(0, 90), min_size=1, max_size=4),
+    st.integers(0, 999),
+    st.sampled_from([1, 2, 5, 50, 10**6]),
+    st.sampled_from([1e-30, 1e-3, 1.0, 1e6]),
+)
+def test_farthest_points_of_small_clouds_equal_the_reference(counts, seed, levels, scale):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randint(levels, (sum(counts), 3), generator=generator).float() * scale
+    assert_equal_to_reference(farthest_point_sample, points, ptr_from_counts(counts), num_samples=counts)
+
+
+def test_farthest_points_of_none_or_too_few():
+    points, ptr = random(10, 3), ptr_from_counts([4, 6])
+    for wanted in (0, [0, 3], [5, 1], -1, [1]):
+        assert_equal_to_reference(farthest_point_sample, points, ptr, num_samples=wanted)
+
+
+def test_many_farthest_points_of_a_large_cloud_equal_the_reference():
+    points = organised(150, 200)
+    assert_equal_to_reference(farthest_point_sample, points, num_samples=3000)
+
+
+def test_a_dense_spot_far_from_the_rest_is_sampled_exactly():
+    # Every level of the spatial sort sees two clusters: the recursion is as deep as float32 allows.
+    points = torch.cat([random(400, 3, seed=k) * 2.0**-k for k in range(0, 100, 4)])
+    assert_equal_to_reference(farthest_point_sample, points, num_samples=200)
+
+
+def test_ctrl_c_stops_farthest_point_sampling_within_a_second():
+    if threading.current_thread() is not threading.main_thread():
+        pytest.skip("signals reach the main thread only")
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    points = random(400_000, 3)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        started = time.perf_counter()
+        with pytest.raises(KeyboardInterrupt):
+            farthest_point_sample(points, num_samples=400_000, backend="cpu")
+        assert time.perf_counter() - started < 1.2
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("cells_per_extent", [0.5, 7.0, 300.0, 1e7, 1e17])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_voxels_equal_the_reference(name, cells_per_extent, machine):
+    points, counts = CLOUDS[name]
+    size = (extent_of(points) or 1.0) / cells_per_extent
+    assert_equal_to_reference(voxel_downsample, points, ptr_from_counts(counts), voxel_size=size)
+
+
+@few
+@given(
+    st.lists(st.integers(0, 60), min_size=1, max_size=4),
+    st.integers(0, 999),
+    st.sampled_from([1e-3, 0.3, 1.0, 1e9]),
+    st.sampled_from([1e-6, 1e-3, 1.0, 1e6]),
+)
+def test_voxels_of_small_clouds_with_a_size_each_equal_the_reference(counts, seed, relative, scale):
+    points = random(sum(counts), 3, seed=seed) * scale
+    sizes = [scale * relative * (1 + cloud) for cloud in range(len(counts))]
+    assert_equal_to_reference(voxel_downsample, points, ptr_from_counts(counts), voxel_size=sizes)
+
+
+def test_points_on_voxel_borders_fall_where_the_reference_puts_them():
+    axis = torch.arange(40.0) * 0.1
+    points = torch.cartesian_prod(axis, axis, axis)
+    for size in (0.1, 0.2, 0.05, 1 / 3):
+        assert_equal_to_reference(voxel_downsample, points, voxel_size=size)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_the_voxel_size_found_equals_the_reference(name):
+    points, counts = CLOUDS[name]
+    if max(counts) > 10_000:
+        points, counts = points[:10_000], [10_000]
+    for num_points in (1, 3, 200):
+        assert_equal_to_reference(find_voxel_size, points, ptr_from_counts(counts), num_points=num_points)
+    assert_equal_to_reference(find_voxel_size, points, ptr_from_counts(counts), num_points=0)
+
+
+def assert_planes_equal_to_reference(points: Tensor, ptr: Tensor | None, **arguments: Any) -> None:
+    """Masks are identical; least squares agree to float64 rounding, since the order of the sums is free."""
+    ours = outcome(ransac_plane, points, ptr, **arguments, backend="cpu")
+    reference = outcome(ransac_plane, points, ptr, **arguments, backend="torch")
+    if not isinstance(reference[0], Tensor):
+        assert ours == reference
+        return
+    assert torch.equal(ours[1], reference[1])
+    scale = float(points.abs().max()) or 1.0
+    assert torch.allclose(ours[0][:, :3], reference[0][:, :3], rtol=0, atol=1e-9)
+    assert torch.allclose(ours[0][:, 3], reference[0][:, 3], rtol=0, atol=1e-9 * scale)
+
+
+@pytest.mark.parametrize("relative_distance", [1e-5, 0.01])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_planes_equal_the_reference(name, relative_distance, machine):
+    points, counts = CLOUDS[name]
+    distance = max((extent_of(points) or 1.0) * relative_distance, 1e-21)
+    assert_planes_equal_to_reference(points, ptr_from_counts(counts), distance=distance, num_hypotheses=50, seed=3)
+
+
+@few
+@given(st.integers(3, 80), st.integers(0, 999), st.sampled_from([1, 3, 16, 37]), st.sampled_from([1e-3, 1.0, 1e6]))
+def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses, scale):
+    points = random(count, 3, seed=seed) * torch.tensor([1.0, 1.0, 0.02]) * scale
+    assert_planes_equal_to_reference(
+        points, None, distance=0.03 * scale, num_hypotheses=num_hypotheses, seed=seed, up=(0, 0.1, 1), max_tilt=0.5
+    )
+
+
+def test_inlier_counts_equal_the_reference():
+    from pcdata.functional import planes
+    from pcdata.kernels import cpu_sampling
+
+    points = organised(100, 101)
+    hypotheses = planes._draw_planes(points, 77, 0)
+    ours, reference = (
+        count(points, hypotheses, 0.004) for count in (cpu_sampling._count_inliers, planes._count_inliers)
+    )
+    assert torch.equal(ours, reference)
+
+
+def test_the_plane_is_the_same_bits_for_any_thread_count():
+    points = organised(300, 400)
+    before = torch.get_num_threads()
+    found = []
+    for count in (1, 2, 7):
+        torch.set_num_threads(count)
+        found.append(ransac_plane(points, num_hypotheses=30, backend="cpu")[0])
+    torch.set_num_threads(before)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
+def depth_images(views: int, height: int, width: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    depth = torch.rand((views, height, width), generator=generator) + 0.3
+    return torch.where(torch.rand(depth.shape, generator=generator) < 0.3, 0.0, depth)
+
+
+def camera(views: int, width: int, height: int, skew: float = 0.0, dtype: torch.dtype = torch.float64) -> Tensor:
+    one = torch.tensor([[0.9 * width, skew, width / 2 - 0.3], [0, 0.8 * width, height / 2 + 0.7], [0, 0, 1]])
+    return (one.double() + torch.arange(views)[:, None, None] * torch.tensor([[3.0, 0, 1], [0, 2, 1], [0, 0, 0]])).to(
+        dtype
+    )
+
+
+LENSES = {
+    "none": None,
+    "4": [0.1, -0.02, 0.001, -0.002],
+    "8": [0.1, -0.02, 0.001, -0.002, 0.003, 0.01, 0.002, 0.001],
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("skew", [0.0, 0.7])
+@pytest.mark.parametrize("size", [(1, 1), (33, 47), (120, 160)])
+def test_deprojection_equals_the_reference(lens, skew, size, machine):
+    coefficients = LENSES[lens]
+    distortion = None if coefficients is None else torch.tensor([coefficients, coefficients])
+    for dtype in (torch.float32, torch.float64):
+        intrinsics = camera(2, size[1], size[0], skew, dtype)
+        assert_equal_to_reference(deproject_depth, depth_images(2, *size), intrinsics, distortion=distortion)
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [
+        torch.zeros(2, 5, 6),
+        torch.ones(2, 5, 6),
+        torch.ones(2, 0, 6),
+        torch.ones(2, 5, 0),
+        -torch.ones(2, 5, 6),
+        torch.full((2, 5, 6), math.nan),
+        torch.full((2, 5, 6), 1e-45),
+        torch.full((2, 5, 6), -0.0),
+        depth_images(2, 12, 10)[:, ::2].transpose(1, 2),
+    ],
+    ids=["nothing", "full", "no rows", "no columns", "negative", "NaN", "denormal", "minus zero", "strided"],
+)
+def test_unusual_depth_images_give_what_the_reference_gives(depth):
+    assert_equal_to_reference(deproject_depth, depth, camera(2, 6, 5))
+
+
+def test_impossible_cameras_raise_what_the_reference_raises():
+    depth = depth_images(1, 40, 50)
+    for intrinsics in (-camera(1, 50, 40), camera(1, 50, 40).mT.contiguous(), camera(1, 50, 40) * 0):
+        assert_equal_to_reference(deproject_depth, depth, intrinsics)
+    folding = torch.tensor([[-2.0, 0.5, 0.0, 0.0]])
+    assert_equal_to_reference(
+        deproject_depth, depth, camera(1, 50, 40) * torch.tensor([0.2, 1.0, 1.0]), distortion=folding
+    )
+
+
+@pytest.fixture(scope="module")
+def frame(test_data: Path) -> tuple[Tensor, Tensor]:
+    """Depth (1, H, W) metres and intrinsics of a real frame."""
+    depth = np.array(pytest.importorskip("PIL.Image").open(test_data / "graspnet_frame/depth.png"))
+    meta = pytest.importorskip("scipy.io").loadmat(test_data / "graspnet_frame/meta.mat")
+    metres = torch.from_numpy(depth.astype(np.float32) / 1000)[None]
+    return metres, torch.from_numpy(meta["intrinsic_matrix"].astype(np.float64))[None]
+
+
+def test_a_real_frame_gives_the_references_results(frame, machine):
+    assert_equal_to_reference(deproject_depth, *frame)
+    points, _, _ = deproject_depth(*frame)
+    assert_equal_to_reference(farthest_point_sample, points, num_samples=64)
+    assert_equal_to_reference(farthest_point_sample, points[::40], num_samples=2000)
+    assert_equal_to_reference(voxel_downsample, points, voxel_size=0.003)
+    assert_planes_equal_to_reference(points, None, num_hypotheses=40)
