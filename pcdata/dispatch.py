@@ -2,8 +2,8 @@
 
 ``@op`` marks the public function: its own body is the reference, plain torch on any device. ``@kernel`` registers a
 faster body beside it under a backend name; it receives arguments that already passed the contract, and must give the
-same result. ``backend="auto"`` takes the fastest live backend for the device; naming an absent one raises with the
-reason.
+same result. ``backend="auto"`` takes the fastest live backend for the device, and the reference where a gradient is
+wanted; naming an absent backend raises with the reason.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
@@ -77,6 +77,8 @@ def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             check_tensors(name, arguments, ordered)
             backend = arguments.pop("backend", "auto")
             device = next(arguments[key].device for key in ordered if isinstance(arguments.get(key), Tensor))
+            if backend == "auto" and _wants_gradient(arguments.values()):
+                backend = REFERENCE  # kernels know no derivative
             body = _choose(operation, backend, device)
             return body(**arguments)
 
@@ -122,6 +124,10 @@ def _fill_row_pointers(arguments: dict[str, Any], specs: dict[str, str]) -> None
         if spec.is_ptr and arguments.get(key) is None and spec.dims[0] in rows_of:
             rows = rows_of[spec.dims[0]]
             arguments[key] = torch.tensor([0, rows.shape[0]], device=rows.device)
+
+
+def _wants_gradient(arguments: Iterable[Any]) -> bool:
+    return torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in arguments)
 
 
 def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:

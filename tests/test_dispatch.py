@@ -129,3 +129,13 @@ def test_every_backend_can_be_named(shift):
 def test_every_real_backend_is_live_or_says_what_to_do(name):
     reason = dispatch.why_unavailable(name)
     assert reason is None or len(reason.split()) > 3
+
+
+def test_a_wanted_gradient_is_computed_by_the_reference():
+    from pcdata.functional import chamfer_distance
+
+    points = torch.rand(40, 3, requires_grad=True)
+    target = torch.rand(30, 3)
+    chamfer_distance(points, None, target, None).sum().backward()
+    assert points.grad is not None
+    assert bool((points.grad != 0).any())

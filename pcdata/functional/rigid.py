@@ -106,7 +106,7 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
             raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
 
 
-def is_rigid(matrix: Tensor, *, tolerance: float = 1e-9) -> bool:
+def is_rigid(matrix: Tensor, *, tolerance: float = 1e-5) -> bool:
     """Say whether all (..., 4, 4) matrices are rotations and translations, or mirrors: they keep every distance."""
     linear = matrix[..., :3, :3].double()
     identity = torch.eye(3, dtype=torch.float64, device=matrix.device)

@@ -139,5 +139,5 @@ def _nearest_per_query(
     index = torch.full((num_queries, max_neighbors), num_points)
     distance = torch.full((num_queries, max_neighbors), torch.inf)
     index[query[kept], place[kept]] = row[kept]
-    distance[query[kept], place[kept]] = squared[kept].sqrt()
+    distance[query[kept], place[kept]] = squared[kept].double().sqrt().float()
     return index, distance, found.clamp(max=max_neighbors)

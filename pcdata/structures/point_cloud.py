@@ -258,11 +258,12 @@ class PointCloud:
         if viewpoint is not None:
             per_cloud = torch.arange(self.num_clouds + 1, device=self.device)
             viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
+        source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
         return self._rebuilt(
             moved,
-            layout=self.layout if self.layout is not None and rigid.is_rigid(matrix) else None,
+            layout=self.layout if self.layout is not None and rigid.is_rigid(source_from_cloud) else None,
             viewpoint=viewpoint,
-            source_from_cloud=self.source_from_cloud @ torch.linalg.inv(matrix),
+            source_from_cloud=source_from_cloud,
             frame_id=self.frame_id if frame_id is None else frame_id,
             unit=self.unit if unit is None else unit,
         )

@@ -29,7 +29,7 @@ def brute_force(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tenso
                 limit = torch.tensor(radius) * torch.tensor(radius)
                 order = [i for i in order if squared[i] < limit]
             for j, i in enumerate(order[:k]):
-                index[q, j], distance[q, j] = rows[i], squared[i].sqrt()
+                index[q, j], distance[q, j] = rows[i], squared[i].double().sqrt().float()
     return index, distance
 
 
