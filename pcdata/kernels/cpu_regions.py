@@ -54,8 +54,6 @@ def dbscan(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: Image
     label = torch.empty(len(points), dtype=torch.int64)
     largest = torch.zeros(1, dtype=torch.float64)
     enough = min(min_points, len(points) + 1)
-    native.call(
-        "pc_dbscan", points.contiguous(), ptr.contiguous(), len(ptr) - 1, float(eps), enough, label, largest
-    )
+    native.call("pc_dbscan", points.contiguous(), ptr.contiguous(), len(ptr) - 1, float(eps), enough, label, largest)
     require_cells("dbscan", eps, largest.item())
     return label

@@ -120,9 +120,10 @@ def assert_normals(
     assert torch.equal(ours[~planar], ours.new_tensor([[0.0, 0, 1]]).expand(int((~planar).sum()), 3))
     torch.testing.assert_close(ours.norm(dim=1), torch.ones(len(ours), dtype=torch.float64), rtol=0, atol=1e-6)
     values = torch.linalg.eigvalsh(covariance[planar])
-    along = torch.einsum("ni,nij,nj->n", ours[planar], covariance[planar], ours[planar])
+    unit = torch.nn.functional.normalize(ours[planar])  # float32 normals are unit to 1e-7 only
+    along = torch.einsum("ni,nij,nj->n", unit, covariance[planar], unit)
     size = covariance[planar].diagonal(dim1=1, dim2=2).sum(1)
-    # The reference centres its sums on the query, the check on the mean: they differ by roundings of whole sums.
+    # The kernel centres its sums on the query, this check on the mean: they differ by roundings of whole sums.
     assert bool((along - values[:, 0] <= 1e-9 * size).all())
     distinct = values[:, 1] - values[:, 0] > 1e-3 * size
     clear_sign = ours[planar][:, 2] > 1e-6
@@ -132,7 +133,7 @@ def assert_normals(
     assert bool((torch.minimum(same.abs().amax(1), flipped.abs().amax(1))[distinct] <= 1e-6).all())
 
 
-def depth_image(height: int = 60, width: int = 90, seed: int = 0, holes: float = 0.2) -> tuple[Tensor, ImageGrid]:
+def depth_image(height: int = 44, width: int = 66, seed: int = 0, holes: float = 0.2) -> tuple[Tensor, ImageGrid]:
     """A back-projected image of two noisy planes in whole millimetres: an edge, a thin pole, strays and holes."""
     generator = np.random.default_rng(seed)
     v, u = np.mgrid[:height, :width]
@@ -154,10 +155,9 @@ def rotation(seed: int = 0) -> Tensor:
 
 def assert_all_equal(points: Tensor, ptr: Tensor | None = None, *, grid: ImageGrid) -> None:
     """Every operation gives with the grid what its reference gives."""
-    for k in (1, 7, 20, 60):
+    for k in (1, 20, 49):
         assert_neighbors(points, ptr, k=k, grid=grid)
-    for k in (20, 7):
-        assert_masks(points, ptr, k=k, grid=grid)
+    assert_masks(points, ptr, k=20, grid=grid)
     assert_balls(points, ptr, radius=0.02, k=12, grid=grid)
     assert_normals(points, ptr, radius=0.03, k=30, grid=grid)
 
@@ -199,9 +199,9 @@ def test_a_ragged_batch_equals_the_reference(instruction_set: str):
 
 
 def test_clouds_large_enough_to_sort_in_parallel_equal_the_reference():
-    points = torch.cat([random_cloud(40_000), torch.zeros(500, 3), 1e-3 * random_cloud(40_000, 1), random_cloud(9, 2) * 1e6])
-    assert_neighbors(points, k=8)
-    assert_neighbors(points, torch.tensor([0, 40_000, 40_003, len(points)]), k=8)
+    points = torch.cat([random_cloud(33_000, spread=1e-3), torch.zeros(500, 3), random_cloud(9, 2, spread=1e6)])
+    assert_neighbors(points, k=4)
+    assert_neighbors(points, torch.tensor([0, 32_900, 32_903, len(points)]), k=4)
 
 
 @pytest.mark.parametrize("spread", [0.5, 3.0, 1e5])
@@ -398,7 +398,7 @@ def frame(folder: Path) -> tuple[Tensor, ImageGrid]:
 def test_part_of_a_real_frame_equals_the_reference(test_data: Path):
     points, grid = frame(test_data)
     v, u = grid.pixel_index // grid.size[1], grid.pixel_index % grid.size[1]
-    part = (v > 250) & (v < 420) & (u > 500) & (u < 760)
+    part = (v > 250) & (v < 350) & (u > 500) & (u < 700)
     points, grid = points[part], replace(grid, pixel_index=grid.pixel_index[part])
     for with_grid in (None, grid):
         assert_neighbors(points, k=20, grid=with_grid)

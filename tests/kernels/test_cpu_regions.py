@@ -159,12 +159,9 @@ def test_too_many_cells_is_the_error_of_the_reference():
     points = torch.tensor([[0.0, 0, 0], [1e6, 0, 0]])
     messages = []
     for name in ("cpu", "torch"):
-        for call in (
-            lambda: radius_outlier_mask(points, radius=1e-7, backend=name),
-            lambda: dbscan(points, eps=1e-7, backend=name),
-        ):
+        for function, length in ((radius_outlier_mask, "radius"), (dbscan, "eps")):
             with pytest.raises(ConfigError, match="same unit") as caught:
-                call()
+                function(points, **{length: 1e-7}, backend=name)
             messages.append(str(caught.value))
     assert messages[:2] == messages[2:]
 
@@ -241,8 +238,8 @@ import torch
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.outliers import radius_outlier_mask
 generator = torch.Generator().manual_seed(0)
-for spread in (0.02, 0.1, 0.5, 1e5):
-    points = torch.randn(40_000, 3, generator=generator) * spread
+for spread in (0.02, 0.3, 1e5):
+    points = torch.randn(12_000, 3, generator=generator) * spread
     for ordered in (points, points[points[:, 0].argsort()]):
         masks = [radius_outlier_mask(ordered, radius=0.02, backend=name) for name in ("cpu", "torch")]
         assert torch.equal(*masks), spread
