@@ -21,6 +21,7 @@ def shift(monkeypatch):
     absent.unavailable = lambda: "no compiler was found; run: install compiler"
     monkeypatch.setitem(sys.modules, "absent_kernels", absent)
     monkeypatch.setattr(dispatch, "BACKEND_MODULES", {"fast": "fast_kernels", "absent": "absent_kernels"})
+    monkeypatch.setattr(dispatch, "AUTO_ORDER", {"cpu": ("torch",)})
     dispatch.why_unavailable.cache_clear()
 
     @dispatch.op(ptr="ptr N B", points="N 3", queries="Q 3", queries_ptr="ptr Q B")
