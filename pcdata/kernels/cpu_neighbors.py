@@ -64,9 +64,7 @@ def ball_query(
 
 @kernel("chamfer_distance", "cpu")
 @torch.no_grad()
-def chamfer_distance(
-    *, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool
-) -> Tensor:
+def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
     """Run the reference's contract in the core, without gradients."""
     require_points(ptr_a, ptr_b)
     forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata import functional as F  # noqa: N812
+from pcdata import functional as F
 from pcdata.dispatch import OPERATIONS, why_unavailable
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.grid import ImageGrid
