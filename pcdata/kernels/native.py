@@ -102,7 +102,8 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
 
 def _argument(value: Any) -> Any:
     if isinstance(value, Tensor):
-        assert value.is_contiguous() and value.device.type == "cpu"
+        assert value.is_contiguous()
+        assert value.device.type == "cpu"
         return ctypes.c_void_p(value.data_ptr())
     if isinstance(value, float):
         return ctypes.c_double(value)
