@@ -108,7 +108,7 @@ def test_every_number_of_threads_gives_one_answer(threads: int):
 
 
 def test_a_ragged_batch_of_large_small_and_empty_clouds_equals_the_reference():
-    counts = [0, 40_000, 1, 0, 700, 2, 33_000, 0]
+    counts = [0, 33_000, 1, 0, 700, 2, 300, 0]
     points = torch.cat([normal(count, seed, 0.2 if seed % 2 else 0.02) for seed, count in enumerate(counts)])
     assert_same(points, ptr_from_counts(counts), radius=0.03, count=6)
 
@@ -222,12 +222,12 @@ def test_any_small_batch_equals_the_reference(
 
 def test_the_real_frame_equals_the_reference(test_data: Path):
     image = pytest.importorskip("PIL.Image")
-    depth = np.asarray(image.open(test_data / "graspnet_frame" / "depth.png")).astype(np.float32)[::4, ::4] / 1000
+    depth = np.asarray(image.open(test_data / "graspnet_frame" / "depth.png")).astype(np.float32)[::6, ::6] / 1000
     v, u = np.nonzero(depth)
     z = depth[v, u]
-    points = torch.from_numpy(np.column_stack([(u - 160) * z / 158, (v - 90) * z / 158, z]).astype(np.float32))
-    intrinsics = torch.tensor([[[158.0, 0, 160], [0, 158.0, 90], [0, 0, 1]]])
-    grid = ImageGrid(torch.from_numpy(v * 320 + u), (180, 320), intrinsics)
+    points = torch.from_numpy(np.column_stack([(u - 107) * z / 105, (v - 60) * z / 105, z]).astype(np.float32))
+    intrinsics = torch.tensor([[[105.0, 0, 107], [0, 105.0, 60], [0, 0, 1]]])
+    grid = ImageGrid(torch.from_numpy(v * 214 + u), (120, 214), intrinsics)
     assert_same(points, radius=0.01, count=20, grid=grid)
     shuffled = points[torch.from_numpy(np.random.default_rng(0).permutation(len(points)))]
     assert_same(shuffled, radius=0.01, count=20)

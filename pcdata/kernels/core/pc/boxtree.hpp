@@ -67,13 +67,6 @@ class LeafBuilder {
     sort(scratch.take<uint64_t>(count));
     all_ = fill(ptr_);
   }
-  // With the rows (as keys) already in an order that keeps neighbours together.
-  LeafBuilder(const pc_context& context, ScratchFrame& scratch, const float* points, const int64_t* ptr,
-              int64_t num_clouds, uint64_t* keys)
-      : context_(context), scratch_(scratch), points_(points), ptr_(ptr), num_clouds_(num_clouds),
-        keys_(keys) {
-    all_ = fill(ptr_);
-  }
 
   // Every row, copies included.
   const Leaves& all() const { return all_; }

@@ -19,7 +19,7 @@ namespace pc {
 class FarthestSampler {
  public:
   static constexpr int kLeaf = 32;  // two AVX-512 registers; 20 bytes a point, and 1.2 more for the nodes
-  static constexpr int kFan = kLanes;  // children tested at once
+  static constexpr int kFan = 16;   // children tested at once
 
   FarthestSampler(ScratchFrame& scratch, const float* points, int64_t count)
       : points_(points), count_(count), num_leaves_((count + kLeaf - 1) / kLeaf) {
@@ -113,20 +113,22 @@ class FarthestSampler {
 
     // Take note of a pick; return the key of the leaf's farthest point.
     int64_t update(const Pick& pick) {
-      Int16 far{};
+      IntLanes far{};
       for (int i = 0; i < kLeaf; i += kLanes) {
-        const Float16 squared =
-            squared_distance(load<Float16>(x + i), load<Float16>(y + i), load<Float16>(z + i), pick.x, pick.y, pick.z);
+        const FloatLanes squared =
+            squared_distance(load<FloatLanes>(x + i), load<FloatLanes>(y + i), load<FloatLanes>(z + i),  //
+                             pick.x, pick.y, pick.z);
         // Distances are not negative, so their bits compare as they do.
-        Int16 now = least(reinterpret_cast<Int16>(squared), load<Int16>(nearest + i));
-        now = load<Uint16>(row + i) == pick.row ? Int16{} + kTaken : now;
+        IntLanes now = least(reinterpret_cast<IntLanes>(squared), load<IntLanes>(nearest + i));
+        now = load<UintLanes>(row + i) == pick.row ? IntLanes{} + kTaken : now;
         store(nearest + i, now);
         far = i == 0 ? now : greatest(far, now);
       }
       const int32_t farthest = highest_lane<int32_t>(far);
-      Uint16 rows = Uint16{} + UINT32_MAX;
+      const UintLanes none = UintLanes{} + UINT32_MAX;
+      UintLanes rows = none;
       for (int i = 0; i < kLeaf; i += kLanes)
-        rows = least(rows, load<Int16>(nearest + i) == farthest ? load<Uint16>(row + i) : Uint16{} + UINT32_MAX);
+        rows = least(rows, load<IntLanes>(nearest + i) == farthest ? load<UintLanes>(row + i) : none);
       return int64_t{farthest} * (int64_t{1} << 32) + static_cast<uint32_t>(~lowest_lane<uint32_t>(rows));
     }
   };
@@ -157,21 +159,27 @@ class FarthestSampler {
       }
       set_key(child, below.farthest());
     }
-    int64_t farthest() const { return highest_lane<int64_t>(greatest(load<Long8>(key), load<Long8>(key + kFan / 2))); }
+    int64_t farthest() const {
+      auto best = load<LongLanes>(key);
+      for (int i = kLanes / 2; i < kFan; i += kLanes / 2) best = greatest(load<LongLanes>(key + i), best);
+      return highest_lane<int64_t>(best);
+    }
 
     // The children that a pick may change, as a bit mask: boxes nearer than their farthest point. Once only duplicates
     // of picks are left, a pick changes nothing but itself.
     uint32_t reached(const Pick& pick) const {
       if (pick.key >> 32 == 0) return holding(pick);
-      const Float16 dx = gap(0, pick.x), dy = gap(1, pick.y), dz = gap(2, pick.z);
-      return bits_of_lanes(((dx * dx) + (dy * dy)) + (dz * dz) < load<Float16>(bound));
+      uint32_t mask = 0;
+      for (int i = 0; i < kFan; i += kLanes) {
+        const FloatLanes dx = gap(0, i, pick.x), dy = gap(1, i, pick.y), dz = gap(2, i, pick.z);
+        mask |= bits_of_lanes(((dx * dx) + (dy * dy)) + (dz * dz) < load<FloatLanes>(bound + i)) << i;
+      }
+      return mask;
     }
-    uint32_t holding(const Pick& pick) const {
-      return 1u << (std::find(key, key + kFan, pick.key) - key);
-    }
-    Float16 gap(int axis, float at) const {
-      const Float16 outside = greatest(load<Float16>(low[axis]) - at, at - load<Float16>(high[axis]));
-      return greatest(outside, Float16{});
+    uint32_t holding(const Pick& pick) const { return 1u << (std::find(key, key + kFan, pick.key) - key); }
+    FloatLanes gap(int axis, int i, float at) const {
+      const FloatLanes outside = greatest(load<FloatLanes>(low[axis] + i) - at, at - load<FloatLanes>(high[axis] + i));
+      return greatest(outside, FloatLanes{});
     }
   };
 

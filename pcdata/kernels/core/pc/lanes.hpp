@@ -1,11 +1,12 @@
-// Sixteen numbers handled as one, with the compilers' vector extension: one AVX-512 register, two of AVX2, four of SSE.
-// For short loops with reductions, which compilers do not vectorise reliably.
+// As many numbers as a register holds, handled as one, with the compilers' vector extension: 16 with AVX-512, 8
+// with AVX2, 4 with SSE2. For short loops with reductions, which compilers do not vectorise reliably. (Wider than a register,
+// GCC takes conditionals apart into single numbers.)
 #pragma once
 
 #include "pc/common.hpp"
 #include "pc/geometry.hpp"
 
-#if defined(__AVX512DQ__) || defined(__AVX2__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
@@ -14,13 +15,18 @@
 
 namespace pc {
 
+#if defined(__AVX512DQ__)
 constexpr int kLanes = 16;
+#elif defined(__AVX2__)
+constexpr int kLanes = 8;
+#else
+constexpr int kLanes = 4;
+#endif
 
-typedef float Float16 __attribute__((vector_size(64)));
-typedef int32_t Int16 __attribute__((vector_size(64)));
-typedef uint32_t Uint16 __attribute__((vector_size(64)));
-typedef int64_t Long8 __attribute__((vector_size(64)));
-typedef double Double8 __attribute__((vector_size(64)));
+typedef float FloatLanes __attribute__((vector_size(4 * kLanes)));
+typedef int32_t IntLanes __attribute__((vector_size(4 * kLanes)));
+typedef uint32_t UintLanes __attribute__((vector_size(4 * kLanes)));
+typedef int64_t LongLanes __attribute__((vector_size(4 * kLanes)));  // half as many
 
 template <class Lanes, class T>
 inline Lanes load(const T* from) {
@@ -43,25 +49,25 @@ inline Lanes greatest(const Lanes& a, const Lanes& b) {
 }
 
 // As for single points: the same operations in the same order.
-inline Float16 squared_distance(const Float16& ax, const Float16& ay, const Float16& az, float bx, float by, float bz) {
-  const Float16 dx = ax - bx, dy = ay - by, dz = az - bz;
+inline FloatLanes squared_distance(const FloatLanes& ax, const FloatLanes& ay, const FloatLanes& az, float bx, float by,
+                                   float bz) {
+  const FloatLanes dx = ax - bx, dy = ay - by, dz = az - bz;
   return ((dx * dx) + (dy * dy)) + (dz * dz);
 }
 
-// Combine all lanes into one by halving: 64 bytes, 32, 16, then the elements.
+// Combine all lanes into one, halving while there are more than 16 bytes.
 template <class T, class Lanes, class Op>
-inline T reduce(const Lanes& lanes, Op op) {
-  typedef T Half __attribute__((vector_size(32)));
-  typedef T Quarter __attribute__((vector_size(16)));
-  Half halves[2];
-  std::memcpy(halves, &lanes, sizeof halves);
-  const Half half = op(halves[0], halves[1]);
-  Quarter quarters[2];
-  std::memcpy(quarters, &half, sizeof quarters);
-  const Quarter quarter = op(quarters[0], quarters[1]);
-  T result = quarter[0];
-  for (size_t i = 1; i < sizeof(Quarter) / sizeof(T); ++i) result = op(result, quarter[i]);
-  return result;
+inline T reduce(const Lanes& lanes, const Op& op) {
+  if constexpr (sizeof(Lanes) > 16) {
+    typedef T Half __attribute__((vector_size(sizeof(Lanes) / 2)));
+    Half halves[2];
+    std::memcpy(halves, &lanes, sizeof halves);
+    return reduce<T, Half>(op(halves[0], halves[1]), op);
+  } else {
+    T result = lanes[0];
+    for (size_t i = 1; i < sizeof(Lanes) / sizeof(T); ++i) result = op(result, lanes[i]);
+    return result;
+  }
 }
 template <class T, class Lanes>
 inline T lowest_lane(const Lanes& lanes) {
@@ -72,18 +78,18 @@ inline T highest_lane(const Lanes& lanes) {
   return reduce<T>(lanes, [](const auto& a, const auto& b) { return greatest(a, b); });
 }
 
-inline int32_t sum_of_lanes(const Int16& lanes) {
+inline int32_t sum_of_lanes(const IntLanes& lanes) {
   return reduce<int32_t>(lanes, [](const auto& a, const auto& b) { return a + b; });
 }
 
 // One bit per lane of a comparison's result (all ones or zero).
-inline uint32_t bits_of_lanes(const Int16& truth) {
+inline uint32_t bits_of_lanes(const IntLanes& truth) {
 #if defined(__AVX512DQ__)
   return _mm512_movepi32_mask(reinterpret_cast<__m512i>(truth));
 #elif defined(__AVX2__)
-  __m256 halves[2];
-  std::memcpy(halves, &truth, sizeof halves);
-  return static_cast<uint32_t>(_mm256_movemask_ps(halves[0]) | _mm256_movemask_ps(halves[1]) << 8);
+  return static_cast<uint32_t>(_mm256_movemask_ps(reinterpret_cast<__m256>(truth)));
+#elif defined(__SSE2__)
+  return static_cast<uint32_t>(_mm_movemask_ps(reinterpret_cast<__m128>(truth)));
 #else
   uint32_t bits = 0;
   for (int i = 0; i < kLanes; ++i) bits |= static_cast<uint32_t>(truth[i] & 1) << i;

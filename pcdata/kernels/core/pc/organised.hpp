@@ -101,31 +101,23 @@ class OrganisedCloud {
     return measure_slopes(context, scratch);
   }
 
-  // The rows of the cloud, ordered by tiles of 4x4 pixels within tiles of 8x8 and so on: near in the image is mostly
-  // near in space, and it takes no sort. Returns as many keys as there are points.
-  uint64_t* tile_order(const pc_context& context, ScratchFrame& scratch, int64_t num_points) const {
+  // The cloud as leaves of 4x4 pixels, in Morton order within tiles of 64x64: near in the image is mostly near in space,
+  // and it takes no sort. Missing pixels leave empty slots anywhere in a leaf.
+  Leaves tile_leaves(const pc_context& context, ScratchFrame& scratch) const {
     const int64_t across = (width_ + kTile - 1) / kTile, tiles = across * ((height_ + kTile - 1) / kTile);
-    std::vector<int64_t> begin(static_cast<size_t>(tiles) + 1, 0);
-    const auto for_points = [&](int64_t tile, auto&& body) {
-      const int64_t u0 = tile % across * kTile, v0 = tile / across * kTile;
-      for (int64_t code = 0; code < kTile * kTile; ++code) {
-        const int64_t u = u0 + even_bits(code), v = v0 + even_bits(code >> 1), at = v * stride_ + u;
-        if (u < width_ && v < height_ && image_[2][at] < kInfinity) body(row_of_pixel_[at]);
-      }
-    };
-    parallel_for(context, tiles, 4, [&](int64_t first, int64_t last, int64_t) {
-      for (int64_t tile = first; tile < last; ++tile)
-        for_points(tile, [&](uint32_t) { ++begin[static_cast<size_t>(tile) + 1]; });
-    });
-    for (size_t tile = 0; tile < static_cast<size_t>(tiles); ++tile) begin[tile + 1] += begin[tile];
-    uint64_t* keys = scratch.take<uint64_t>(num_points);
-    parallel_for(context, tiles, 4, [&](int64_t first, int64_t last, int64_t) {
-      for (int64_t tile = first; tile < last; ++tile) {
-        uint64_t* next = keys + begin[static_cast<size_t>(tile)];
-        for_points(tile, [&](uint32_t row) { *next++ = row; });
+    constexpr int64_t kLeaves = kTile / kLeafSide * (kTile / kLeafSide);
+    int64_t* leaf_ptr = scratch.take<int64_t>(2);
+    leaf_ptr[0] = 0;
+    leaf_ptr[1] = tiles * kLeaves;
+    Leaf* leaves = scratch.take<Leaf>(tiles * kLeaves);
+    parallel_for(context, tiles, 2, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t i = first * kLeaves; i < last * kLeaves; ++i) {
+        const int64_t tile = i / kLeaves, code = i % kLeaves;
+        fill_leaf_at(tile % across * kTile + kLeafSide * even_bits(code),
+                     tile / across * kTile + kLeafSide * even_bits(code >> 1), leaves[i]);
       }
     });
-    return keys;
+    return {leaves, leaf_ptr, 1};
   }
 
   int64_t width() const { return width_; }
@@ -143,17 +135,23 @@ class OrganisedCloud {
  private:
   // An image with fewer points in it is mostly searched in vain.
   static constexpr int64_t kMaxPixelsPerPoint = 4;
-  static constexpr int64_t kTile = 64;
+  static constexpr int64_t kTile = 64, kLeafSide = 4;
   static constexpr int64_t kRowsPerPiece = 16;
   static constexpr int64_t kPointsPerPiece = 1 << 14;
   static constexpr float kMinDepth = 1e-30f, kMaxSlope = 1e18f;  // so that no slope overflows
 
-  // Bits 0, 2, 4, ... of a 12-bit number, moved together.
-  static int64_t even_bits(int64_t v) {
-    v &= 0x555;
-    v = (v | v >> 1) & 0x333;
-    v = (v | v >> 2) & 0xF0F;
-    return (v | v >> 4) & 0x3F;
+  // Bits 0, 2, 4 and 6 of a number, moved together.
+  static int64_t even_bits(int64_t v) { return (v & 1) | (v >> 1 & 2) | (v >> 2 & 4) | (v >> 3 & 8); }
+
+  // A leaf may reach over the edge of the image, into the margin.
+  void fill_leaf_at(int64_t u, int64_t v, Leaf& leaf) const {
+    const bool outside = u >= width_ || v >= height_;
+    float* value[3] = {leaf.x, leaf.y, leaf.z};
+    for (int64_t i = 0; i < kLeafSize; ++i) {
+      const int64_t at = outside ? 0 : (v + i / kLeafSide) * stride_ + u + i % kLeafSide;
+      for (int axis = 0; axis < 3; ++axis) value[axis][i] = outside ? kInfinity : image_[axis][at];
+      leaf.row[i] = leaf.z[i] < kInfinity ? row_of_pixel_[at] : kNoId;
+    }
   }
 
   template <class Body>
@@ -283,13 +281,10 @@ class WindowSearch {
  public:
   WindowSearch(const OrganisedCloud& cloud, const WindowRings& rings) : cloud_(cloud), rings_(rings) {}
 
-  // The lanes at (u, v) to (u+15, v) that are points.
-  LaneMask points_at(int64_t u, int64_t v) const {
-    return less(Floats::load(cloud_.z() + v * cloud_.stride() + u), Floats(kInfinity));
-  }
-  QueryGroup queries_at(int64_t u, int64_t v, LaneMask lanes) const {
+  // The points at pixels (u, v) to (u+15, v).
+  QueryGroup queries_at(int64_t u, int64_t v) const {
     const int64_t at = v * cloud_.stride() + u;
-    return QueryGroup(cloud_.x() + at, cloud_.y() + at, cloud_.z() + at, lanes);
+    return QueryGroup(cloud_.x() + at, cloud_.y() + at, cloud_.z() + at);
   }
 
   // Offer windows of growing size, from `reach` on; return the lanes that are proved complete.

@@ -34,26 +34,29 @@ struct PointBlock {
 };
 
 // Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance, in separate float operations like the reference.
-inline Int16 is_near(const Plane& plane, float distance, const Float16& x, const Float16& y, const Float16& z) {
-  const Float16 signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
-  const Int16 magnitude = reinterpret_cast<Int16>(signed_distance) & 0x7FFFFFFF;
-  return reinterpret_cast<Float16>(magnitude) < distance;
+inline IntLanes is_near(const Plane& plane, float distance, const FloatLanes& x, const FloatLanes& y,
+                        const FloatLanes& z) {
+  const FloatLanes signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
+  const IntLanes magnitude = reinterpret_cast<IntLanes>(signed_distance) & 0x7FFFFFFF;
+  return reinterpret_cast<FloatLanes>(magnitude) < distance;
 }
 
 // Add to counts[h] the points of a block near planes[h]. Several planes share each load of a point.
 template <int kTogether>
 inline void count_near(const PointBlock& block, const Plane* planes, float distance, int64_t* counts) {
-  Int16 near[kTogether] = {};
+  IntLanes near[kTogether] = {};
   for (int i = 0; i < block.count; i += kLanes) {
-    const Float16 x = load<Float16>(block.x + i), y = load<Float16>(block.y + i), z = load<Float16>(block.z + i);
+    const auto x = load<FloatLanes>(block.x + i), y = load<FloatLanes>(block.y + i), z = load<FloatLanes>(block.z + i);
     // A true lane is -1.
     for (int h = 0; h < kTogether; ++h) near[h] -= is_near(planes[h], distance, x, y, z);
   }
   for (int h = 0; h < kTogether; ++h) counts[h] += sum_of_lanes(near[h]);
 }
 
+typedef double Double8 __attribute__((vector_size(64)));
+
 // Sums over chosen points about a centre, each in eight lanes so that every instruction set adds in the same order.
-struct Moments {
+struct PlaneMoments {
   Double8 x{}, y{}, z{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
 
   void add(const Double8& px, const Double8& py, const Double8& pz) {

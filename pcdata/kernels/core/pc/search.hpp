@@ -91,7 +91,7 @@ class BatchSearch {
   // A window starts with about twice as many pixels as neighbours are wanted and grows by a few rings, each of which
   // costs every lane: what is then not proved (1-2 % on a tabletop frame) is cheaper in the tree.
   static constexpr int kMoreRings = 4;
-  static constexpr int64_t kOneIn = 16;
+  static constexpr int64_t kOneIn = 16;  // more queries without a proof than this mean a grid that does not fit
   int first_reach() const {
     int reach = 1;
     while ((2 * reach + 1) * (2 * reach + 1) < 2 * k_) ++reach;
@@ -118,9 +118,9 @@ class BatchSearch {
       WindowSearch search(cloud, rings);
       Worker worker{{}, task_};
       for (int64_t u = 0; u < cloud.width(); u += kQueries) {
-        const LaneMask points = search.points_at(u, v);
+        QueryGroup group = search.queries_at(u, v);
+        const LaneMask points = group.active;
         if (points == 0) continue;
-        QueryGroup group = search.queries_at(u, v, points);
         worker.nearest.start(k_, group.limits(limit_));
         group.active = search.run(group, u, v, first_reach(), worker.nearest);
         uint32_t row[kQueries] = {};
@@ -144,27 +144,22 @@ class BatchSearch {
     });
     const int64_t count = num_unproved.load();
     if (count == 0) return;
-    const Clouds rows{clouds.points, alone, 1};
     if (count * kOneIn > end - begin) {
-      // The grid does not fit the points: their order in the image may not keep neighbours together.
+      // The grid does not fit the points: near in the image need not be near in space.
       LeafBuilder builder(context_, scratch, clouds.points, alone, 1);
-      finish_by_tree(scratch, rows, builder, unproved, count);
-    } else {
-      LeafBuilder builder(context_, scratch, clouds.points, alone, 1,
-                          cloud.tile_order(context_, scratch, end - begin));
-      finish_by_tree(scratch, rows, builder, unproved, count);
+      const int64_t* unused;
+      return finish_by_tree(scratch, clouds.points, builder.without_copies(k_, unused), unproved, count);
     }
+    finish_by_tree(scratch, clouds.points, cloud.tile_leaves(context_, scratch), unproved, count);
   }
 
-  void finish_by_tree(ScratchFrame& scratch, const Clouds& cloud, LeafBuilder& builder, const Unproved* queries,
+  void finish_by_tree(ScratchFrame& scratch, const float* rows, const Leaves& leaves, const Unproved* queries,
                       int64_t count) {
-    const int64_t* unused;
-    const Leaves leaves = builder.without_copies(k_, unused);
     const CloudTree* tree = build_trees(context_, scratch, leaves);
     // Stragglers are sorted in space too, so that the sixteen of a group look into the same boxes.
     float* points = scratch.take<float>(3 * count);
     for (int64_t i = 0; i < count; ++i)
-      std::copy_n(cloud.points + 3 * int64_t{queries[i].row}, 3, points + 3 * i);
+      std::copy_n(rows + 3 * int64_t{queries[i].row}, 3, points + 3 * i);
     const int64_t all[2] = {0, count};
     LeafBuilder groups(context_, scratch, points, all, 1);
     for_groups(groups.all(), [&](const Leaf& leaf, int64_t, int64_t, TreeSearch& search, Worker& worker) {

@@ -31,12 +31,14 @@ struct Placed {
 // does the same inside every cell that still holds too many: a recursive radix sort, most significant digit first. Each
 // level measures its own box, so neither a stray point far out nor a dense spot spoils the order.
 //
-// `write(points, count, place)` receives every point once: a run of sorted points that starts at that place in the order.
+// `write(points, count, place)` receives every point once: a run of sorted points, and where in the order it starts.
 class SpatialSort {
  public:
   // Room for `count` points, 34 bytes each.
   SpatialSort(ScratchFrame& scratch, int64_t count)
-      : sorted_(scratch.take<Placed>(count)), spare_(scratch.take<Placed>(count)), keys_(scratch.take<uint16_t>(count)) {}
+      : sorted_(scratch.take<Placed>(count)),
+        spare_(scratch.take<Placed>(count)),
+        keys_(scratch.take<uint16_t>(count)) {}
 
   // Sort points (count, 3) on this thread, in this object's room from `offset` on.
   template <class Write>
@@ -138,7 +140,8 @@ class SpatialSort {
     Float4 half_low, per_half;
     int32_t last;
 
-    Cells(const Box& box, int bits) : half_low(Float4{box.low[0], box.low[1], box.low[2], 0} * 0.5f), last((1 << bits) - 1) {
+    Cells(const Box& box, int bits)
+        : half_low(Float4{box.low[0], box.low[1], box.low[2], 0} * 0.5f), last((1 << bits) - 1) {
       const float scale = static_cast<float>(1 << bits) / box.half_length();
       per_half = Float4{scale, scale, scale, 0};
     }
@@ -173,7 +176,7 @@ class SpatialSort {
   }
 
   // For one cell, first how many points of a stretch fall into it, then where the next goes; apart for the two halves
-  // of the stretch, which are worked on in turn: neighbours mostly share a cell, and one count would wait for the other.
+  // of the stretch, worked on in turn: neighbours mostly share a cell, and one count would wait for the other.
   struct Places {
     uint32_t in_first, in_second;
 

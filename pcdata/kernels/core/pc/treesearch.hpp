@@ -7,37 +7,24 @@
 
 namespace pc {
 
-// Sixteen queries, one per lane, and the box of those that count.
+// Sixteen queries, one per lane.
 struct QueryGroup {
   Floats x, y, z;
-  float low[3], high[3];
-  LaneMask active;
+  LaneMask active;         // the lanes that count
+  float low[3], high[3];   // their box, when they come from a leaf: the tree's search needs it
 
-  // Lanes out of `active` may hold anything; they get a finite stand-in, so no arithmetic meets NaN.
-  QueryGroup(const float* qx, const float* qy, const float* qz, LaneMask lanes) : active(lanes) {
-    alignas(64) float copy[3][kQueries];
-    const float* from[3] = {qx, qy, qz};
-    for (int axis = 0; axis < 3; ++axis) {
-      low[axis] = kInfinity;
-      high[axis] = -kInfinity;
-      for (int lane = 0; lane < kQueries; ++lane) {
-        const bool counts = lanes >> lane & 1;
-        const float value = from[axis][lane];
-        copy[axis][lane] = counts ? value : 0.0f;
-        low[axis] = counts && value < low[axis] ? value : low[axis];
-        high[axis] = counts && value > high[axis] ? value : high[axis];
-      }
-    }
-    x = Floats::load(copy[0]);
-    y = Floats::load(copy[1]);
-    z = Floats::load(copy[2]);
+  // Sixteen points, at infinity where there is none. Those become finite, so that no arithmetic meets NaN.
+  QueryGroup(const float* qx, const float* qy, const float* qz)
+      : x(finite(qx)), y(finite(qy)), z(finite(qz)), active(less(Floats::load(qz), Floats(kInfinity))) {}
+
+  explicit QueryGroup(const Leaf& leaf) : QueryGroup(leaf.x, leaf.y, leaf.z) {
+    extent(leaf.x, low[0], high[0]);
+    extent(leaf.y, low[1], high[1]);
+    extent(leaf.z, low[2], high[2]);
   }
-  explicit QueryGroup(const Leaf& leaf) : QueryGroup(leaf.x, leaf.y, leaf.z, real_slots(leaf)) {}
 
-  static LaneMask real_slots(const Leaf& leaf) {
-    LaneMask mask = 0;
-    for (int lane = 0; lane < kQueries; ++lane) mask |= LaneMask{leaf.row[lane] != kNoId} << lane;
-    return mask;
+  static Floats finite(const float* from) {
+    return minimum(Floats::load(from), Floats(std::numeric_limits<float>::max()));
   }
   // `limit` in the lanes that count, off in the others.
   Floats limits(float limit) const {
@@ -84,8 +71,9 @@ class TreeSearch {
     for (const int64_t index : visited_) {
       if (!lanes_near(queries, tree_.level[0][index / kFanOut], index % kFanOut, reach)) continue;
       const Leaf& leaf = tree_.leaf[index];
-      for (int i = 0; i < kLeafSize && leaf.row[i] != kNoId; ++i)
-        body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), [&](int) { return leaf.row[i]; });
+      for (int i = 0; i < kLeafSize; ++i)
+        if (leaf.row[i] != kNoId)
+          body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), [&](int) { return leaf.row[i]; });
     }
   }
 

@@ -114,7 +114,9 @@ struct VoxelGrid {
             static_cast<uint64_t>(z)};
   }
   WideVoxel unpacked(const PackedVoxel& voxel) const {
-    auto low_bits = [](uint64_t value, int count) { return static_cast<int64_t>(value & ((uint64_t{1} << count) - 1)); };
+    auto low_bits = [](uint64_t value, int count) {
+      return static_cast<int64_t>(value & ((uint64_t{1} << count) - 1));
+    };
     return {static_cast<int64_t>(voxel.bits >> (bits[1] + bits[2])), low_bits(voxel.bits >> bits[2], bits[1]),
             low_bits(voxel.bits, bits[2])};
   }
@@ -178,7 +180,8 @@ class VoxelBlock {
   }
   void keys(int count, const VoxelGrid&, WideVoxel* to) const {
     for (int i = 0; i < count; ++i)
-      to[i] = {static_cast<int64_t>(voxel_[0][i]), static_cast<int64_t>(voxel_[1][i]), static_cast<int64_t>(voxel_[2][i])};
+      to[i] = {static_cast<int64_t>(voxel_[0][i]), static_cast<int64_t>(voxel_[1][i]),
+               static_cast<int64_t>(voxel_[2][i])};
   }
 
  private:

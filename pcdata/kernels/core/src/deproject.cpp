@@ -38,8 +38,8 @@ struct Output {
   int64_t* pixel_index;  // (M,)
 };
 
-// Write the points of one image row, run by run of readings: within a run there is nothing to decide. `ray(u)` gives x/z
-// and y/z.
+// Write the points of one image row, run by run of readings: within a run there is nothing to decide. `ray(u)` gives
+// x/z and y/z.
 template <class Ray>
 void write_row(const float* depth, int64_t width, int64_t first_pixel, Output out, const Ray& ray) {
   for (int64_t u = 0; u < width;) {

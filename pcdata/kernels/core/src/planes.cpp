@@ -41,7 +41,7 @@ Double8 chosen(const float* points, const uint8_t* mask, int64_t first, int axis
 }
 
 struct Sums {
-  Moments moments;
+  PlaneMoments moments;
   float largest;  // absolute coordinate
   int64_t count;
 };
@@ -114,7 +114,7 @@ PC_EXPORT int32_t pc_plane_sums(const pc_context* context, const float* points, 
     });
     std::fill_n(sums, 11, 0.0);
     for (int64_t piece = 0; piece < pieces; ++piece) {
-      const pc::Moments& m = found[piece].moments;
+      const pc::PlaneMoments& m = found[piece].moments;
       const pc::Double8 lanes[9] = {m.x, m.y, m.z, m.xx, m.xy, m.xz, m.yy, m.yz, m.zz};
       sums[0] += static_cast<double>(found[piece].count);
       sums[1] = std::max(sums[1], static_cast<double>(found[piece].largest));

@@ -48,19 +48,19 @@ struct Bounds {
   }
 };
 
-// Sixteen points are three registers, whose lanes hold x, y, z, x, ... in turn.
+// As many points as a register has lanes fill three, whose lanes hold x, y, z, x, ... in turn.
 Bounds bounds_of(const float* points, int64_t begin, int64_t end) {
   const float* values = points + 3 * begin;
   const int64_t count = 3 * (end - begin);
   float low[3 * kLanes], high[3 * kLanes];
   for (int i = 0; i < 3 * kLanes; ++i) low[i] = high[i] = values[i % 3];
-  Float16 lows[3], highs[3];
+  FloatLanes lows[3], highs[3];
   std::memcpy(lows, low, sizeof lows);
   std::memcpy(highs, high, sizeof highs);
   int64_t i = 0;
   for (; i + 3 * kLanes <= count; i += 3 * kLanes) {
     for (int part = 0; part < 3; ++part) {
-      const Float16 some = load<Float16>(values + i + part * kLanes);
+      const FloatLanes some = load<FloatLanes>(values + i + part * kLanes);
       lows[part] = least(some, lows[part]);
       highs[part] = greatest(some, highs[part]);
     }
@@ -255,8 +255,9 @@ void downsample(const pc_context& context, ScratchFrame& scratch, const Clouds& 
     const Piece& piece = pieces[p];
     const int64_t base = clouds.ptr[piece.cloud];
     const int64_t end = std::min(piece.end, base + counts[piece.cloud]);
+    float* own = means + 3 * starts[static_cast<size_t>(piece.cloud)];
     for (int64_t i = piece.begin; i < end; ++i)
-      mean_of(found.voxels[i], found.sums[i], grids[piece.cloud], means + 3 * (starts[static_cast<size_t>(piece.cloud)] + i - base));
+      mean_of(found.voxels[i], found.sums[i], grids[piece.cloud], own + 3 * (i - base));
   });
 }
 
@@ -276,7 +277,8 @@ template <class Body>
 bool with_grids(const pc_context& context, ScratchFrame& scratch, const Clouds& clouds, Pieces& pieces, Body&& body) {
   std::vector<VoxelGrid> grids(static_cast<size_t>(clouds.num_clouds));
   for (VoxelGrid& grid : grids) grid = {};
-  if (!measure_all(context, scratch, clouds.points, pieces, clouds.sizes, clouds.num_clouds, grids.data())) return false;
+  if (!measure_all(context, scratch, clouds.points, pieces, clouds.sizes, clouds.num_clouds, grids.data()))
+    return false;
   if (std::all_of(grids.begin(), grids.end(), [](const VoxelGrid& grid) { return grid.packs(); }))
     body(PackedVoxel{}, grids.data());
   else
