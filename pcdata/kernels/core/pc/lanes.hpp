@@ -1,6 +1,6 @@
-// As many numbers as a register holds, handled as one, with the compilers' vector extension: 16 with AVX-512, 8
-// with AVX2, 4 with SSE2. For short loops with reductions, which compilers do not vectorise reliably. (Wider than a register,
-// GCC takes conditionals apart into single numbers.)
+// As many numbers as a register holds, handled as one, with the compilers' vector extension: 16 with AVX-512, 8 with
+// AVX2, 4 with SSE2. For short loops with reductions, which compilers do not vectorise reliably. (GCC takes
+// conditionals on vectors wider than a register apart into single numbers.)
 #pragma once
 
 #include "pc/common.hpp"

@@ -186,7 +186,7 @@ class VoxelBlock {
 
  private:
   // Round half to even, as torch does. Adding 1.5 * 2^52 leaves the integer in the low bits of the double; exact below
-  // 2^51, which packed coordinates are unless one axis has them all (see measure()).
+  // 2^51, which packed coordinates and offsets always are.
   static int64_t rounded(double value) {
     constexpr double kMagic = 6755399441055744.0;
     const double shifted = value + kMagic;
