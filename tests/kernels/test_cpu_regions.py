@@ -54,7 +54,7 @@ def normal(count: int, seed: int = 0, spread: float = 1.0) -> Tensor:
     return torch.from_numpy((spread * np.random.default_rng(seed).normal(size=(count, 3))).astype(np.float32))
 
 
-def depth_image(height: int = 90, width: int = 120, seed: int = 0) -> tuple[Tensor, ImageGrid]:
+def depth_image(height: int = 60, width: int = 80, seed: int = 0) -> tuple[Tensor, ImageGrid]:
     """A back-projected image of two noisy planes with an edge, a thin pole, strays and holes."""
     generator = np.random.default_rng(seed)
     v, u = np.mgrid[:height, :width]
@@ -74,9 +74,9 @@ def test_both_operations_have_a_compiled_kernel():
 
 
 @pytest.mark.parametrize("spread", [0.03, 0.3, 3.0])
-@pytest.mark.parametrize("count", [1, 2, 5, 50, 1001])
+@pytest.mark.parametrize("count", [1, 2, 5, 50, 601])
 def test_dense_to_sparse_clouds_equal_the_reference(spread: float, count: int):
-    assert_same(normal(1000, spread=spread), radius=0.1, count=count)
+    assert_same(normal(600, spread=spread), radius=0.1, count=count)
 
 
 @pytest.mark.parametrize("radius", [0.004, 0.01, 0.05])
