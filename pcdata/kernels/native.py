@@ -120,7 +120,7 @@ def _folder() -> Path:
         if (folder / "libpcdata_baseline.so").exists():
             return folder
     raise OSError(
-        "the compiled core is not installed (no C++ compiler was found when pcdata was installed); install one "
+        "the compiled core is not installed (building it failed, or there was no C++ compiler); install a compiler "
         "(on Debian or Ubuntu: apt-get install g++) and reinstall pcdata"
     )
 

@@ -79,6 +79,7 @@ EXAMPLES = [
     Example("chamfer_distance", two_clouds, ("cloud",)),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),
+    # Neighbourhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.5, "max_neighbors": 30}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
@@ -267,7 +268,7 @@ def test_every_backend_gives_what_the_reference_gives(example, backend):
         if reason is not None:
             pytest.skip(reason)
         if backend not in OPERATIONS[example.name].kernels:
-            return
+            pytest.skip(f"{backend} has no kernel for {example.name}")
     arguments = packed(example, clouds_of(example))
     expected = call(example, arguments, backend="torch")
     for found, wanted in zip(call(example, arguments, backend=backend), expected, strict=True):
