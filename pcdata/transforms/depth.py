@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
@@ -14,7 +14,7 @@ from pcdata.functional.ragged import cloud_of_rows
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Metres
+from pcdata.transforms.fields import FromSensor, Metres
 
 
 class MaskDepth(Transform):
@@ -23,8 +23,9 @@ class MaskDepth(Transform):
     takes = DepthFrame
     gives = DepthFrame
 
-    near: Metres | None = None  # readings closer than this are dropped
-    far: Metres | None = None  # readings beyond this are dropped
+    # Readings closer than near or beyond far are dropped.
+    near: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[0])] = None
+    far: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[1])] = None
     use_mask: bool = True  # drop pixels outside frame.mask where the capture has one
     require_mask: bool = False  # refuse a capture without a mask
     drop_labels: Sequence[int] = ()  # drop pixels with these labels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -18,9 +19,10 @@ from pcdata.functional.voxels import (
     voxel_mean_direction,
 )
 from pcdata.rng import Streams, seeded
+from pcdata.sensors import SensorProfile
 from pcdata.structures import Kind, PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
-from pcdata.transforms.fields import Count, Fraction, IfShort, Metres
+from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres
 
 
 class VoxelDownsample(Transform):
@@ -31,7 +33,8 @@ class VoxelDownsample(Transform):
     size, or the count to reach: then every cloud gets the largest size that leaves at least so many points.
     """
 
-    voxel_size: Metres | None = None  # edge length, in the cloud's unit
+    # Edge length, in the cloud's unit.
+    voxel_size: Annotated[Metres | None, FromSensor(SensorProfile.voxel_size)] = None
     num_points: Count | None = None  # wanted count instead of a size
 
     def check_fields(self) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Interval, MinLen
+
+from pcdata.sensors import SensorProfile
 
 Metres = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
@@ -18,3 +22,10 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]  # row-major, acts on column vectors
 
 # What a sampler does with a cloud that has fewer points than asked.
 IfShort = Literal["error", "repeat", "tile", "zeros", "keep"]
+
+
+@dataclass(frozen=True)
+class FromSensor:
+    """Marks, inside ``Annotated``, a field for which a configuration may say ``sensor`` instead of a value."""
+
+    figure: Callable[[SensorProfile, float], float | str]  # of the sensor's profile and the reference depth in metres
