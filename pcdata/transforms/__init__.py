@@ -14,6 +14,7 @@ from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
 from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
+from pcdata.transforms.sensor_noise import RandomSensorNoise
 
 __all__ = [
     "REGISTRY",
@@ -39,6 +40,7 @@ __all__ = [
     "RandomRotation",
     "RandomSample",
     "RandomScale",
+    "RandomSensorNoise",
     "RandomTranslation",
     "RemovePlane",
     "RemoveRadiusOutliers",
