@@ -4,6 +4,7 @@ from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, R
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
+from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
@@ -25,6 +26,7 @@ __all__ = [
     "Deproject",
     "EstimateNormals",
     "FarthestPointSample",
+    "KeepConfidence",
     "MaskDepth",
     "MergeViews",
     "NormalizeUnitSphere",

@@ -17,6 +17,7 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_minimum,
 )
 from pcdata.rng import Streams, seeded
 from pcdata.sensors import SensorProfile
@@ -29,8 +30,9 @@ class VoxelDownsample(Transform):
     """Average the points of every occupied voxel (Open3D's grid), every field by its kind.
 
     Positions, colours and other floats are averaged, directions averaged and renormalised, labels and other integers
-    decided by vote (the lowest wins a tie); ``source_index`` is that of the first point in the voxel. Give the voxel
-    size, or the count to reach: then every cloud gets the largest size that leaves at least so many points.
+    decided by vote (the lowest wins a tie); confidence is their lowest, as an average is no better than its parts;
+    ``source_index`` is that of the first point in the voxel. Give the voxel size, or the count to reach: then every
+    cloud gets the largest size that leaves at least so many points.
     """
 
     # Edge length, in the cloud's unit.
@@ -166,7 +168,8 @@ def _reduce(values: Tensor, kind: Kind, inverse: Tensor, count: int) -> Tensor:
     if values.is_floating_point():
         reduced = voxel_mean(columns, inverse, count)
     else:
-        votes = [voxel_majority(column.long(), inverse, count) for column in columns.unbind(1)]
+        decide = voxel_minimum if kind is Kind.MINIMUM else voxel_majority
+        votes = [decide(column.long(), inverse, count) for column in columns.unbind(1)]
         reduced = torch.stack(votes, dim=1).to(values.dtype)
     return reduced.reshape(count, *values.shape[1:])
 

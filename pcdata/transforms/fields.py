@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Interval, MinLen
 
 from pcdata.sensors import SensorProfile
+from pcdata.structures import Confidence
 
 Metres = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
@@ -22,6 +23,15 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]  # row-major, acts on column vectors
 
 # What a sampler does with a cloud that has fewer points than asked.
 IfShort = Literal["error", "repeat", "tile", "zeros", "keep"]
+
+
+# The levels that a minimum can ask for, by the names of Confidence.
+ConfidenceName = Literal["hallucinated", "completed", "reliable"]
+
+
+def confidence_named(name: ConfidenceName) -> Confidence:
+    """Return the level of this name."""
+    return Confidence[name.upper()]
 
 
 @dataclass(frozen=True)

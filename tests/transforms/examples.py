@@ -56,10 +56,12 @@ EXAMPLES: dict[str, list[Example]] = {
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
+    "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MaskDepth": _of(
         T.MaskDepth(near=0.6, far=0.9),
         T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
         T.MaskDepth(require_mask=True),
+        T.MaskDepth(min_confidence="completed"),
         make=frame_with_counts,
     ),
     "MergeViews": _of(T.MergeViews()),

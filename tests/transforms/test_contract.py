@@ -266,11 +266,11 @@ def changed_values(value: Any) -> list[Any]:
     if isinstance(value, (int, float)):
         return [value + 1, value / 2, value * 0.9, 0.3]
     if isinstance(value, str):
-        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep", "kinect_v1"]
+        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep", "kinect_v1", "hallucinated"]
     if isinstance(value, T.Transform):
         return [T.Center()]
     if value is None:
-        return [0.7, 3, "base", (0.0, 0.0, 1.0)]
+        return [0.7, 3, "base", (0.0, 0.0, 1.0), "reliable"]
     items = list(value)
     if not items or isinstance(items[0], T.Transform):
         return [[*items, 1], [*items, T.Center()]]
