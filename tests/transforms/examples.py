@@ -36,6 +36,9 @@ EXAMPLES: dict[str, list[Example]] = {
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
     ),
+    "CompleteDepth": _of(
+        T.CompleteDepth(completion="smooth"), T.CompleteDepth(completion="nearest", reach=1), make=frame_with_counts
+    ),
     "Compose": [
         Example(
             T.Compose([T.CropWorkspace(frame="base", **BOX), T.NormalizeUnitSphere(), T.RandomRotation(axis=None)])
@@ -57,6 +60,12 @@ EXAMPLES: dict[str, list[Example]] = {
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
+    "MarkUnreliableDepth": _of(
+        T.MarkUnreliableDepth(sensor="realsense_d435"),
+        T.MarkUnreliableDepth(sensor="kinect_v1", enclosed=False),
+        T.MarkUnreliableDepth(sensor="photoneo_phoxi_m", rough=False),
+        make=frame_with_counts,
+    ),
     "MaskDepth": _of(
         T.MaskDepth(near=0.6, far=0.9),
         T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
