@@ -54,7 +54,7 @@ def _shifted(image: Tensor, shift: int, dim: int) -> Tensor:
 
 
 def _local_median(values: Tensor) -> Tensor:
-    """Return (V, H, W) medians over the channels and a window of (V, C, H, W); NaN is left out, 0 where most are NaN."""
+    """Return (V, H, W) medians over the channels and a window of (V, C, H, W) without NaN; 0 where most are NaN."""
     views, _, height, width = values.shape
     margin = _WINDOW // 2
     padded = torch.nn.functional.pad(values, (margin, margin, margin, margin), value=math.nan)

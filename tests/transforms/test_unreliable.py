@@ -20,7 +20,6 @@ from pcdata.transforms import MarkUnreliableDepth, RandomSensorNoise
 from tests.factories import tabletop_frame
 
 SENSOR = "realsense_d435"
-DATA = os.environ.get("PCDATA_TEST_DATA")
 
 
 def frame_of(depth: torch.Tensor) -> DepthFrame:
@@ -107,11 +106,9 @@ for source, target in zip(sys.argv[1::2], sys.argv[2::2]):
 
 
 @pytest.fixture(scope="module")
-def glass(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
+def glass(test_data: Path, tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
     """Depth of transparent objects, of the same objects painted, and their mask, by scene."""
-    if DATA is None:
-        pytest.skip("PCDATA_TEST_DATA is not set: it names a folder of real captures")
-    folder, out = Path(DATA) / "d435_transparent", tmp_path_factory.mktemp("exr")
+    folder, out = test_data / "d435_transparent", tmp_path_factory.mktemp("exr")
     files = sorted(folder.glob("*-depth-img.exr"))
     pairs = [str(name) for file in files for name in (file, out / f"{file.stem}.npy")]
     # OpenCV reads the switch once, when its first image is read: in a process of its own it is sure to be on.
