@@ -11,15 +11,19 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"],
+    "pcdata.structures": ["Camera", "Confidence", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"],
+    "pcdata.sensors": ["SensorProfile", "sensor_profile"],
     "pcdata.transforms": [
         "Center",
         "ClusterObjects",
+        "CompleteDepth",
         "Compose",
         "CropWorkspace",
         "Deproject",
         "EstimateNormals",
         "FarthestPointSample",
+        "KeepConfidence",
+        "MarkUnreliableDepth",
         "MaskDepth",
         "MergeViews",
         "NormalizeUnitSphere",
@@ -34,6 +38,7 @@ _HOMES = {
         "RandomRotation",
         "RandomSample",
         "RandomScale",
+        "RandomSensorNoise",
         "RandomTranslation",
         "RemovePlane",
         "RemoveRadiusOutliers",
@@ -48,7 +53,18 @@ _HOMES = {
     "pcdata.build": ["build_dataset", "load_config"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "report", "structures", "synthetic", "transforms"]
+_SUBMODULES = [
+    "build",
+    "datasets",
+    "errors",
+    "functional",
+    "io",
+    "report",
+    "sensors",
+    "structures",
+    "synthetic",
+    "transforms",
+]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
 
