@@ -205,7 +205,7 @@ def _refuse_degenerate(tilt: float, focal_uncertainty: float) -> None:
     if tilt < _MIN_TILT:
         raise CalibrationError(
             f"calibrate_intrinsics: the boards are parallel to within {math.degrees(tilt):.1f} degrees, so focal "
-            "length and distance cannot be told apart; tilt the board by 30 to 45 degrees, to the left, right, front and back"
+            "length and distance cannot be told apart; tilt the board by 30 to 45 degrees, to all four sides"
         )
     if not focal_uncertainty <= _MAX_FOCAL_UNCERTAINTY:
         raise CalibrationError(

@@ -94,7 +94,7 @@ def test_boards_that_are_all_parallel_are_refused():
     flat = {
         str(n): corner_view(board_pose(0, 0, 0.3 + 0.03 * n, aside=asides[n]), noise=0.1, seed=n) for n in range(10)
     }
-    with pytest.raises(CalibrationError, match=r"parallel to within .* tilt the board by 30 to 45 degrees"):
+    with pytest.raises(CalibrationError, match=r"parallel to within .* tilt the board by 30 to 45 degrees, to all"):
         calibrate_intrinsics(flat, size=SIZE, board="x")
 
 
