@@ -16,11 +16,13 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "rng", "extras", "yaml_nodes"},
+    {"checks", "rng", "extras"},
     {"dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
+    {"sensors"},
+    {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
     {"datasets", "calibration"},
     {"build"},
