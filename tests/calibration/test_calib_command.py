@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 from pcdata.calibration import Calibration, Evidence
 from pcdata.cli import main
 from pcdata.io import write_depth
+from pcdata.sensors import sensor_profile
 from tests.calibration.boards import CAMERA, CHARUCO, CHESSBOARD, good_poses, rendered
 from tests.calibration.robots import HOLDER_FROM_TARGET, MOUNT_FROM_CAMERA, apart, camera_poses, robot_poses
 from tests.calibration.test_plane_check import wall
@@ -64,12 +66,17 @@ def test_check_fails_on_bias_and_names_the_limit(capsys, walls: Path):
 
 
 def test_check_holds_noise_to_a_sensor(capsys, walls: Path):
-    code, out, _ = run(capsys, "calib", "check", walls, "--sensor", "d435", "--limit", "1")
-    assert "expected mm" in out
-    assert code in (0, 1)
-    code, _, err = run(capsys, "calib", "check", walls, "--sensor", "d4355")
-    assert code != 0
-    assert "d435" in err
+    profile = sensor_profile("realsense_d435")
+    code, out, _ = run(capsys, "calib", "check", walls, "--sensor", profile.name, "--limit", "1")
+    expected = math.hypot(profile.noise_at(1.206, focal=300.0), profile.depth_step / 12**0.5)
+    assert float(out.splitlines()[2].split()[8]) == pytest.approx(1000 * expected, rel=0.01)
+    assert code == (0 if 1.5 * expected >= 0.004 * 1.2**2 * 1.0 else 1)
+    code, out, _ = run(capsys, "calib", "check", walls, "--sensor", "photoneo_phoxi_m")  # a scanner is finer by far
+    assert code == 1
+    assert "near: depth RMS over expected noise is" in out
+    code, _, err = run(capsys, "calib", "check", walls, "--sensor", "realsense_d436")
+    assert code == 2
+    assert "realsense_d435" in err
 
 
 # -- intrinsics ----------------------------------------------------------------------------------------------------
