@@ -105,7 +105,7 @@ def test_the_lower_layers_need_torch_and_numpy_alone(module):
     assert outside <= allowed
 
 
-HEAVY = {"open3d", "torch_cluster", "matplotlib", "kornia", "scipy", "h5py", "pydantic"}
+HEAVY = {"cv2", "small_gicp", "open3d", "torch_cluster", "matplotlib", "kornia", "scipy", "h5py", "pydantic"}
 
 
 @pytest.mark.parametrize("module", MODULES)
