@@ -16,7 +16,7 @@ from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
 from pcdata.transforms.sensor_words import is_sensor_word, sensor_hint, sensor_value
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at, yaml_text
+from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
 
 def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:

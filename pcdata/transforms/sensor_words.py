@@ -17,7 +17,7 @@ from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
 from pcdata.transforms.base import REGISTRY, Transform, field_types
 from pcdata.transforms.fields import FromSensor
-from pcdata.transforms.yaml_nodes import SensorChoice, YamlDocument
+from pcdata.yaml_nodes import SensorChoice, YamlDocument
 
 SENSOR = "sensor"
 _DIGITS = 3  # significant: no figure of a profile is known better, and libm's last digits differ between machines
