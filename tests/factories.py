@@ -104,7 +104,7 @@ def frame_with_counts(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> De
         camera=camera,
         colors=torch.randint(256, (views, *size, 3), generator=generator, dtype=torch.uint8),
         labels=torch.randint(-1, 4, (views, *size), generator=generator),
-        confidence=torch.randint(256, (views, *size), generator=generator, dtype=torch.uint8),
+        confidence=torch.randint(4, (views, *size), generator=generator, dtype=torch.uint8),
         mask=torch.rand(views, *size, generator=generator) < 0.7,
         world_from_camera=base_from_camera(views, seed=seed),
         frame_id="base",

@@ -21,6 +21,7 @@ LAYERS = [
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
+    {"sensors"},
     {"io", "transforms", "synthetic"},
     {"datasets"},
     {"build"},

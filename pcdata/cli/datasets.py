@@ -1,0 +1,80 @@
+"""Commands that make and show datasets: demo, build, inspect, doctor."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.progress import Progress
+
+
+def add_to(commands: Any) -> None:
+    """Add the commands to the parser."""
+    demo = commands.add_parser("demo", help="run the whole job on an embedded synthetic capture")
+    demo.add_argument("out", nargs="?", default="pcdata_demo", metavar="OUT", help="folder (default: pcdata_demo)")
+    demo.add_argument("--scenes", type=positive, default=4, metavar="N", help="captures to build from (default: 4)")
+    demo.set_defaults(run=_demo)
+
+    build = commands.add_parser("build", help="build a dataset from captures")
+    build.add_argument("config", metavar="CONFIG", help="YAML file; see configs/ for examples")
+    build.add_argument("--source", required=True, metavar="PATH", help="folder of captures, or one cloud file")
+    build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
+    add_capture_options(build)
+    build.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    build.add_argument("--overwrite", action="store_true", help="replace the dataset that is in DIR")
+    build.set_defaults(run=_build)
+
+    inspect = commands.add_parser("inspect", help="say what a dataset, a capture folder or a cloud file holds")
+    inspect.add_argument("path", metavar="PATH")
+    add_capture_options(inspect)
+    inspect.set_defaults(run=_inspect)
+
+    doctor = commands.add_parser("doctor", help="say what is installed, which backends are live, what to install")
+    doctor.set_defaults(run=_doctor)
+
+
+def _demo(arguments: argparse.Namespace) -> None:
+    from pcdata.demo import run_demo
+
+    with Progress("demo") as progress:
+        result = run_demo(arguments.out, num_scenes=arguments.scenes, progress=progress)
+    print(_build_table(result.report))
+    points = sum(int(batch.mask.sum()) for batch in result.batches)
+    print(f"\nloaded back with 2 workers: {len(result.batches)} batches, {points:,} augmented points")
+    print(f"dataset  {result.report.folder}  (python {result.report.folder / 'load.py'} loads it)")
+    print(f"picture  {result.picture}")
+
+
+def _build(arguments: argparse.Namespace) -> None:
+    from pcdata.build import build_dataset, load_config
+
+    config = load_config(arguments.config)
+    source = open_captures(arguments.source, arguments, limit=arguments.limit)
+    with Progress("build") as progress:
+        report = build_dataset(config, source, arguments.out, overwrite=arguments.overwrite, progress=progress)
+    print(_build_table(report))
+    print(f"\ndataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
+
+
+def _inspect(arguments: argparse.Namespace) -> None:
+    from pcdata.io.manifest import FILE_NAME
+    from pcdata.io.source import absolute
+    from pcdata.report.inspection import capture_text, dataset_text
+
+    if (absolute(arguments.path) / FILE_NAME).is_file():
+        print(dataset_text(arguments.path))
+    else:
+        print(capture_text(open_captures(arguments.path, arguments)))
+
+
+def _doctor(arguments: argparse.Namespace) -> None:
+    from pcdata.report.health import health_text
+
+    print(health_text())
+
+
+def _build_table(report: Any) -> str:
+    from pcdata.report.inspection import build_text
+
+    return build_text(report)

@@ -1,0 +1,27 @@
+"""Options that several commands share, and what they open."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+
+def add_capture_options(command: argparse.ArgumentParser) -> None:
+    """Add what says how captures are to be read."""
+    command.add_argument("--kind", metavar="LAYOUT", help="capture layout, where it cannot be told from the files")
+    command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
+
+
+def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:
+    """Open the captures at a path as the options say."""
+    from pcdata.io import open_source
+
+    options = {} if arguments.metres_per_unit is None else {"metres_per_unit": arguments.metres_per_unit}
+    return open_source(path, kind=arguments.kind, limit=limit, **options)
+
+
+def positive(text: str) -> int:
+    """Parse a whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    return int(text)
