@@ -21,7 +21,7 @@ class DepthAverage(NamedTuple):
     """What is known of every pixel after T readings of it."""
 
     depth: Tensor  # (V, H, W) float32 metres: the mean of the readings kept, 0 = too few
-    count: Tensor  # (V, H, W) int64: how many were kept
+    num_readings: Tensor  # (V, H, W) int64: how many were kept
     variance: Tensor  # (V, H, W) float32 square metres: sample variance of those kept, 0 for fewer than two
     num_jitter: Tensor  # (V, H, W) int64: readings dropped because they stray from the median
     num_jumps: Tensor  # (V, H, W) int64: those of them that lie beyond max_jump: another surface, or motion
@@ -39,8 +39,8 @@ def average_depth(
 
     The pixel's median is the lower one, so always a reading. A reading is jitter, and dropped, if it lies further from
     the median than ``mad_factor`` standard deviations (taken as 1.4826 times the median absolute deviation), but never
-    within ``min_deviation`` and always beyond ``max_jump`` times the median. So a pixel at an edge that flickers between
-    two surfaces takes the one it saw more often (the nearer one when in doubt): it never takes a depth in between.
+    within ``min_deviation`` and always beyond ``max_jump`` times the median. So a pixel at an edge that flickers
+    between two surfaces takes the one it saw more often (the nearer when in doubt), never a depth in between.
 
     Args:
         depths: the images.
@@ -61,15 +61,17 @@ def average_depth(
     check_lengths(where, "depths", depths)
     if not (mad_factor > 0 and min_deviation >= 0 and max_jump > 0 and min_count >= 1):
         raise ConfigError(
-            f"{where}: mad_factor and max_jump must be more than 0, min_deviation at least 0, min_count at least 1, got "
-            f"{mad_factor}, {max_jump}, {min_deviation}, {min_count}"
+            f"{where}: needs mad_factor > 0, min_deviation >= 0, max_jump > 0 and min_count >= 1, got {mad_factor}, "
+            f"{min_deviation}, {max_jump}, {min_count}"
         )
     flat = depths.flatten(1)
     parts = [_average(part, mad_factor, min_deviation, max_jump, min_count) for part in flat.split(_BLOCK, dim=1)]
     return DepthAverage(*(torch.cat(values).reshape(depths.shape[1:]) for values in zip(*parts, strict=True)))
 
 
-def _average(readings: Tensor, mad_factor: float, min_deviation: float, max_jump: float, min_count: int) -> DepthAverage:
+def _average(
+    readings: Tensor, mad_factor: float, min_deviation: float, max_jump: float, min_count: int
+) -> DepthAverage:
     """Average (T, N) readings of N pixels."""
     valid = readings > 0
     num_valid = valid.sum(0)
@@ -89,7 +91,7 @@ def _average(readings: Tensor, mad_factor: float, min_deviation: float, max_jump
     enough = count >= min_count
     return DepthAverage(
         depth=torch.where(enough, median + mean, 0.0),
-        count=count,
+        num_readings=count,
         variance=variance,
         num_jitter=num_valid - count,
         num_jumps=(valid & (distance > far)).sum(0),

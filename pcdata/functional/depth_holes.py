@@ -26,8 +26,8 @@ def fill_holes(
 
     ``left`` copies the next reading to the left in the row. The others go inwards from the rim of a hole, a layer of
     pixels at a time: each pixel takes, of those of its four neighbours that have a depth by then, the farthest
-    (background, the safe guess in a stereo shadow) or the nearest. Nothing is blended. ``distance`` counts the columns or
-    the layers from the reading; 0 = not filled. A pixel that no reading leads to stays empty.
+    (background, the safe guess in a stereo shadow) or the nearest. Nothing is blended. ``distance`` counts the columns
+    or the layers from the reading; 0 = not filled. A pixel that no reading leads to stays empty.
 
     With ``max_size`` only narrow places are filled: a pixel is left empty if a square of ``max_size + 1`` pixels a side
     that holds no reading fits over it within the image.
@@ -41,7 +41,7 @@ def fill_holes(
     """
     where = "fill_holes"
     if rule not in RULES or (max_size is not None and max_size < 1):
-        raise ConfigError(f"{where}: rule must be one of {RULES} and max_size None or at least 1, got {rule!r}, {max_size}")
+        raise ConfigError(f"{where}: needs a rule of {RULES} and max_size None or >= 1, got {rule!r} and {max_size}")
     check_lengths(where, "depth", depth)
     hole = depth == 0
     wanted = hole if max_size is None else hole & ~_wide(hole, max_size + 1)

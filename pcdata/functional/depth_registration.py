@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -95,7 +96,9 @@ def register_depth(
     linked = _one_surface(depth, seen.visible, max_jump)
     left, right = _cell(seen.u, half_width, linked)
     top, bottom = _cell(seen.v, half_height, linked)
-    nearest = _rasterize(seen, (left, right, top, bottom), color_size)
+    views = zip(seen.depth, seen.visible, left, right, top, bottom)
+    images = [_rasterize(one[0], one[1], one[2:], color_size) for one in views]
+    nearest = torch.stack(images) if images else torch.empty((0, *color_size), dtype=torch.int64, device=depth.device)
 
     found = nearest != _EMPTY
     registered = torch.where(found, (nearest >> _INDEX_BITS).int().view(torch.float32), 0.0)
@@ -115,8 +118,8 @@ def _project(
         (motion[:, axis, 0] * x + motion[:, axis, 1] * y + motion[:, axis, 2]) * depth + motion[:, axis, 3]
         for axis in range(3)
     ]
-    z = moved[2]
-    visible = (depth > 0) & (z > 0)
+    visible = (depth > 0) & (moved[2] > 0)
+    z = torch.where(visible, moved[2], 1.0)  # what is not visible is not looked at, but must not become NaN
     x, y = moved[0] / z, moved[1] / z
     if distortion is not None:
         radius = (x.double().square() + y.double().square()).sqrt()
@@ -152,33 +155,34 @@ def _one_surface(depth: Tensor, visible: Tensor, max_jump: float) -> Tensor:
 def _cell(center: Tensor, half: Tensor, linked: Tensor) -> tuple[Tensor, Tensor]:
     """Return one coordinate's lower and upper end of every pixel's cell."""
     columns = center[:, 1:] + center[:, :-1]
-    corner = torch.where(linked, 0.25 * (columns[..., 1:] + columns[..., :-1]), torch.nan)
-    corner = torch.nn.functional.pad(corner, (1, 1, 1, 1), value=torch.nan)
-    around = [corner[:, :-1, :-1], corner[:, :-1, 1:], corner[:, 1:, :-1], corner[:, 1:, 1:]]
-    at_edge = (around[0] + around[1] + around[2] + around[3]).isnan()
-    half = torch.where(at_edge, half, torch.nan)
-    low, high = center - half, center + half
-    for one in around:  # fmin and fmax pass over NaN
-        low, high = torch.fmin(low, one), torch.fmax(high, one)
-    return low, high
+    corner = 0.25 * (columns[..., 1:] + columns[..., :-1])
+    low = _around_pixels(torch.where(linked, corner, torch.inf), torch.inf, torch.minimum)
+    high = _around_pixels(torch.where(linked, corner, -torch.inf), -torch.inf, torch.maximum)
+    half = torch.where(_around_pixels(linked, False, torch.logical_and), -torch.inf, half)  # reaches nowhere
+    return torch.minimum(low, center - half), torch.maximum(high, center + half)
+
+
+def _around_pixels(inner_corners: Tensor, border: float, combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Combine the values of every pixel's four corners: (V, H - 1, W - 1) to (V, H, W)."""
+    corners = torch.nn.functional.pad(inner_corners, (1, 1, 1, 1), value=border)
+    rows = combine(corners[:, 1:], corners[:, :-1])
+    return combine(rows[..., 1:], rows[..., :-1])
 
 
 def _rasterize(
-    seen: _Projection, cells: tuple[Tensor, Tensor, Tensor, Tensor], size: tuple[int, int]
-) -> Tensor:  # (V, Hc, Wc) int64
-    """Return at every colour pixel the smallest key, depth above index, of the cells that hold its centre."""
+    depth: Tensor, visible: Tensor, cells: tuple[Tensor, Tensor, Tensor, Tensor], size: tuple[int, int]
+) -> Tensor:  # (Hc, Wc) int64
+    """Return at every colour pixel of one view the smallest key (depth, then index) of the cells over its centre."""
     height, width = size
-    views, pixels = len(seen.depth), seen.depth[0].numel() if len(seen.depth) else 0
-    # Half-open cells: a centre on a shared side belongs to one of the two. Clamped to the image before they are integers.
-    left, right = (cells[i].ceil().clamp(0, width).flatten() for i in (0, 1))
-    top, bottom = (cells[i].ceil().clamp(0, height).flatten() for i in (2, 3))
-    paints = (seen.visible.flatten() & (right > left) & (bottom > top)).nonzero().squeeze(1)
-    first_u, first_v = left[paints].int(), top[paints].int()
-    across, down = right[paints].int() - first_u, bottom[paints].int() - first_v
-    view = paints.div(pixels, rounding_mode="floor") if pixels else paints
-    first = (view * height + first_v) * width + first_u
-    keys = (seen.depth.flatten()[paints].view(torch.int32).long() << _INDEX_BITS) | (paints - view * pixels)
-    nearest = torch.full((views * height * width,), _EMPTY, device=keys.device)
+    # Half-open cells: a centre on a shared side belongs to one of the two.
+    left, right = (end.ceil().clamp(0, width).flatten() for end in cells[:2])
+    top, bottom = (end.ceil().clamp(0, height).flatten() for end in cells[2:])
+    pixels = (visible.flatten() & (right > left) & (bottom > top)).nonzero().squeeze(1)
+    first_u, first_v = left[pixels].long(), top[pixels].long()
+    across, down = right[pixels].long() - first_u, bottom[pixels].long() - first_v
+    first = first_v * width + first_u
+    keys = (depth.flatten()[pixels].view(torch.int32).long() << _INDEX_BITS) | pixels
+    nearest = torch.full((height * width,), _EMPTY, device=keys.device)
     steps_down, steps_across = (int(steps.max()) if len(steps) else 0 for steps in (down, across))
     for row in range(steps_down):
         for column in range(steps_across):
@@ -188,19 +192,18 @@ def _rasterize(
             reached = ((down > row) & (across > column)).nonzero().squeeze(1)
             target = first[reached] + (row * width + column)
             nearest.scatter_reduce_(0, target, keys[reached], "amin")
-    return nearest.reshape(views, height, width)
+    return nearest.reshape(size)
 
 
 def _occlusions(seen: _Projection, readings: Tensor, registered: Tensor, max_jump: float) -> tuple[Tensor, Tensor]:
     """Return which readings are hidden, (V, H, W), and the colour pixels that hide one, (V, Hc, Wc)."""
     height, width = registered.shape[1:]
-    u, v = (seen.u + 0.5).floor(), (seen.v + 0.5).floor()
+    u, v = (seen.u + 0.5).floor_(), (seen.v + 0.5).floor_()
     inside = seen.visible & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    view = torch.arange(len(u), device=u.device)[:, None, None]
-    u, v = (torch.where(inside, place, 0).long() for place in (u, v))
-    target = (view * height + v) * width + u
-    front = registered.flatten()[target.flatten()].reshape(u.shape)
-    behind = inside & (front > 0) & (seen.depth - front > max_jump * front)
-    occluding = torch.zeros(registered.numel(), dtype=torch.bool, device=u.device)
-    occluding[target[behind]] = True
-    return readings & (~inside | behind), occluding.reshape(registered.shape)
+    target = v.clamp_(0, height - 1).long().mul_(width).add_(u.clamp_(0, width - 1).long())
+    front = registered.flatten(1).gather(1, target.flatten(1)).reshape(u.shape)
+    behind = inside & (front > 0) & (seen.depth > (1 + max_jump) * front)
+    occluding = torch.zeros_like(registered, dtype=torch.bool)
+    view, row, column = behind.nonzero().unbind(1)
+    occluding.flatten(1)[view, target[view, row, column]] = True
+    return readings & (~inside | behind), occluding

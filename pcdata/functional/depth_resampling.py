@@ -100,8 +100,8 @@ def resize_depth(
     where = "resize_depth"
     if len(size) != 2 or min(size) < 1 or (max_jump is not None and not max_jump > 0):
         raise ConfigError(
-            f"{where}: size must be (height, width) of at least one pixel and max_jump None or more than 0, got {size}, "
-            f"{max_jump}"
+            f"{where}: size must be (height, width) of at least one pixel and max_jump None or more than 0, got "
+            f"{size} and {max_jump}"
         )
     check_lengths(where, "depth", depth)
     if 0 in depth.shape[1:]:

@@ -50,9 +50,10 @@ def temporal_filter(
 ) -> tuple[Tensor, TemporalState]:  # values (V, H, W), and the state for the next frame
     """Average each pixel with its past while it changes little; bridge short losses of the reading.
 
-    A reading that differs by less than ``delta`` from the last value becomes ``alpha`` of itself and the rest of the last
-    value; any other reading is taken as it is, and the pixel's history starts anew. A pixel without a reading repeats
-    its last value where the persistence rule holds for its history before this frame, and then still counts as missing.
+    A reading that differs by less than ``delta`` from the last value becomes ``alpha`` of itself and the rest of the
+    last value; any other reading is taken as it is, and the pixel's history starts anew. A pixel without a reading
+    repeats its last value where the persistence rule holds for its history before this frame; it counts as missing
+    all the same.
 
     Args:
         values: the frame; the same V views of the same size in every call.

@@ -50,14 +50,15 @@ def spatial_filter(
     """Smooth surfaces and keep edges: exponential averages along rows, then columns, forth and back.
 
     A pixel takes ``alpha`` of its own value and the rest of the average that arrives from its neighbour, but starts
-    anew if the neighbour has no reading or differs by ``delta`` or more. Time does not depend on the parameters. It runs
-    step by step along one axis and on whole rows at a time across it. No gradient flows through it.
+    anew if the neighbour has no reading or differs by ``delta`` or more. It runs step by step along one axis and on
+    whole rows at a time across it; time grows with ``iterations`` alone. No gradient flows through it.
 
     Args:
         disparity: the images; depth works too, but there the noise grows with the square of the distance.
         alpha: weight of the pixel itself, 0..1; 1 changes nothing. librealsense offers 0.25..1.
         delta: the smallest step that is an edge, in the unit of the images. librealsense offers 1..50 (1/32 pixel).
         iterations: how often rows and columns are gone through. librealsense offers 1..5.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
 
     Raises:
         ConfigError: a parameter out of range.

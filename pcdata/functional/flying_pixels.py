@@ -22,15 +22,16 @@ def flying_pixel_mask(
 ) -> Tensor:  # (V, H, W) bool, True = flying pixel
     """Mark readings beside a depth edge that share a surface with too few of their eight neighbours.
 
-    Two neighbours share a surface if their depths differ by at most ``tolerance`` times the nearer one; two readings that
-    do not lie across an edge from each other. Relative to depth, the slope of a surface gives the same difference at any
-    distance: 0.02 bears one tilted by 85 degrees at 600 pixels focal length. Lines that are one pixel wide go as well
-    (their pixels have two neighbours); a reading with nothing but holes around it stays.
+    Two neighbours share a surface if their depths differ by at most ``tolerance`` times the nearer one; two readings
+    that do not lie across an edge from each other. Relative to depth, the slope of a surface gives the same difference
+    at any distance: 0.02 bears one tilted by 85 degrees at 600 pixels focal length. Lines that are one pixel wide go as
+    well (their pixels have two neighbours); a reading with nothing but holes around it stays.
 
     Args:
         depth: the images.
         tolerance: as a part of the depth; sensor noise of three standard deviations should fit in.
         min_neighbors: 1..8 neighbours that a good reading has on its surface.
+        backend: which body to run; see :mod:`pcdata.dispatch`.
 
     Raises:
         ConfigError: a parameter out of range.
@@ -39,8 +40,8 @@ def flying_pixel_mask(
     where = "flying_pixel_mask"
     if not tolerance > 0 or not 1 <= min_neighbors <= 8:
         raise ConfigError(
-            f"{where}: needs tolerance > 0 and min_neighbors 1..8, got {tolerance}, {min_neighbors}; to keep every pixel "
-            "leave the step out"
+            f"{where}: needs tolerance > 0 and min_neighbors 1..8, got {tolerance}, {min_neighbors}; to keep every "
+            "pixel leave the step out"
         )
     check_lengths(where, "depth", depth)
     height, width = depth.shape[1:]

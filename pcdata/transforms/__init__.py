@@ -6,6 +6,8 @@ from pcdata.transforms.clusters import ClusterObjects, SplitObjects
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
+from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
@@ -21,9 +23,11 @@ __all__ = [
     "ClusterObjects",
     "Compose",
     "CropWorkspace",
+    "DecimateDepth",
     "Deproject",
     "EstimateNormals",
     "FarthestPointSample",
+    "FillHoles",
     "MaskDepth",
     "MergeViews",
     "NormalizeUnitSphere",
@@ -40,10 +44,13 @@ __all__ = [
     "RandomSample",
     "RandomScale",
     "RandomTranslation",
+    "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
+    "ResizeDepth",
     "SelectTransform",
+    "SpatialFilterDepth",
     "SpatialTransform",
     "SplitObjects",
     "ToFrame",

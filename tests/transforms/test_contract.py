@@ -264,7 +264,7 @@ def changed_values(value: Any) -> list[Any]:
     if isinstance(value, (int, float)):
         return [value + 1, value / 2, value * 0.9, 0.3]
     if isinstance(value, str):
-        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep"]
+        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep", "mean", "left"]
     if isinstance(value, T.Transform):
         return [T.Center()]
     if value is None:
