@@ -11,7 +11,7 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"],
+    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud", "register_to_color"],
     "pcdata.transforms": [
         "Center",
         "ClusterObjects",
@@ -48,7 +48,16 @@ _HOMES = {
         "Transform",
         "VoxelDownsample",
     ],
-    "pcdata.io": ["open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
+    "pcdata.io": [
+        "AveragedSource",
+        "TemporalFilterDepth",
+        "TemporallyFilteredSource",
+        "open_source",
+        "read_pcd",
+        "read_ply",
+        "write_pcd",
+        "write_ply",
+    ],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
 }

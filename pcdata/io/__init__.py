@@ -1,5 +1,6 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
+from pcdata.io.averaged import AveragedSource
 from pcdata.io.calibration import (
     Calibration,
     read_calibration,
@@ -13,11 +14,15 @@ from pcdata.io.images import read_color, read_depth, read_labels, read_mask, wri
 from pcdata.io.pcd import read_pcd, write_pcd
 from pcdata.io.ply import read_ply, write_ply
 from pcdata.io.source import Source
+from pcdata.io.temporal import TemporalFilterDepth, TemporallyFilteredSource
 
 __all__ = [
     "LAYOUTS",
+    "AveragedSource",
     "Calibration",
     "Source",
+    "TemporalFilterDepth",
+    "TemporallyFilteredSource",
     "open_source",
     "read_calibration",
     "read_color",
