@@ -47,7 +47,8 @@ def average_depth(
         mad_factor: jitter limit in standard deviations. Of ten readings the deviation is known to a third only: at 3, a
             twentieth of good normal readings goes and the average is a tenth noisier.
         resolution: metres, the step of the sensor's readings: a spread below it is not seen.
-        max_jump: as a part of the median depth: what is further away is another surface.
+        max_jump: as a part of the median depth: what is further away is another surface. Three standard deviations of
+            the noise should fit in; for stereo, whose noise grows with the square of the distance, raise it far away.
         min_count: a pixel with fewer readings kept has no reading.
 
     Raises:
