@@ -21,28 +21,31 @@ def decimate_depth(
     *,
     factor: int,
     rule: Literal["median", "mean"] = "median",
+    max_jump: float = 0.02,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # depth (V, h, w) float32 metres; pixel_index (V, h, w) int64
     """Make one pixel of every block of ``factor`` x ``factor`` pixels, from the readings in it alone.
 
-    The median is the lower one, so it is a reading of one surface at any factor. The mean is what librealsense takes
-    from factor 4 on; it smooths more, and mixes the surfaces that meet in a block. Rows and columns that fill no block
-    are left out: h = H // factor, w = W // factor.
+    The median belongs to one surface at any factor: of an even number of readings it is the mean of the middle two if
+    they differ by at most ``max_jump`` times the nearer, else the nearer. The mean is what librealsense takes from
+    factor 4 on; it smooths more, and mixes the surfaces that meet in a block. Rows and columns that fill no block are
+    left out: h = H // factor, w = W // factor.
 
-    ``pixel_index`` is the pixel ``v * W + u`` of the image that the median reading comes from, so that labels can
-    follow; in a block without a reading, the pixel at its middle (rounded up).
+    ``pixel_index`` is the pixel ``v * W + u`` of the image that the (nearer) median reading comes from, so that labels
+    can follow; in a block without a reading, the pixel at its middle (rounded up).
 
     Raises:
-        ConfigError: a factor outside 1..8 or an unknown rule.
+        ConfigError: a factor outside 1..8, an unknown rule or a jump that is not positive.
         ShapeError: the image is smaller than one block.
         CaptureError: a negative depth.
 
-    Source: librealsense, decimation filter (median for 2 and 3, mean above).
+    Source: librealsense, decimation filter (the lower median for 2 and 3, the mean above).
     """
     where = "decimate_depth"
-    if not 1 <= factor <= MAX_FACTOR or rule not in ("median", "mean"):
+    if not 1 <= factor <= MAX_FACTOR or rule not in ("median", "mean") or not max_jump > 0:
         raise ConfigError(
-            f"{where}: factor must be 1..{MAX_FACTOR} and rule 'median' or 'mean', got {factor!r}, {rule!r}"
+            f"{where}: factor must be 1..{MAX_FACTOR}, rule 'median' or 'mean' and max_jump more than 0, got "
+            f"{factor!r}, {rule!r} and {max_jump}"
         )
     check_lengths(where, "depth", depth)
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
@@ -61,11 +64,14 @@ def decimate_depth(
         torch.where(block > 0, (block.contiguous().view(torch.int32).long() << 6) | place, none)
         for place, block in enumerate(blocks)
     ]
-    median = pick_image(sort_images(keys), (count - 1).clamp(min=0) // 2)
+    ordered = sort_images(keys)
+    median = pick_image(ordered, (count - 1).clamp(min=0) // 2)
     middle = factor // 2 * factor + factor // 2
     place = torch.where(count > 0, median & 63, middle)
     if rule == "median":
-        reduced = (median >> 6).int().view(torch.float32)
+        lower, upper = ((one >> 6).int().view(torch.float32) for one in (median, pick_image(ordered, count // 2)))
+        # Without the upper one a slanted surface would come out nearer than it is.
+        reduced = torch.where(upper - lower <= max_jump * lower, lower + 0.5 * (upper - lower), lower)
     else:
         total = sum(block.double() for block in blocks)
         reduced = (total / count.clamp(min=1)).float()

@@ -108,7 +108,7 @@ class AveragedSource:
             raise CaptureError(
                 f"AveragedSource: {100 * jumps / max(readings, 1):.1f} % of the readings lie on another surface than "
                 f"the others of their pixel (at most {100 * self.max_moving:g} %): the camera or the scene moved. "
-                "Average fewer captures, or only still ones"
+                "Average fewer captures, or only still ones; if it is the sensor's noise, raise max_jump"
             )
         confidence = None
         if any(frame.confidence is not None for frame in frames):

@@ -28,10 +28,11 @@ class DecimateDepth(Transform):
 
     factor: Annotated[int, Interval(ge=2, le=MAX_FACTOR)] = 2
     rule: Literal["median", "mean"] = "median"  # the mean mixes the surfaces that meet in a block
+    max_jump: Positive = 0.02  # as a part of the depth: what differs more is another surface
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Reduce every image and rewrite the intrinsics."""
-        depth, pixel_index = decimate_depth(data.depth, factor=self.factor, rule=self.rule)
+        depth, pixel_index = decimate_depth(data.depth, factor=self.factor, rule=self.rule, max_jump=self.max_jump)
         size = (depth.shape[1], depth.shape[2])
         covered = (size[0] * self.factor, size[1] * self.factor)
         camera = data.camera if covered == data.size else data.camera.cropped(0, 0, covered)
@@ -46,15 +47,16 @@ class DecimateDepth(Transform):
 class ResizeDepth(Transform):
     """Sample the images at another size: depth never blends across an edge, labels never blend at all.
 
-    Without ``max_jump`` every pixel takes the nearest reading; with it, depth on one surface is interpolated (exact on
-    planes). Labels, confidence and mask are those of the nearest pixel; colours are filtered against aliasing.
+    Depth on one surface is interpolated, exactly on planes; across edges, beside holes, and everywhere if ``max_jump``
+    is None, a pixel takes the nearest reading, up to half a pixel off. Labels, confidence and mask are those of the
+    nearest pixel; colours are filtered against aliasing.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
     size: tuple[Count, Count]  # (height, width)
-    max_jump: Positive | None = None  # as a part of the depth: what differs more is another surface
+    max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Resize every image and rewrite the intrinsics."""

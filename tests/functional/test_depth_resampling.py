@@ -25,9 +25,19 @@ def blocks(depth: torch.Tensor, factor: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("factor", range(1, 9))
-def test_a_block_becomes_the_lower_median_of_its_readings(factor):
+def test_a_block_becomes_the_median_of_its_readings(factor):
     depth = noisy_image(25, 34)
-    reduced, pixel_index = decimate_depth(depth, factor=factor)
+    reduced, _ = decimate_depth(depth, factor=factor, max_jump=10.0)
+    for place, block in enumerate(blocks(depth, factor).flatten(0, 2).tolist()):
+        readings = [value for value in block if value > 0]
+        expected = statistics.median(readings) if readings else 0.0
+        assert reduced.flatten()[place].item() == pytest.approx(expected, rel=2e-7)
+
+
+@pytest.mark.parametrize("factor", range(1, 9))
+def test_where_the_middle_two_are_two_surfaces_a_block_becomes_the_nearer(factor):
+    depth = noisy_image(25, 34)
+    reduced, pixel_index = decimate_depth(depth, factor=factor, max_jump=1e-9)
     assert reduced.shape == (2, 25 // factor, 34 // factor)
     for place, block in enumerate(blocks(depth, factor).flatten(0, 2).tolist()):
         readings = [value for value in block if value > 0]

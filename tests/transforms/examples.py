@@ -52,7 +52,7 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "DecimateDepth": _of(
         T.DecimateDepth(factor=2),
-        T.DecimateDepth(factor=5),
+        T.DecimateDepth(factor=5, max_jump=0.5),
         T.DecimateDepth(factor=3, rule="mean"),
         make=frame_with_counts,
     ),
@@ -117,7 +117,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
     "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),
     "ResizeDepth": _of(
-        T.ResizeDepth(size=(7, 9)),
+        T.ResizeDepth(size=(7, 9), max_jump=None),
         T.ResizeDepth(size=(24, 31), max_jump=0.3),
         make=frame_with_counts,
     ),
