@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -13,9 +13,9 @@ from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional import rigid
 from pcdata.functional.depth import check_intrinsics, check_lengths, check_rays, pixel_rays
 from pcdata.functional.lens import check_distortion, distort_normalized, fold_radius
+from pcdata.functional.splatting import MAX_PIXELS, ZBuffer, cell_of_pixels, on_one_surface
 
-_INDEX_BITS = 32  # of a key in the z-buffer; the depth's bits lie above them
-_EMPTY = torch.iinfo(torch.int64).max
+_BAND = 1 << 16  # pixels handled at once on a CPU: the dozens of intermediate images stay in a core's cache
 
 
 class RegisteredDepth(NamedTuple):
@@ -27,8 +27,19 @@ class RegisteredDepth(NamedTuple):
     hidden: Tensor  # (V, H, W) bool: a reading that the colour camera does not see; it must not take its colour there
 
 
+class _View(NamedTuple):
+    """One view's depth image and both cameras."""
+
+    depth: Tensor  # (H, W)
+    rays: tuple[Tensor, Tensor]  # x/z and y/z of the depth camera, each (H, W) float32
+    focal: Tensor  # (2,) of the depth camera
+    color_intrinsics: Tensor  # (3, 3)
+    color_from_depth: Tensor  # (4, 4)
+    color_distortion: Tensor | None  # (E,)
+
+
 class _Projection(NamedTuple):
-    """Where the colour camera sees the depth pixels; each (V, H, W)."""
+    """Where the colour camera sees some rows of depth pixels; each (h, W)."""
 
     u: Tensor
     v: Tensor
@@ -86,124 +97,90 @@ def register_depth(
         if lens is not None:
             check_distortion(where, lens)
     rigid.check_rigid(f"{where}: color_from_depth", color_from_depth)
-    if max(depth[0].numel() if len(depth) else 0, color_size[0] * color_size[1]) >= 1 << _INDEX_BITS:
-        raise CaptureError(f"{where}: images of 2^32 pixels and more are not supported")
+    if depth.shape[1] * depth.shape[2] > MAX_PIXELS:
+        raise CaptureError(f"{where}: depth images of more than {MAX_PIXELS} pixels are not supported")
 
     rays = pixel_rays(intrinsics, (depth.shape[1], depth.shape[2]), distortion)
     check_rays(where, rays, depth > 0)
-    seen = _project(depth, rays, color_intrinsics, color_from_depth, color_distortion)
-    half_width, half_height = _half_pixel(depth, seen, intrinsics, color_intrinsics, color_from_depth)
-    linked = _one_surface(depth, seen.visible, max_jump)
-    left, right = _cell(seen.u, half_width, linked)
-    top, bottom = _cell(seen.v, half_height, linked)
-    views = zip(seen.depth, seen.visible, left, right, top, bottom)
-    images = [_rasterize(one[0], one[1], one[2:], color_size) for one in views]
-    nearest = torch.stack(images) if images else torch.empty((0, *color_size), dtype=torch.int64, device=depth.device)
-
-    found = nearest != _EMPTY
-    registered = torch.where(found, (nearest >> _INDEX_BITS).int().view(torch.float32), 0.0)
-    pixel_index = torch.where(found, nearest & ((1 << _INDEX_BITS) - 1), -1)
-    hidden, occluding = _occlusions(seen, depth > 0, registered, max_jump)
-    return RegisteredDepth(registered, pixel_index, occluding, hidden)
+    focal = intrinsics.double().diagonal(dim1=1, dim2=2)[:, :2]
+    lenses = [None] * len(depth) if color_distortion is None else color_distortion.unbind(0)
+    x, y = (part.contiguous() for part in rays.float().unbind(-1))
+    views = zip(depth, zip(x, y), focal, color_intrinsics.double(), color_from_depth, lenses)
+    results = [_register_view(_View(*view), color_size, max_jump) for view in views]
+    if not results:
+        none = torch.empty((0, *color_size), device=depth.device)
+        return RegisteredDepth(none, none.long(), none.bool(), torch.zeros_like(depth, dtype=torch.bool))
+    return RegisteredDepth(*(torch.stack(images) for images in zip(*results, strict=True)))
 
 
-def _project(
-    depth: Tensor, rays: Tensor, intrinsics: Tensor, color_from_depth: Tensor, distortion: Tensor | None
-) -> _Projection:
-    """Move every reading into the colour camera and project it, in float32 (a thousandth of a pixel)."""
-    rays = rays.float()
-    motion = color_from_depth.float()[:, :, :, None, None]
-    x, y = rays[..., 0], rays[..., 1]
-    moved = [
-        (motion[:, axis, 0] * x + motion[:, axis, 1] * y + motion[:, axis, 2]) * depth + motion[:, axis, 3]
-        for axis in range(3)
-    ]
+def _register_view(view: _View, size: tuple[int, int], max_jump: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    buffer = ZBuffer(size, view.depth.device)
+    height, width = view.depth.shape
+    projections = []
+    for start, stop in _bands(view.depth):
+        # One more row on each side: the corners of a pixel depend on its neighbours.
+        first, last = max(0, start - 1), min(height, stop + 1)
+        rows = slice(start - first, stop - first)
+        seen = _project(view, first, last)
+        linked = on_one_surface(torch.where(seen.visible, view.depth[first:last], 0.0), max_jump)
+        half_width, half_height = _half_pixel(view, view.depth[first:last] / seen.depth)
+        left, right = cell_of_pixels(seen.u, half_width, linked)
+        top, bottom = cell_of_pixels(seen.v, half_height, linked)
+        cells = (left[rows], right[rows], top[rows], bottom[rows])
+        buffer.paint(seen.depth[rows], seen.visible[rows], cells, first_index=start * width)
+        projections.append(_Projection(*(image[rows] for image in seen)))
+    registered, pixel_index = buffer.image()
+
+    hidden = torch.empty_like(view.depth, dtype=torch.bool)
+    occluding = torch.zeros(registered.numel(), dtype=torch.bool, device=registered.device)
+    for (start, stop), seen in zip(_bands(view.depth), projections, strict=True):
+        outside, behind, target = _behind(seen, registered, max_jump)
+        hidden[start:stop] = (view.depth[start:stop] > 0) & (outside | behind)
+        occluding[target[behind]] = True
+    return registered, pixel_index, occluding.reshape(size), hidden
+
+
+def _bands(image: Tensor) -> Iterator[tuple[int, int]]:
+    """Yield the first row of every band and the row after its last."""
+    height, width = image.shape
+    rows = max(1, _BAND // max(1, width)) if image.device.type == "cpu" else max(1, height)
+    return ((start, min(height, start + rows)) for start in range(0, height, rows))
+
+
+def _project(view: _View, first: int, last: int) -> _Projection:
+    """Move the readings of some rows into the colour camera and project them, in float32 (a thousandth of a pixel)."""
+    depth = view.depth[first:last]
+    x, y = (part[first:last] for part in view.rays)
+    moved = [((a * x + b * y + c) * depth).add_(d) for a, b, c, d in view.color_from_depth[:3].tolist()]
     visible = (depth > 0) & (moved[2] > 0)
     z = torch.where(visible, moved[2], 1.0)  # what is not visible is not looked at, but must not become NaN
     x, y = moved[0] / z, moved[1] / z
-    if distortion is not None:
-        radius = (x.double().square() + y.double().square()).sqrt()
-        visible &= radius < fold_radius(distortion)[:, None, None]
+    if view.color_distortion is not None:
+        lens = view.color_distortion[None]
+        visible &= (x.double().square() + y.double().square()).sqrt() < fold_radius(lens)
         xy = torch.stack([torch.where(visible, x, 0.0), torch.where(visible, y, 0.0)], dim=-1)
-        x, y = distort_normalized(xy.double(), distortion).float().unbind(-1)
-    k = intrinsics.float()[:, :, :, None, None]
-    u = k[:, 0, 0] * x + k[:, 0, 1] * y + k[:, 0, 2]
-    v = k[:, 1, 1] * y + k[:, 1, 2]
-    return _Projection(u, v, z, visible)
+        x, y = distort_normalized(xy[None].double(), lens)[0].float().unbind(-1)
+    (fx, skew, cx), (_, fy, cy), _ = view.color_intrinsics.tolist()
+    return _Projection(fx * x + skew * y + cx, fy * y + cy, z, visible)
 
 
-def _half_pixel(
-    depth: Tensor, seen: _Projection, intrinsics: Tensor, color_intrinsics: Tensor, color_from_depth: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return half the width and height, in colour pixels, of the box around a depth pixel that faces its camera."""
-    turn = color_from_depth[:, :2, :2].abs() / torch.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], -1)[:, None]
-    focal = torch.stack([color_intrinsics[:, 0, 0], color_intrinsics[:, 1, 1]], -1)
-    extent = (0.5 * focal * turn.sum(-1)).float()[:, :, None, None]
-    nearness = depth / seen.depth
-    return extent[:, 0] * nearness, extent[:, 1] * nearness
+def _half_pixel(view: _View, nearness: Tensor) -> tuple[Tensor, Tensor]:
+    """Return half the width and height, in colour pixels, of the box around a depth pixel that faces its camera.
+
+    Args:
+        view: the cameras.
+        nearness: (h, W) depth in the depth camera over depth in the colour camera.
+    """
+    extent = (view.color_from_depth[:2, :2].abs() / view.focal).sum(1) * view.color_intrinsics.diagonal()[:2]
+    half_width, half_height = (0.5 * extent).tolist()
+    return half_width * nearness, half_height * nearness
 
 
-def _one_surface(depth: Tensor, visible: Tensor, max_jump: float) -> Tensor:
-    """Say for the (V, H - 1, W - 1) inner corners whether the four pixels around lie on one surface."""
-    near = torch.where(visible, depth, 0.0)
-    lows, highs = (combine(near[:, 1:], near[:, :-1]) for combine in (torch.minimum, torch.maximum))
-    low = torch.minimum(lows[..., 1:], lows[..., :-1])
-    high = torch.maximum(highs[..., 1:], highs[..., :-1])
-    return (low > 0) & (high - low <= max_jump * low)
-
-
-def _cell(center: Tensor, half: Tensor, linked: Tensor) -> tuple[Tensor, Tensor]:
-    """Return one coordinate's lower and upper end of every pixel's cell."""
-    columns = center[:, 1:] + center[:, :-1]
-    corner = 0.25 * (columns[..., 1:] + columns[..., :-1])
-    low = _around_pixels(torch.where(linked, corner, torch.inf), torch.inf, torch.minimum)
-    high = _around_pixels(torch.where(linked, corner, -torch.inf), -torch.inf, torch.maximum)
-    half = torch.where(_around_pixels(linked, False, torch.logical_and), -torch.inf, half)  # reaches nowhere
-    return torch.minimum(low, center - half), torch.maximum(high, center + half)
-
-
-def _around_pixels(inner_corners: Tensor, border: float, combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Combine the values of every pixel's four corners: (V, H - 1, W - 1) to (V, H, W)."""
-    corners = torch.nn.functional.pad(inner_corners, (1, 1, 1, 1), value=border)
-    rows = combine(corners[:, 1:], corners[:, :-1])
-    return combine(rows[..., 1:], rows[..., :-1])
-
-
-def _rasterize(
-    depth: Tensor, visible: Tensor, cells: tuple[Tensor, Tensor, Tensor, Tensor], size: tuple[int, int]
-) -> Tensor:  # (Hc, Wc) int64
-    """Return at every colour pixel of one view the smallest key (depth, then index) of the cells over its centre."""
-    height, width = size
-    # Half-open cells: a centre on a shared side belongs to one of the two.
-    left, right = (end.ceil().clamp(0, width).flatten() for end in cells[:2])
-    top, bottom = (end.ceil().clamp(0, height).flatten() for end in cells[2:])
-    pixels = (visible.flatten() & (right > left) & (bottom > top)).nonzero().squeeze(1)
-    first_u, first_v = left[pixels].long(), top[pixels].long()
-    across, down = right[pixels].long() - first_u, bottom[pixels].long() - first_v
-    first = first_v * width + first_u
-    keys = (depth.flatten()[pixels].view(torch.int32).long() << _INDEX_BITS) | pixels
-    nearest = torch.full((height * width,), _EMPTY, device=keys.device)
-    steps_down, steps_across = (int(steps.max()) if len(steps) else 0 for steps in (down, across))
-    for row in range(steps_down):
-        for column in range(steps_across):
-            if row == column == 0:
-                nearest.scatter_reduce_(0, first, keys, "amin")
-                continue
-            reached = ((down > row) & (across > column)).nonzero().squeeze(1)
-            target = first[reached] + (row * width + column)
-            nearest.scatter_reduce_(0, target, keys[reached], "amin")
-    return nearest.reshape(size)
-
-
-def _occlusions(seen: _Projection, readings: Tensor, registered: Tensor, max_jump: float) -> tuple[Tensor, Tensor]:
-    """Return which readings are hidden, (V, H, W), and the colour pixels that hide one, (V, Hc, Wc)."""
-    height, width = registered.shape[1:]
+def _behind(seen: _Projection, registered: Tensor, max_jump: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Say which pixels lie outside the colour image and which behind its surface, and the colour pixel of each."""
+    height, width = registered.shape
     u, v = (seen.u + 0.5).floor_(), (seen.v + 0.5).floor_()
-    inside = seen.visible & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    outside = ~(seen.visible & (u >= 0) & (u < width) & (v >= 0) & (v < height))
     target = v.clamp_(0, height - 1).long().mul_(width).add_(u.clamp_(0, width - 1).long())
-    front = registered.flatten(1).gather(1, target.flatten(1)).reshape(u.shape)
-    behind = inside & (front > 0) & (seen.depth > (1 + max_jump) * front)
-    occluding = torch.zeros_like(registered, dtype=torch.bool)
-    view, row, column = behind.nonzero().unbind(1)
-    occluding.flatten(1)[view, target[view, row, column]] = True
-    return readings & (~inside | behind), occluding
+    front = registered.flatten()[target]
+    return outside, ~outside & (front > 0) & (seen.depth > (1 + max_jump) * front), target
