@@ -3,8 +3,8 @@
     PCDATA_TEST_DATA=... python benchmarks/depth_filters.py     # prints the table, writes results/depth_filters.json
 
 Method: ours and OpenCV's run in turn; each runs once to warm up, then ``--repeats`` times, a peer that takes longer
-than a second only once. Medians and interquartile ranges of wall-clock time are kept; a busy machine shows in the
-range. OpenCV has no operator with the same result for most filters, so each row says what differs. A camera gives 30
+than a second only once. Medians and interquartile ranges of the process's CPU time are kept: with one thread that is
+the time on a core of one's own, whatever else the machine does. OpenCV has no operator with the same result for most filters, so each row says what differs. A camera gives 30
 frames a second, so 33 ms is what a filter may take.
 """
 
@@ -182,9 +182,9 @@ def measure(case: Case, repeats: int) -> Row:
 
 
 def timed(body: Callable[[], Any], seconds: list[float]) -> None:
-    started = time.perf_counter()
+    started = time.process_time()
     body()
-    seconds.append(time.perf_counter() - started)
+    seconds.append(time.process_time() - started)
 
 
 def spread(seconds: list[float]) -> float:
@@ -196,6 +196,7 @@ def write(rows: list[Row], name: str, repeats: int) -> None:
     result = {
         "frame": name,
         "repeats": repeats,
+        "clock": "CPU time of the process",
         "machine": {"cores": os.cpu_count(), "threads": torch.get_num_threads(), "processor": platform.machine()},
         "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__, "opencv": cv2.__version__},
         "rows": [asdict(row) for row in rows],

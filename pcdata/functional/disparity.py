@@ -73,24 +73,27 @@ def spatial_filter(
             f"{where}: needs 0 < alpha <= 1, delta > 0 and iterations >= 1, got {alpha}, {delta}, {iterations}"
         )
     check_lengths(where, "disparity", disparity)
-    values = torch.where(disparity.detach() > 0, disparity.detach(), _HOLE)
+    values = disparity.detach()
+    # The axis gone along comes first, so that every step reads and writes contiguous memory.
+    rows = torch.where(values > 0, values, _HOLE).permute(1, 0, 2).contiguous()  # (H, V, W)
+    columns = torch.empty_like(rows.permute(2, 1, 0), memory_format=torch.contiguous_format)  # (W, V, H)
     for _ in range(iterations):
-        # The axis gone along comes first, so that every step reads and writes contiguous memory.
-        columns_first = values.permute(2, 0, 1).contiguous()
-        _smooth_forth_and_back(columns_first, alpha, delta)
-        rows_first = columns_first.permute(2, 1, 0).contiguous()
-        _smooth_forth_and_back(rows_first, alpha, delta)
-        values = rows_first.permute(1, 0, 2)
-    return values.clamp(min=0).contiguous()
+        columns.copy_(rows.permute(2, 1, 0))
+        _smooth_forth_and_back(columns, alpha, delta)
+        rows.copy_(columns.permute(2, 1, 0))
+        _smooth_forth_and_back(rows, alpha, delta)
+    return rows.clamp_(min=0).permute(1, 0, 2).contiguous()
 
 
 def _smooth_forth_and_back(values: Tensor, alpha: float, delta: float) -> None:
     """Average (L, ...) along L in both directions, in place."""
+    carried = torch.empty_like(values[1:])
+    slices, weights = values.unbind(0), carried.unbind(0)
     for order in (1, -1):
-        same_surface = torch.diff(values, dim=0).abs_() < delta
-        carried = same_surface.to(values.dtype).mul_(1 - alpha)
-        slices, weights = values.unbind(0)[::order], carried.unbind(0)[::order]
-        for previous, current, weight in zip(slices, slices[1:], weights):
+        # 1 - alpha on a surface, 0 across an edge; in place, for at this speed a new image costs more than the sums.
+        torch.sub(values[1:], values[:-1], out=carried).abs_().lt_(delta).mul_(1 - alpha)
+        along = slices[::order]
+        for previous, current, weight in zip(along, along[1:], weights[::order]):
             current.lerp_(previous, weight)
 
 

@@ -33,16 +33,15 @@ class ZBuffer:
 
         Half-open, so that a centre on a side that two cells share belongs to one of them.
         """
-        height, width = self.size
-        left, right = (end.ceil().clamp(0, width).flatten() for end in cells[:2])
-        top, bottom = (end.ceil().clamp(0, height).flatten() for end in cells[2:])
-        pixels = (visible.flatten() & (right > left) & (bottom > top)).nonzero().squeeze(1)
-        if len(pixels) == 0:
+        if depth.numel() == 0:
             return
-        first_u, first_v = left[pixels], top[pixels]
-        across, down = right[pixels] - first_u, bottom[pixels] - first_v
-        first = first_v.long().mul_(width).add_(first_u.long())
-        keys = (depth.flatten()[pixels].view(torch.int32).long() << _INDEX_BITS) | (pixels + first_index)
+        height, width = self.size
+        left, right = (end.ceil().clamp_(0, width).flatten() for end in cells[:2])
+        top, bottom = (end.ceil().clamp_(0, height).flatten() for end in cells[2:])
+        across, down = (right - left).mul_(visible.flatten()), bottom - top
+        first = top.long().mul_(width).add_(left.long())
+        index = torch.arange(first_index, first_index + depth.numel(), device=depth.device)
+        keys = depth.flatten().view(torch.int32).long().bitwise_left_shift_(_INDEX_BITS).bitwise_or_(index)
         for row in range(int(down.max())):
             for column in range(int(across.max())):
                 reached = ((down > row) & (across > column)).nonzero().squeeze(1)
