@@ -11,10 +11,20 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud", "register_to_color"],
+    "pcdata.structures": [
+        "Camera",
+        "Confidence",
+        "DepthFrame",
+        "Kind",
+        "PaddedClouds",
+        "PointCloud",
+        "register_to_color",
+    ],
+    "pcdata.sensors": ["SensorProfile", "sensor_profile"],
     "pcdata.transforms": [
         "Center",
         "ClusterObjects",
+        "CompleteDepth",
         "Compose",
         "CropWorkspace",
         "DecimateDepth",
@@ -22,6 +32,8 @@ _HOMES = {
         "EstimateNormals",
         "FarthestPointSample",
         "FillHoles",
+        "KeepConfidence",
+        "MarkUnreliableDepth",
         "MaskDepth",
         "MergeViews",
         "NormalizeUnitSphere",
@@ -36,6 +48,7 @@ _HOMES = {
         "RandomRotation",
         "RandomSample",
         "RandomScale",
+        "RandomSensorNoise",
         "RandomTranslation",
         "RemoveFlyingPixels",
         "RemovePlane",
@@ -62,7 +75,18 @@ _HOMES = {
     "pcdata.build": ["build_dataset", "load_config"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "report", "structures", "synthetic", "transforms"]
+_SUBMODULES = [
+    "build",
+    "datasets",
+    "errors",
+    "functional",
+    "io",
+    "report",
+    "sensors",
+    "structures",
+    "synthetic",
+    "transforms",
+]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
 

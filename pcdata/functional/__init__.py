@@ -23,6 +23,7 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_minimum,
 )
 
 __all__ = [
@@ -63,4 +64,5 @@ __all__ = [
     "voxel_majority",
     "voxel_mean",
     "voxel_mean_direction",
+    "voxel_minimum",
 ]

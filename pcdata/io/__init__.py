@@ -9,6 +9,7 @@ from pcdata.io.calibration import (
     write_calibration,
     write_pose,
 )
+from pcdata.io.confidence import read_confidence, write_confidence
 from pcdata.io.detect import LAYOUTS, open_source
 from pcdata.io.images import read_color, read_depth, read_labels, read_mask, write_color, write_depth
 from pcdata.io.pcd import read_pcd, write_pcd
@@ -26,6 +27,7 @@ __all__ = [
     "open_source",
     "read_calibration",
     "read_color",
+    "read_confidence",
     "read_depth",
     "read_intrinsics",
     "read_labels",
@@ -35,6 +37,7 @@ __all__ = [
     "read_pose",
     "write_calibration",
     "write_color",
+    "write_confidence",
     "write_depth",
     "write_pcd",
     "write_ply",

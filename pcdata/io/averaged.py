@@ -12,7 +12,7 @@ from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note, near_
 from pcdata.functional.depth_average import DepthAverage, average_depth
 from pcdata.io.source import CaptureSource
 from pcdata.io.still_camera import check_still_camera
-from pcdata.structures import DepthFrame, confidence_of
+from pcdata.structures import Confidence, DepthFrame, confidence_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,8 @@ class AveragedSource:
     was averaged and what was dropped: ``averaged: {frames, readings, jitter, jumps, too_few, noise}``, counts of
     readings and of pixels, and the median standard deviation of a single reading in metres.
 
-    Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras are told
+    Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
+    readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras are told
     by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
     """
 
@@ -94,7 +95,9 @@ class AveragedSource:
             raise
 
     def _average(self, frames: Sequence[DepthFrame], names: Sequence[str]) -> DepthFrame:
+        confidences = torch.stack([confidence_of(frame) for frame in frames])
         depths = torch.stack([frame.depth for frame in frames])
+        depths = torch.where(confidences > int(Confidence.NO_READING), depths, 0.0)
         average = average_depth(
             depths,
             mad_factor=self.mad_factor,
@@ -112,9 +115,8 @@ class AveragedSource:
             )
         confidence = None
         if any(frame.confidence is not None for frame in frames):
-            # A pixel is as good as the worst reading in it; frames without a reading there do not count.
-            seen = torch.where(depths > 0, torch.stack([confidence_of(frame) for frame in frames]), 255).amin(0)
-            confidence = torch.where(average.depth > 0, seen, 0).to(torch.uint8)
+            worst = torch.where(depths > 0, confidences, int(Confidence.RELIABLE)).amin(0)
+            confidence = torch.where(average.depth > 0, worst, int(Confidence.NO_READING)).to(torch.uint8)
         facts = {"frames": list(names), "readings": readings, **_facts(average)}
         provenance = {**frames[0].provenance, "averaged": facts}
         return replace(frames[0], depth=average.depth, confidence=confidence, provenance=provenance)

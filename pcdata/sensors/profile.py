@@ -79,14 +79,14 @@ class SensorProfile:
         """
         return math.hypot(_SIGMAS * self.pitch_at(depth), _SIGMAS * math.sqrt(2.0) * self.noise_at(depth))
 
-    def edge_threshold(self, depth: float) -> float:
+    def edge_threshold(self, depth: Depth, *, focal: float | None = None) -> Depth:
         """Return the depth difference of neighbouring pixels, in metres, above which they lie on two surfaces.
 
         What a surface tilted by 80 degrees steps from pixel to pixel, three standard deviations of the difference of
         two readings, and the rounding of both.
         """
-        step = _STEEPEST * self.pitch_at(depth)
-        return step + _SIGMAS * math.sqrt(2.0) * self.noise_at(depth) + self.depth_step
+        step = _STEEPEST * self.pitch_at(depth, focal=focal)
+        return step + _SIGMAS * math.sqrt(2.0) * self.noise_at(depth, focal=focal) + self.depth_step
 
     def voxel_size(self, depth: float) -> float:
         """Return the finest voxel edge in metres that averages readings rather than repeats their grid.

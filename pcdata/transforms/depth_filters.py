@@ -14,7 +14,7 @@ from pcdata.functional.flying_pixels import flying_pixel_mask
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.structures.filled import with_filled_depth
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count, Metres, Positive
+from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
 
 
 class SpatialFilterDepth(Transform):
@@ -72,7 +72,8 @@ class RemoveFlyingPixels(Transform):
     takes = DepthFrame
     gives = DepthFrame
 
-    tolerance: Positive = 0.02  # as a part of the depth: neighbours that differ more lie on two surfaces
+    # As a part of the depth: neighbours that differ more lie on two surfaces.
+    tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02
     min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3  # of the eight, on the reading's own surface
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:

@@ -137,6 +137,17 @@ def test_an_average_is_as_reliable_as_its_worst_reading():
     assert bool((frame.confidence[frame.depth == 0] == Confidence.NO_READING).all())
 
 
+def test_readings_that_are_not_trusted_count_for_nothing():
+    captures = recording(4)
+    depth = captures.load("0-2").depth
+    untrusted = torch.zeros(depth.shape, dtype=torch.uint8)
+    with_wrong = with_frame(captures, 2, depth=depth + 1.0, confidence=untrusted)
+    without = with_frame(captures, 2, depth=torch.zeros_like(depth))
+    found, expected = (AveragedSource(source=one, num_frames=4).load("0-0") for one in (with_wrong, without))
+    assert torch.equal(found.depth, expected.depth)
+    assert torch.equal(found.confidence > 0, found.depth > 0)
+
+
 def test_groups_must_come_out_even_and_samples_must_exist():
     with pytest.raises(CaptureError, match="10 captures are no whole number of groups of 4"):
         AveragedSource(source=recording(10), num_frames=4)

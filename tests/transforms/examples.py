@@ -36,6 +36,9 @@ EXAMPLES: dict[str, list[Example]] = {
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
     ),
+    "CompleteDepth": _of(
+        T.CompleteDepth(completion="smooth"), T.CompleteDepth(completion="nearest", reach=1), make=frame_with_counts
+    ),
     "Compose": [
         Example(
             T.Compose([T.CropWorkspace(frame="base", **BOX), T.NormalizeUnitSphere(), T.RandomRotation(axis=None)])
@@ -67,10 +70,18 @@ EXAMPLES: dict[str, list[Example]] = {
         T.FillHoles(max_size=1),
         make=frame_with_counts,
     ),
+    "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
+    "MarkUnreliableDepth": _of(
+        T.MarkUnreliableDepth(sensor="realsense_d435"),
+        T.MarkUnreliableDepth(sensor="kinect_v1", enclosed=False),
+        T.MarkUnreliableDepth(sensor="photoneo_phoxi_m", rough=False),
+        make=frame_with_counts,
+    ),
     "MaskDepth": _of(
         T.MaskDepth(near=0.6, far=0.9),
         T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
         T.MaskDepth(require_mask=True),
+        T.MaskDepth(min_confidence="completed"),
         make=frame_with_counts,
     ),
     "MergeViews": _of(T.MergeViews()),
@@ -104,6 +115,11 @@ EXAMPLES: dict[str, list[Example]] = {
         *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
     "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
+    "RandomSensorNoise": _of(
+        T.RandomSensorNoise(sensor="realsense_d435"),
+        T.RandomSensorNoise(sensor="azure_kinect_nfov", strength=0.5, edge_dropout=0.1, grazing_degrees=70.0),
+        make=frame_with_counts,
+    ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
