@@ -4,8 +4,8 @@
 
 Method: ours and OpenCV's run in turn; each runs once to warm up, then ``--repeats`` times, a peer that takes longer
 than a second only once. Medians and interquartile ranges of the process's CPU time are kept: with one thread that is
-the time on a core of one's own, whatever else the machine does. OpenCV has no operator with the same result for most filters, so each row says what differs. A camera gives 30
-frames a second, so 33 ms is what a filter may take.
+the time on a core of one's own, whatever else the machine does. OpenCV has no operator with the same result for most
+filters, so each row says what differs. A camera gives 30 frames a second, so 33 ms is what a filter may take.
 """
 
 from __future__ import annotations

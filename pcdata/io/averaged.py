@@ -24,8 +24,8 @@ class AveragedSource:
     readings and of pixels, and the median standard deviation of a single reading in metres.
 
     Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
-    readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras are told
-    by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
+    readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras
+    are told by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
     """
 
     source: CaptureSource

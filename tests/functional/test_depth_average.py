@@ -12,7 +12,7 @@ from pcdata.functional import average_depth
 from pcdata.functional.sorting import network, pick_image, sort_images
 from pcdata.rng import seeded
 from pcdata.synthetic import tabletop
-from pcdata.synthetic.noise import facing_depth
+from tests.factories import depth_edges
 
 
 def pixel(*readings: float) -> torch.Tensor:
@@ -103,7 +103,7 @@ def test_ten_frames_cut_the_noise_to_a_third_and_do_not_move_edges(seed):
     depths = torch.stack([frame.depth for frame in scene.noisy_frames(10)])
     truth = scene.truth.depth.float()
     average = average_depth(depths)
-    across, edge = facing_depth(truth.double(), 0.02)
+    across, edge = depth_edges(truth.double(), 0.02)
     beside_edge = torch.nn.functional.max_pool2d(edge.float(), 5, 1, 2) > 0
 
     inside = ~beside_edge & (depths > 0).all(0)

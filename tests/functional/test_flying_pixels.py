@@ -11,7 +11,7 @@ from pcdata.errors import ConfigError
 from pcdata.functional import flying_pixel_mask
 from pcdata.rng import seeded
 from pcdata.synthetic import SensorNoise, tabletop
-from pcdata.synthetic.noise import facing_depth
+from tests.factories import depth_edges
 
 
 def counted(depth: torch.Tensor, tolerance: float, min_neighbors: int) -> torch.Tensor:
@@ -46,7 +46,7 @@ def test_mixed_pixels_go_and_good_ones_stay(seed, flying, dropout):
     scene = tabletop(seed, num_objects=5, noise=noise)
     unmixed = tabletop(seed, num_objects=5, noise=dataclasses.replace(noise, flying_pixels=0.0)).frame.depth
     depth, truth = scene.frame.depth, scene.truth.depth
-    across, _ = facing_depth(truth, 0.02)
+    across, _ = depth_edges(truth, 0.02)
     mixed = (depth > 0) & (depth != unmixed)
     # A mixture that is almost one of the two sides lies on that surface: nobody could tell it from a reading there.
     in_the_air = mixed & ((depth - truth).abs() > 0.02 * truth) & ((depth - across).abs() > 0.02 * across)

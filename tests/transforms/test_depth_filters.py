@@ -11,9 +11,8 @@ from pcdata.errors import ConfigError
 from pcdata.functional import depth_to_disparity, spatial_filter
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.synthetic import SensorNoise, tabletop
-from pcdata.synthetic.noise import facing_depth
 from pcdata.transforms import Compose, FillHoles, RemoveFlyingPixels, SpatialFilterDepth
-from tests.factories import frame_with_counts
+from tests.factories import depth_edges, frame_with_counts
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def bare(depth: torch.Tensor) -> DepthFrame:
 
 def test_the_spatial_filter_halves_the_noise_of_surfaces_and_keeps_edges_within_a_pixel(noisy):
     truth = noisy.truth.depth.float()
-    across, edge = facing_depth(truth.double(), 0.05)
+    across, edge = depth_edges(truth.double(), 0.05)
     inside = (torch.nn.functional.max_pool2d(edge.float(), 7, 1, 3) == 0) & (noisy.frame.depth > 0)
     filtered = SpatialFilterDepth()(noisy.frame).depth
     before, after = ((depth - truth)[inside].square().mean().sqrt() for depth in (noisy.frame.depth, filtered))
