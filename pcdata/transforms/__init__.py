@@ -8,6 +8,8 @@ from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
+from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.inpainting import NearestCompletion, SmoothCompletion
@@ -27,9 +29,11 @@ __all__ = [
     "CompleteDepth",
     "Compose",
     "CropWorkspace",
+    "DecimateDepth",
     "Deproject",
     "EstimateNormals",
     "FarthestPointSample",
+    "FillHoles",
     "KeepConfidence",
     "MarkUnreliableDepth",
     "MaskDepth",
@@ -50,11 +54,14 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
+    "ResizeDepth",
     "SelectTransform",
     "SmoothCompletion",
+    "SpatialFilterDepth",
     "SpatialTransform",
     "SplitObjects",
     "ToFrame",

@@ -53,11 +53,22 @@ EXAMPLES: dict[str, list[Example]] = {
         T.CropWorkspace(frame="base", **BOX),
         T.CropWorkspace(frame="base", frame_from_box=QUARTER_TURN, lower=(0.1, 0.0, -0.5), upper=(0.5, 0.3, 0.5)),
     ),
+    "DecimateDepth": _of(
+        T.DecimateDepth(factor=2),
+        T.DecimateDepth(factor=5, max_jump=0.5),
+        T.DecimateDepth(factor=3, rule="mean"),
+        make=frame_with_counts,
+    ),
     "Deproject": _of(T.Deproject(), make=frame_with_counts),
     "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(max_neighbors=8, orient="none")),
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+    ),
+    "FillHoles": _of(
+        *(T.FillHoles(rule=rule, max_distance=2) for rule in ("left", "farthest", "nearest")),
+        T.FillHoles(max_size=1),
+        make=frame_with_counts,
     ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MarkUnreliableDepth": _of(
@@ -110,12 +121,27 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RemoveFlyingPixels": _of(
+        T.RemoveFlyingPixels(),
+        T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
+        make=frame_with_counts,
+    ),
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),
         T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, seed=4),
     ),
     "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
     "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),
+    "ResizeDepth": _of(
+        T.ResizeDepth(size=(7, 9), max_jump=None),
+        T.ResizeDepth(size=(24, 31), max_jump=0.3),
+        make=frame_with_counts,
+    ),
+    "SpatialFilterDepth": _of(
+        T.SpatialFilterDepth(),
+        T.SpatialFilterDepth(alpha=0.3, delta=5.0, iterations=1, hole_fill_radius=2, baseline=0.1),
+        make=frame_with_counts,
+    ),
     "SplitObjects": _of(T.SplitObjects()),
     "ToFrame": [
         Example(T.ToFrame(frame="base"), cloud_in_camera),

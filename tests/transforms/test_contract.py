@@ -277,6 +277,7 @@ def changed_values(value: Any) -> list[Any]:
             "kinect_v1",
             "hallucinated",
             "nearest",
+            "mean",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]
