@@ -32,8 +32,8 @@ def estimate_normals(
     """Estimate each point's normal: the direction in which its neighbourhood varies least.
 
     The neighbourhood is the nearest ``max_neighbors`` points with d < radius, the point itself included; its covariance
-    and eigenvectors are float64. Where no direction stands out, one is agreed on: fewer than three neighbours, or spread
-    equally in all directions, give (0, 0, 1); neighbours on a line along d, or spread equally across d, give the
+    and eigenvectors are float64. Where no direction stands out, one is agreed on: fewer than three neighbours, or an
+    equal spread in all directions, give (0, 0, 1); neighbours on a line along d, or spread equally across d, give the
     direction across d and across (0, d_z, -d_y), or across d and (-d_z, 0, d_x) where d_x is larger than d_y. The sign
     is a convention: the last component of (x, y, z) that is not 0 is positive, so z >= 0; use :func:`orient_normals`
     to face the camera.
