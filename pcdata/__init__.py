@@ -46,9 +46,21 @@ _HOMES = {
     "pcdata.io": ["open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
+    "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "report", "structures", "synthetic", "transforms"]
+_SUBMODULES = [
+    "build",
+    "datasets",
+    "errors",
+    "functional",
+    "io",
+    "report",
+    "structures",
+    "synthetic",
+    "transforms",
+    "validation",
+]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
 

@@ -22,7 +22,7 @@ LAYERS = [
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
     {"io", "transforms", "synthetic"},
-    {"datasets"},
+    {"datasets", "validation"},
     {"build"},
     {"report"},
     {"demo", "cli", "__main__"},

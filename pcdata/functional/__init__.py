@@ -2,14 +2,19 @@
 
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.depth import deproject_depth, pixel_rays, project_points, range_to_depth
+from pcdata.functional.edge_offset import EdgeOffset, EdgeVotes, edge_votes, offset_from_votes
+from pcdata.functional.extremes import pile_at_extreme
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.lens import distort_normalized, undistort_normalized
 from pcdata.functional.metrics import chamfer_distance
+from pcdata.functional.missing_region import largest_missing_region
 from pcdata.functional.neighbors import ball_query, knn
 from pcdata.functional.normals import estimate_normals, orient_normals
+from pcdata.functional.occlusion_edges import occlusion_edges
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
+from pcdata.functional.view_agreement import view_agreement
 from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_downsample,
@@ -19,17 +24,24 @@ from pcdata.functional.voxels import (
 )
 
 __all__ = [
+    "EdgeOffset",
+    "EdgeVotes",
     "ImageGrid",
     "ball_query",
     "chamfer_distance",
     "dbscan",
     "deproject_depth",
     "distort_normalized",
+    "edge_votes",
     "estimate_normals",
     "farthest_point_sample",
     "find_voxel_size",
     "knn",
+    "largest_missing_region",
+    "occlusion_edges",
+    "offset_from_votes",
     "orient_normals",
+    "pile_at_extreme",
     "pixel_rays",
     "project_points",
     "radius_outlier_mask",
@@ -38,6 +50,7 @@ __all__ = [
     "ransac_plane",
     "statistical_outlier_mask",
     "undistort_normalized",
+    "view_agreement",
     "voxel_downsample",
     "voxel_majority",
     "voxel_mean",
