@@ -18,7 +18,8 @@ NAME = "pose_direction"
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 _LEAST_COMPARED = 200  # readings that two views must share before they can be said to agree or not
 _AGREE = 0.5  # of the readings compared: under a wrong pose few agree, and those by chance
-_MARGIN = 0.2  # by which another convention must agree better to be named
+_SURE = 0.9  # when so many agree, no other convention can agree much better
+_MARGIN = 0.1  # by which another convention must agree better to be named
 _LEAST_MOTION = (0.02, 0.035)  # metres, radians: closer cameras agree under every convention
 
 
@@ -100,18 +101,17 @@ def direction_check(pairs: Sequence[tuple[PosedView, PosedView]], who: str) -> C
     share = _share(given)
     verdict, advice = Verdict.PASS, ""
     found = f"{who} agree at {100 * share:.0f} % of {given.compared:,} readings that both can see"
-    if given.compared < _LEAST_COMPARED or share < _AGREE:
-        shares = {name: _share(_agreement(pairs, read)) for name, read in CONVENTIONS.items()}
-        name = max(shares, key=lambda one: shares[one])
-        if shares[name] >= max(_AGREE, share + _MARGIN):
-            verdict = Verdict.FAIL
-            found += f"; {100 * shares[name]:.0f} % would if the poses were {name}"
-            advice = f"the poses look like {name}: convert them to world_from_camera with OpenCV axes, in metres"
-        elif given.compared < _LEAST_COMPARED:
-            verdict, found = Verdict.WARN, f"not measurable: {who} see hardly anything in common"
-        else:
-            verdict = Verdict.WARN
-            advice = "the views agree under no convention: is the calibration old, the scene moving, the unit wrong?"
+    shares = {name: _share(_agreement(pairs, read)) for name, read in CONVENTIONS.items()} if share < _SURE else {}
+    name = max(shares, key=lambda one: shares[one], default="")
+    if shares and shares[name] >= max(_AGREE, share + _MARGIN):
+        verdict = Verdict.FAIL
+        found += f"; {100 * shares[name]:.0f} % would if the poses were {name}"
+        advice = f"the poses look like {name}: convert them to world_from_camera with OpenCV axes, in metres"
+    elif given.compared < _LEAST_COMPARED:
+        verdict, found = Verdict.WARN, f"not measurable: {who} see hardly anything in common"
+    elif share < _AGREE:
+        verdict = Verdict.WARN
+        advice = "the views agree under no convention: is the calibration old, the scene moving, the unit wrong?"
     return Check(
         name=NAME,
         verdict=verdict,
