@@ -9,7 +9,7 @@ from pcdata.errors import ConfigError, near_matches
 
 KERNELS = ("tukey", "huber", "trimmed", "none")
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
-_TUKEY = 4.685  # times sigma: 95 % efficiency on normal residuals (Holland & Welsch 1977)
+TUKEY_CUT = 4.685  # times sigma: 95 % efficiency on normal residuals (Holland & Welsch 1977)
 _HUBER = 1.345  # likewise
 _KEPT_BY_TRIMMING = 0.8  # the smaller residuals that a trimmed fit keeps (Chetverikov et al. 2002)
 
@@ -43,4 +43,4 @@ def robust_weights(residuals: Tensor, scale: Tensor, kernel: str) -> Tensor:  # 
     in_scales = torch.where(size > 0, size / scale.clamp(min=1e-300), 0.0)
     if kernel == "huber":
         return (_HUBER / in_scales.clamp(min=_HUBER)).to(residuals.dtype)
-    return (1 - (in_scales / _TUKEY).clamp(max=1).square()).square()
+    return (1 - (in_scales / TUKEY_CUT).clamp(max=1).square()).square()

@@ -67,11 +67,14 @@ class DepthSurface:
         *,
         max_samples: int,
     ) -> DepthSurface:
-        """Fit planes to the windows of a depth image; the samples are every n-th row and column of them."""
+        """Fit planes to the windows of a depth image, and sample them where they are worth most.
+
+        On flat ground every fourth window suffices, since they share their pixels; elsewhere every window is a sample.
+        """
         planes = fit_depth_planes(depth, intrinsics, distortion)
-        spaced = torch.zeros_like(planes.depth, dtype=torch.bool)
-        spaced[::2, ::2] = True  # every second: neighbouring windows share two thirds of their pixels
-        rows = ((planes.depth > 0) & spaced).flatten().nonzero().squeeze(1)
+        spaced = torch.zeros_like(planes.is_flat)
+        spaced[::4, ::4] = True
+        rows = ((planes.depth > 0) & (spaced | ~planes.is_flat)).flatten().nonzero().squeeze(1)
         rows = evenly(rows, max_samples)
         samples = Samples(
             planes.points.reshape(-1, 3)[rows],

@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional import rigid
 from pcdata.functional.registration import measured_normal_noise
-from pcdata.functional.robust import robust_scale, robust_weights
+from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights
 from pcdata.functional.small_motions import (
     PlaneSystem,
     TwistSolution,
@@ -25,7 +25,7 @@ from pcdata.functional.surfaces import Surface
 
 # Both directions of a pair measure the same surfaces with the same pixels, and neighbouring windows share some.
 _SHARED_DATA = 4.0
-_MIN_SCALE = 0.5  # of whitened residuals: two exact depth images should not make each other infinitely certain
+_MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,8 @@ class ViewAlignment:
     motions: Tensor  # (V, 4, 4) float64; the identity for the view that was fixed
     twists: Tensor  # (V, 6) float64 of the motions about pivot: rotation vector, translation
     covariance: Tensor  # (6V, 6V) float64 of the twists, 0 for the fixed view and along unobservable directions
-    pivot: Tensor  # (3,) float64, the middle of the overlap
+    unobservable: Tensor  # (M, 6V) float64, twists of all views together that were not moved along
+    pivot: Tensor  # (3,) float64, the middle of the samples
     before: tuple[PairFit, ...]  # both directions of every pair, as given
     after: tuple[PairFit, ...]  # the same with the motions applied, at the last distance
     iterations: int
@@ -61,7 +62,7 @@ def align_views(
     world_from_view: Tensor,  # (V, 4, 4) float64
     *,
     fixed: int = 0,
-    max_distances: Sequence[float] = (0.06, 0.03, 0.015),
+    max_distances: Sequence[float] = (0.06, 0.03, 0.015, 0.008, 0.004),
     max_angle: float = 0.6,
     max_iterations: int = 8,
 ) -> ViewAlignment:
@@ -111,6 +112,7 @@ def align_views(
         motions=motions,
         twists=twist_from_motion(motions, pivot),
         covariance=_SHARED_DATA * solution.covariance,
+        unobservable=solution.unobservable,
         pivot=pivot,
         before=before,
         after=fits,
@@ -160,7 +162,10 @@ def _measure(
     points = points @ world_from_target[:3, :3].T + world_from_target[:3, 3]
     normals = normals @ world_from_target[:3, :3].T
     scale = robust_scale(residual / sigma).clamp(min=_MIN_SCALE)
-    weights = robust_weights(residual / sigma, scale, "tukey") / (sigma * scale).square()
+    # Tukey's cut is the distance of this scale, not the spread of the residuals: most of them lie on the table, which
+    # fits however far the view slid along it, and would have the sides of the objects thrown out as outliers.
+    cut = residual.new_tensor(max_distance / TUKEY_CUT)
+    weights = robust_weights(residual, cut, "tukey") / (sigma * scale).square()
     system = plane_system(points, normals, residual, weights, pivot=pivot, normal_noise=noise)
     return PairFit(source, target, residual, points, num_samples, num_visible, system, float(scale))
 
