@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,9 +10,9 @@ from torch import Tensor
 
 from pcdata.functional.depth import pixel_rays
 
-# Half the width of a window, as a tangent: 8.5 mm at 1 m. Narrower leaves the normals of a stereo camera noisier than
-# 3 degrees; wider loses the sides of small objects.
-_HALF_WINDOW = 0.0085
+# Half the width of a window, as a tangent: 5.5 mm at 1 m. Wider loses the sides of small objects, which alone show a
+# camera that slid along the table; narrower leaves their normals too noisy to tell relief from noise.
+_HALF_WINDOW = 0.0055
 _MIN_VALID = 0.7  # of a window's pixels
 _MAX_ROUGHNESS = 2.0  # times the image's median residual: windows across an edge, or on strongly bent surfaces
 _FLOOR_ROUGHNESS = 3e-4  # metres: what a perfect sensor's curved surfaces are allowed
@@ -28,6 +29,7 @@ class DepthPlanes:
     normals: Tensor  # (h, w, 3) float64 unit, towards the camera
     depth: Tensor  # (h, w) float64 of the points, 0 = the window holds no plane
     sigma: Tensor  # (h, w) float64 metres, standard deviation of the plane along its normal at its point
+    normal_sigma: Tensor  # (h, w) float64 radians, standard deviation of the normal along each tangent
     is_flat: Tensor  # (h, w) bool, the plane is that of a window three times as wide
     first: int  # pixel coordinate of the first window's centre, both ways
     stride: int  # pixels between windows
@@ -68,13 +70,16 @@ def fit_depth_planes(
     cosine = inverse_depth / (length * rays.norm(dim=-1))
     holds = smooth & (cosine >= _MIN_COSINE) & (inverse_depth > 0)
     safe = torch.where(holds, inverse_depth, 1.0)
+    # An error e of 1/z moves the surface by e / (1/z) / |coefficients| along its normal.
+    sigma = torch.where(holds, noise / (safe * length) / count.sqrt(), 0.0)
+    across = torch.where(is_flat, 3.0, 1.0) * window / float(intrinsics[0, 0]) / safe  # metres, the narrower way
     return DepthPlanes(
         coefficients=coefficients,
         points=rays / safe[..., None],
         normals=-coefficients / torch.where(holds, length, 1.0)[..., None],
         depth=torch.where(holds, 1 / safe, 0.0),
-        # An error e of 1/z moves the surface by e / (1/z) / |coefficients| along its normal.
-        sigma=torch.where(holds, noise / (safe * length) / count.sqrt(), 0.0),
+        sigma=sigma,
+        normal_sigma=math.sqrt(12) * sigma / across,  # of the slope of a line fitted over a width
         is_flat=is_flat & holds,
         first=window // 2,
         stride=stride,

@@ -159,9 +159,9 @@ def icp_point_to_plane(
         normals = target_normals[found.target_index].double()
         pivot = points.mean(0)
         sigma = robust_scale(found.residual) if scale is None else found.residual.new_tensor(scale)
-        noise = measured_normal_noise(turned[found.source_index], normals)
+        noise = _normal_noise(turned[found.source_index], normals)
         weights = robust_weights(found.residual, sigma, kernel)
-        system = plane_system(points, normals, found.residual, weights, pivot=pivot, normal_noise=noise)
+        system = plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)
         return pivot, found, system, weights
 
     iterations, converged = 0, False
@@ -190,7 +190,7 @@ def icp_point_to_plane(
     )
 
 
-def measured_normal_noise(normals: Tensor, partners: Tensor) -> float:
+def _normal_noise(normals: Tensor, partners: Tensor) -> float:
     """Return how far normals err along each tangent, in radians, from the median angle between (M, 3) partners."""
     if len(normals) == 0:
         return _MIN_NORMAL_NOISE

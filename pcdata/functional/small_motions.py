@@ -49,7 +49,7 @@ def plane_system(
     weights: Tensor,  # (N,) float64
     *,
     pivot: Tensor,  # (3,) float64
-    normal_noise: float,  # radians, standard deviation of the normals along each tangent
+    normal_sigma: float | Tensor,  # radians, () or (N,): standard deviation of the normals along each tangent
 ) -> PlaneSystem:
     """Build the 6x6 normal equations of moving the points onto the planes.
 
@@ -61,9 +61,10 @@ def plane_system(
     weighted = jacobian * weights[:, None]
     information = weighted.T @ jacobian
     # A normal off by d, d across n with covariance s^2 (I - n n^T), changes J by B d, where B n = J:
-    # so the expected extra information is s^2 (sum w B B^T - sum w J J^T).
-    isotropic = _isotropic_information(arm, weights)
-    return PlaneSystem(information, weighted.T @ residuals, normal_noise**2 * (isotropic - information))
+    # so the expected extra information is sum w s^2 (B B^T - J J^T).
+    noise = weights * normal_sigma**2
+    feigned = _isotropic_information(arm, noise) - (jacobian * noise[:, None]).T @ jacobian
+    return PlaneSystem(information, weighted.T @ residuals, feigned)
 
 
 def solve_observable(system: PlaneSystem) -> TwistSolution:

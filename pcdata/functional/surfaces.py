@@ -13,6 +13,7 @@ from pcdata.functional.depth_planes import DepthPlanes, fit_depth_planes
 from pcdata.functional.neighbors import ball_query, knn
 
 _FLOOR_SIGMA = 5e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_FLOOR_NORMAL_SIGMA = 0.005  # radians, 0.3 degrees; likewise for normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +23,7 @@ class Samples:
     points: Tensor  # (N, 3) float64
     normals: Tensor  # (N, 3) float64 unit
     sigma: Tensor  # (N,) float64 metres along the normal
+    normal_sigma: Tensor  # (N,) float64 radians, of the normal along each tangent
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,7 @@ class Matches:
     residual: Tensor  # (M,) float64 metres, normal . (sample - this surface)
     normals: Tensor  # (M, 3) float64 unit, of this surface
     sigma: Tensor  # (M,) float64 metres, of this surface along its normal
+    normal_sigma: Tensor  # (M,) float64 radians, of these normals along each tangent
     num_visible: int  # samples that this view could see: inside its image, in front of nothing that hides them
 
 
@@ -69,17 +72,16 @@ class DepthSurface:
     ) -> DepthSurface:
         """Fit planes to the windows of a depth image, and sample them where they are worth most.
 
-        On flat ground every fourth window suffices, since they share their pixels; elsewhere every window is a sample.
+        Every direction that surfaces face gets an equal share, so the table does not outvote the sides of the objects.
         """
         planes = fit_depth_planes(depth, intrinsics, distortion)
-        spaced = torch.zeros_like(planes.is_flat)
-        spaced[::4, ::4] = True
-        rows = ((planes.depth > 0) & (spaced | ~planes.is_flat)).flatten().nonzero().squeeze(1)
-        rows = evenly(rows, max_samples)
+        rows = (planes.depth > 0).flatten().nonzero().squeeze(1)
+        rows = rows[evenly_by_direction(planes.normals.reshape(-1, 3)[rows], max_samples)]
         samples = Samples(
             planes.points.reshape(-1, 3)[rows],
             planes.normals.reshape(-1, 3)[rows],
             planes.sigma.flatten()[rows].clamp(min=_FLOOR_SIGMA),
+            planes.normal_sigma.flatten()[rows].clamp(min=_FLOOR_NORMAL_SIGMA),
         )
         return cls(planes, intrinsics.double(), distortion, (depth.shape[0], depth.shape[1]), samples)
 
@@ -107,8 +109,15 @@ class DepthSurface:
         residual = (1 - (plane * points[rows]).sum(1)) / plane.norm(dim=1)
         near = (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
         near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
-        sigma = planes.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA)
-        return Matches(rows[near], residual[near], normal[near], sigma[near], len(rows))
+        index = index[near]
+        return Matches(
+            rows[near],
+            residual[near],
+            normal[near],
+            planes.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA),
+            planes.normal_sigma.flatten()[index].clamp(min=_FLOOR_NORMAL_SIGMA),
+            len(rows),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +155,17 @@ class CloudSurface:
             normals = torch.where((normals * toward).sum(1, keepdim=True) < 0, -normals, normals)
         roughness = values[:, 0].clamp(min=0).sqrt()
         flat = roughness <= torch.maximum(2 * roughness.median(), roughness.new_tensor(3e-4)) if len(rows) else enough
-        sigma = (roughness / number[:, 0].sqrt()).clamp(min=_FLOOR_SIGMA)
-        patches = Samples((center + mean)[flat], normals[flat], sigma[flat])
+        sigma = roughness / number[:, 0].sqrt()
+        reach = values[:, 1].clamp(min=1e-12).sqrt()  # standard deviation along the narrower tangent
+        patches = Samples(
+            (center + mean)[flat],
+            normals[flat],
+            sigma[flat].clamp(min=_FLOOR_SIGMA),
+            (sigma / reach)[flat].clamp(min=_FLOOR_NORMAL_SIGMA),
+        )
         kept = evenly(torch.arange(len(patches.points), device=points.device), max_samples)
-        return cls(patches, Samples(patches.points[kept], patches.normals[kept], patches.sigma[kept]))
+        picked = (patches.points, patches.normals, patches.sigma, patches.normal_sigma)
+        return cls(patches, Samples(*(values[kept] for values in picked)))
 
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Measure samples against the plane of the nearest patch; the side that a normal points to is ignored."""
@@ -162,7 +178,8 @@ class CloudSurface:
         rows, index = rows[alike], index[alike]
         normal = torch.where(cosine[alike, None] < 0, -normal[alike], normal[alike])
         residual = (normal * (points[rows] - self.patches.points[index])).sum(1)
-        return Matches(rows, residual, normal, self.patches.sigma[index], len(points))
+        patches = self.patches
+        return Matches(rows, residual, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
 
 
 def evenly(rows: Tensor, count: int) -> Tensor:
@@ -170,3 +187,22 @@ def evenly(rows: Tensor, count: int) -> Tensor:
     if len(rows) <= count:
         return rows
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]
+
+
+def evenly_by_direction(normals: Tensor, count: int) -> Tensor:  # (N, 3) unit -> (M,) int64, M <= count
+    """Choose at most ``count`` rows so that the directions share them equally, evenly spaced within each.
+
+    A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0.
+
+    Source: normal-space sampling, Rusinkiewicz & Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
+    """
+    signs = torch.where(normals.abs() < 0.4, 0.0, normals.sign()).long() + 1
+    box = (signs * signs.new_tensor([9, 3, 1])).sum(1)
+    sizes = torch.bincount(box, minlength=27)
+    # The largest equal share: boxes with fewer rows leave theirs to the others.
+    share, left, waiting = 0, count, int((sizes > 0).sum())
+    for size in sorted(size for size in sizes.tolist() if size):
+        share = max(share, left // waiting)
+        left, waiting = left - min(size, share), waiting - 1
+    chosen = [evenly((box == one).nonzero().squeeze(1), share) for one in sizes.nonzero().squeeze(1).tolist()]
+    return torch.cat([normals.new_empty(0, dtype=torch.int64), *chosen]).sort().values

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional import rigid
-from pcdata.functional.registration import measured_normal_noise
 from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights
 from pcdata.functional.small_motions import (
     PlaneSystem,
@@ -154,11 +153,11 @@ def _measure(
         normals = samples.normals @ rotation.T
         found = capture[target].match(points, normals, max_distance=max_distance, max_angle=max_angle)
         sigma = (samples.sigma[found.row].square() + found.sigma.square()).sqrt()
-        parts.append((found.residual, points[found.row], found.normals, normals[found.row], sigma))
+        tilt = (samples.normal_sigma[found.row].square() + found.normal_sigma.square()).sqrt()
+        parts.append((found.residual, points[found.row], found.normals, sigma, tilt))
         num_samples += len(points)
         num_visible += found.num_visible
-    residual, points, normals, own_normals, sigma = (torch.cat(part) for part in zip(*parts))
-    noise = measured_normal_noise(own_normals, normals)
+    residual, points, normals, sigma, tilt = (torch.cat(part) for part in zip(*parts))
     points = points @ world_from_target[:3, :3].T + world_from_target[:3, 3]
     normals = normals @ world_from_target[:3, :3].T
     scale = robust_scale(residual / sigma).clamp(min=_MIN_SCALE)
@@ -166,7 +165,7 @@ def _measure(
     # fits however far the view slid along it, and would have the sides of the objects thrown out as outliers.
     cut = residual.new_tensor(max_distance / TUKEY_CUT)
     weights = robust_weights(residual, cut, "tukey") / (sigma * scale).square()
-    system = plane_system(points, normals, residual, weights, pivot=pivot, normal_noise=noise)
+    system = plane_system(points, normals, residual, weights, pivot=pivot, normal_sigma=tilt)
     return PairFit(source, target, residual, points, num_samples, num_visible, system, float(scale))
 
 
