@@ -43,12 +43,23 @@ _HOMES = {
         "Transform",
         "VoxelDownsample",
     ],
-    "pcdata.io": ["open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
+    "pcdata.io": ["Calibration", "open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-_SUBMODULES = ["build", "datasets", "errors", "functional", "io", "report", "structures", "synthetic", "transforms"]
+_SUBMODULES = [
+    "build",
+    "calibration",
+    "datasets",
+    "errors",
+    "functional",
+    "io",
+    "report",
+    "structures",
+    "synthetic",
+    "transforms",
+]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]
 

@@ -57,6 +57,10 @@ class CaptureError(PcdataError, ValueError):
     """A raw capture (depth, colour, intrinsics, pose, cloud file) cannot be trusted."""
 
 
+class CalibrationError(PcdataError, ValueError):
+    """A calibration file is wrong, or what was given cannot determine a calibration."""
+
+
 class CacheError(PcdataError, RuntimeError):
     """A stored dataset is damaged, hostile, incomplete or made by another pipeline."""
 
