@@ -22,8 +22,8 @@ LAYERS = [
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
     {"io", "transforms", "synthetic"},
-    {"datasets", "calibration"},
-    {"build"},
+    {"datasets", "validation"},
+    {"build", "calibration"},
     {"report"},
     {"demo", "cli", "__main__"},
 ]

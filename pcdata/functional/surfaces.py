@@ -46,6 +46,11 @@ class Surface(Protocol):
         """Samples spread over the surface."""
         ...
 
+    @property
+    def knows_visibility(self) -> bool:
+        """Whether the view can tell a sample that it could not see from one that it sees elsewhere."""
+        ...
+
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Compare samples (N, 3), given in this view's frame, with this surface."""
         ...
@@ -60,6 +65,7 @@ class DepthSurface:
     distortion: Tensor | None
     size: tuple[int, int]
     samples: Samples
+    knows_visibility: bool = True
 
     @classmethod
     def from_depth(
@@ -126,6 +132,7 @@ class CloudSurface:
 
     patches: Samples  # the targets, denser than the samples
     samples: Samples
+    knows_visibility: bool = False
 
     @classmethod
     def from_points(

@@ -37,6 +37,7 @@ class PairFit:
     points: Tensor  # (M, 3) float64 where, in the common frame
     num_samples: int  # of the source
     num_visible: int  # of them, that the target could see
+    knows_visibility: bool  # of the target; False: every sample counts as visible
     system: PlaneSystem  # 6x6, of moving the source, whitened
     scale: float  # standard deviation of the whitened residuals: 1 where the noise model is right
 
@@ -166,7 +167,8 @@ def _measure(
     cut = residual.new_tensor(max_distance / TUKEY_CUT)
     weights = robust_weights(residual, cut, "tukey") / (sigma * scale).square()
     system = plane_system(points, normals, residual, weights, pivot=pivot, normal_sigma=tilt)
-    return PairFit(source, target, residual, points, num_samples, num_visible, system, float(scale))
+    knows_visibility = all(capture[target].knows_visibility for capture in captures)
+    return PairFit(source, target, residual, points, num_samples, num_visible, knows_visibility, system, float(scale))
 
 
 def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution:

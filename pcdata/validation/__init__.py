@@ -1,0 +1,1 @@
+"""Judging captures: do they hold what training needs, and do several cameras agree."""
