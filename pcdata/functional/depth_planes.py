@@ -17,7 +17,7 @@ _MIN_VALID = 0.7  # of a window's pixels
 _MAX_ROUGHNESS = 2.0  # times the image's median residual: windows across an edge, or on strongly bent surfaces
 _FLOOR_ROUGHNESS = 3e-4  # metres: what a perfect sensor's curved surfaces are allowed
 _MAX_WIDER = 1.1  # times the variance within the nine parts; on a plane the two differ by a few per cent
-_MIN_COSINE = 0.2  # between ray and normal: flatter ones are mostly noise
+MIN_COSINE = 0.2  # between ray and normal: flatter ones are mostly noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def fit_depth_planes(
     rays = torch.stack([fine.x, fine.y, torch.ones_like(fine.x)], -1)
     inverse_depth = (coefficients * rays).sum(-1)
     cosine = inverse_depth / (length * rays.norm(dim=-1))
-    holds = smooth & (cosine >= _MIN_COSINE) & (inverse_depth > 0)
+    holds = smooth & (cosine >= MIN_COSINE) & (inverse_depth > 0)
     safe = torch.where(holds, inverse_depth, 1.0)
     # An error e of 1/z moves the surface by e / (1/z) / |coefficients| along its normal.
     sigma = torch.where(holds, noise / (safe * length) / count.sqrt(), 0.0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.depth import project_points
-from pcdata.functional.depth_planes import DepthPlanes, fit_depth_planes
+from pcdata.functional.depth_planes import MIN_COSINE, DepthPlanes, fit_depth_planes
 from pcdata.functional.neighbors import ball_query, knn
 
 _FLOOR_SIGMA = 5e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
@@ -31,7 +31,7 @@ class Matches:
     """Samples of another view that have a partner on this one; all in this view's frame."""
 
     row: Tensor  # (M,) int64 rows of the samples asked for
-    residual: Tensor  # (M,) float64 metres, normal . (sample - this surface)
+    offset: Tensor  # (M, 3) float64 metres, sample - its partner on this surface
     normals: Tensor  # (M, 3) float64 unit, of this surface
     sigma: Tensor  # (M,) float64 metres, of this surface along its normal
     normal_sigma: Tensor  # (M,) float64 radians, of these normals along each tangent
@@ -82,7 +82,8 @@ class DepthSurface:
         """
         planes = fit_depth_planes(depth, intrinsics, distortion)
         rows = (planes.depth > 0).flatten().nonzero().squeeze(1)
-        rows = rows[evenly_by_direction(planes.normals.reshape(-1, 3)[rows], max_samples)]
+        chosen = evenly_by_direction(planes.normals.reshape(-1, 3)[rows], max_samples, planes.is_flat.flatten()[rows])
+        rows = rows[chosen]
         samples = Samples(
             planes.points.reshape(-1, 3)[rows],
             planes.normals.reshape(-1, 3)[rows],
@@ -102,7 +103,9 @@ class DepthSurface:
         cell = ((pixels - planes.first) / planes.stride).round()
         height, width = planes.depth.shape
         inside = ((cell >= 0) & (cell < cell.new_tensor([width, height]))).all(1)
-        rows = inside.nonzero().squeeze(1)
+        # The far side of an object is turned away, however thin the object is.
+        faces = -(points * normals).sum(1) > MIN_COSINE * points.norm(dim=1)
+        rows = (inside & faces).nonzero().squeeze(1)
         column, line = cell[rows].long().unbind(1)
         index = line * width + column
         seen = planes.depth.flatten()[index]
@@ -112,13 +115,15 @@ class DepthSurface:
         rows, index, seen = rows[visible], index[visible], seen[visible]
         plane = planes.coefficients.reshape(-1, 3)[index]
         normal = planes.normals.reshape(-1, 3)[index]
-        residual = (1 - (plane * points[rows]).sum(1)) / plane.norm(dim=1)
-        near = (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
+        reached = (plane * points[rows]).sum(1, keepdim=True)  # 1 on the plane, along the sample's own ray
+        offset = points[rows] * (1 - 1 / reached)
+        residual = (normal * offset).sum(1)
+        near = (reached[:, 0] > 0) & (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
         near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
         index = index[near]
         return Matches(
             rows[near],
-            residual[near],
+            offset[near],
             normal[near],
             planes.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA),
             planes.normal_sigma.flatten()[index].clamp(min=_FLOOR_NORMAL_SIGMA),
@@ -184,9 +189,9 @@ class CloudSurface:
         alike = cosine.abs() > torch.cos(torch.tensor(max_angle)).item()
         rows, index = rows[alike], index[alike]
         normal = torch.where(cosine[alike, None] < 0, -normal[alike], normal[alike])
-        residual = (normal * (points[rows] - self.patches.points[index])).sum(1)
         patches = self.patches
-        return Matches(rows, residual, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
+        offset = points[rows] - patches.points[index]
+        return Matches(rows, offset, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
 
 
 def evenly(rows: Tensor, count: int) -> Tensor:
@@ -196,10 +201,15 @@ def evenly(rows: Tensor, count: int) -> Tensor:
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]
 
 
-def evenly_by_direction(normals: Tensor, count: int) -> Tensor:  # (N, 3) unit -> (M,) int64, M <= count
+def evenly_by_direction(
+    normals: Tensor,  # (N, 3) unit
+    count: int,
+    preferred: Tensor,  # (N,) bool
+) -> Tensor:  # (M,) int64 ascending rows, M <= count
     """Choose at most ``count`` rows so that the directions share them equally, evenly spaced within each.
 
-    A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0.
+    A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0. Where the preferred rows
+    of a direction fill its share, it takes only those.
 
     Source: normal-space sampling, Rusinkiewicz & Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
     """
@@ -211,5 +221,9 @@ def evenly_by_direction(normals: Tensor, count: int) -> Tensor:  # (N, 3) unit -
     for size in sorted(size for size in sizes.tolist() if size):
         share = max(share, left // waiting)
         left, waiting = left - min(size, share), waiting - 1
-    chosen = [evenly((box == one).nonzero().squeeze(1), share) for one in sizes.nonzero().squeeze(1).tolist()]
-    return torch.cat([normals.new_empty(0, dtype=torch.int64), *chosen]).sort().values
+    chosen = [normals.new_empty(0, dtype=torch.int64)]
+    for one in sizes.nonzero().squeeze(1).tolist():
+        rows = (box == one).nonzero().squeeze(1)
+        better = rows[preferred[rows]]
+        chosen.append(evenly(better if len(better) >= share else rows, share))
+    return torch.cat(chosen).sort().values

@@ -154,8 +154,11 @@ def _measure(
         normals = samples.normals @ rotation.T
         found = capture[target].match(points, normals, max_distance=max_distance, max_angle=max_angle)
         sigma = (samples.sigma[found.row].square() + found.sigma.square()).sqrt()
-        tilt = (samples.normal_sigma[found.row].square() + found.normal_sigma.square()).sqrt()
-        parts.append((found.residual, points[found.row], found.normals, sigma, tilt))
+        # The mean of both normals, each as heavy as it is certain: flat ground keeps the noisier one from feigning relief.
+        own, other = samples.normal_sigma[found.row] ** -2, found.normal_sigma**-2
+        normal = torch.nn.functional.normalize(own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1)
+        residual = (normal * found.offset).sum(1)
+        parts.append((residual, points[found.row], normal, sigma, (own + other).rsqrt()))
         num_samples += len(points)
         num_visible += found.num_visible
     residual, points, normals, sigma, tilt = (torch.cat(part) for part in zip(*parts))
