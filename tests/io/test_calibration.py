@@ -106,7 +106,7 @@ def test_a_quaternion_and_a_rotation_vector_say_the_same_rotation(tmp_path: Path
         ("unit: metre", "unit: millimetre", r"3:7: unit must be 'metre', got 'millimetre'; convert"),
         ("fx: 600.5, ", "", r"5:10: camera 'wrist': 'fx' is missing"),
         ("fx: 600.5", "fx: -600.5", r"5:3: camera 'wrist': .*focal lengths must be positive"),
-        ("fx: 600.5", "fx: .nan", r"5:56: camera 'wrist': fx must be a finite number, got nan"),
+        ("fx: 600.5", "fx: .nan", r"5:55: camera 'wrist': fx must be a finite number, got nan"),
         ("fx: 600.5", "Fx: 600.5", r"no such key 'Fx'; did you mean 'fx'"),
         ("width: 640", "width: 640.5", r"width must be a whole number from 1 to 65536, got 640.5"),
         ("cx: 320", "cx: 900", r"principal point .* outside the 640x480 image"),
