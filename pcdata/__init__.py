@@ -43,7 +43,7 @@ _HOMES = {
         "Transform",
         "VoxelDownsample",
     ],
-    "pcdata.io": ["open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
+    "pcdata.io": ["Calibration", "open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
     "pcdata.validation": ["validate_frame", "validate_source"],
@@ -51,6 +51,7 @@ _HOMES = {
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _SUBMODULES = [
     "build",
+    "calibration",
     "datasets",
     "errors",
     "functional",

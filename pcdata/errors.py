@@ -65,6 +65,10 @@ class NoReadingError(CaptureError):
     """A depth image has no reading at all."""
 
 
+class CalibrationError(PcdataError, ValueError):
+    """A calibration file is wrong, or what was given cannot determine a calibration."""
+
+
 class CacheError(PcdataError, RuntimeError):
     """A stored dataset is damaged, hostile, incomplete or made by another pipeline."""
 

@@ -16,14 +16,14 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "rng", "extras"},
+    {"checks", "rng", "extras", "yaml_nodes"},
     {"dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
     {"io", "transforms", "synthetic"},
     {"datasets", "validation"},
-    {"build"},
+    {"build", "calibration"},
     {"report"},
     {"demo", "cli", "__main__"},
 ]
@@ -35,6 +35,7 @@ ALLOWED_SIBLINGS = {("cli", "demo"), ("__main__", "cli")}
 OUTSIDE = {
     "errors": set(),
     "extras": set(),
+    "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},
     "rng": {"torch", "numpy"},
     "dispatch": {"torch", "numpy", "typing_extensions"},

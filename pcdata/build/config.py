@@ -14,7 +14,7 @@ from pcdata.errors import near_matches
 from pcdata.io.stores import COMPRESSIONS, Compression, Format
 from pcdata.transforms.config import read_config
 from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at
+from pcdata.yaml_nodes import YamlDocument, node_at
 
 Collate = Literal["packed", "padded", "fixed"]
 

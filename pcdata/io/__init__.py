@@ -1,11 +1,12 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
-from pcdata.io.calibration import (
-    Calibration,
-    read_calibration,
+from pcdata.io.calibration import Calibration, Evidence
+from pcdata.io.capture_camera import (
+    CaptureCamera,
+    read_capture_camera,
     read_intrinsics,
     read_pose,
-    write_calibration,
+    write_capture_camera,
     write_pose,
 )
 from pcdata.io.detect import LAYOUTS, open_source
@@ -17,9 +18,11 @@ from pcdata.io.source import Source
 __all__ = [
     "LAYOUTS",
     "Calibration",
+    "CaptureCamera",
+    "Evidence",
     "Source",
     "open_source",
-    "read_calibration",
+    "read_capture_camera",
     "read_color",
     "read_depth",
     "read_intrinsics",
@@ -28,7 +31,7 @@ __all__ = [
     "read_pcd",
     "read_ply",
     "read_pose",
-    "write_calibration",
+    "write_capture_camera",
     "write_color",
     "write_depth",
     "write_pcd",

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError
-from pcdata.io.calibration import read_pose
+from pcdata.io.capture_camera import read_pose
 from pcdata.io.images import read_color, read_labels, read_mask
 from pcdata.structures import Camera, DepthFrame
 

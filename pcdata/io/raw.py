@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from pcdata.errors import CaptureError
-from pcdata.io.calibration import Calibration, write_calibration, write_pose
+from pcdata.io.capture_camera import CaptureCamera, write_capture_camera, write_pose
 from pcdata.io.images import write_color, write_depth
 from pcdata.structures import DepthFrame
 
@@ -31,8 +31,8 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
 def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
     (view / "depth").mkdir(parents=True)
     unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
-    calibration = Calibration(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
-    write_calibration(view / "intrinsics.json", calibration)
+    calibration = CaptureCamera(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
+    write_capture_camera(view / "intrinsics.json", calibration)
     if frame.colors is not None:
         (view / "color").mkdir()
         write_color(view / "color" / "0.png", frame.colors[v])

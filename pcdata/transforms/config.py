@@ -15,7 +15,7 @@ import yaml
 from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at, yaml_text
+from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
 
 def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:

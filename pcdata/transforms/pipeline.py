@@ -14,7 +14,7 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform
 from pcdata.transforms.compose import Compose, order_checked_before
 from pcdata.transforms.config import read_config, steps_from_node
-from pcdata.transforms.yaml_nodes import YamlDocument, yaml_text
+from pcdata.yaml_nodes import YamlDocument, yaml_text
 
 SECTIONS = ("depth", "cloud", "augment")
 

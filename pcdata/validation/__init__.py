@@ -1,4 +1,4 @@
-"""Judge raw captures, each camera on its own, before anything is made of them."""
+"""Judging captures: do they hold what training needs, and do several cameras agree."""
 
 from pcdata.validation.check import Check, Verdict
 from pcdata.validation.limits import Limits
