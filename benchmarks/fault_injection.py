@@ -61,6 +61,7 @@ class Fault:
     check: str  # the one that must fail
     inject: Callable[[Captures, int], Captures | None]  # (recording, draw) -> broken; None = cannot be done to it
     draws: int = 1
+    view: Callable[[int], int] | None = None  # draw -> the one view that is wrong and must be named
 
 
 @dataclass
@@ -72,6 +73,7 @@ class Row:
     caught: int = 0
     warned: int = 0
     missed: int = 0
+    named: int | None = None  # of those caught: the wrong view, and no other, failed
 
     @property
     def total(self) -> int:
@@ -265,7 +267,7 @@ def moved(millimetre: float, degrees: float) -> Fault:
         return [replace(f, world_from_camera=error.apply(f.world_from_camera, draw)) for f in frames[:1]]
 
     size = f"{millimetre:g} mm" if millimetre else f"{degrees:g} degrees"
-    return Fault("one camera moved", size, "view_overlap", inject, draws=3)
+    return Fault("one camera moved", size, "view_pose or view_gap", inject, draws=3, view=lambda draw: draw % 3)
 
 
 FAULTS = [
@@ -435,8 +437,13 @@ def run(recordings: Sequence[Recording], kind: str) -> tuple[list[Row], Counter[
                 continue
             for draw in range(fault.draws):
                 broken = fault.inject(recording.frames, draw if fault.draws > 3 else number + draw)
-                if broken is not None:
-                    count(row, judge(recording, broken, fault.check), fault.check)
+                if broken is None:
+                    continue
+                checks = judge(recording, broken, fault.check)
+                count(row, checks, fault.check)
+                if fault.view is not None:
+                    wrong = {one.view for one in checks if one.name == "view_pose" and one.verdict is Verdict.FAIL}
+                    row.named = (row.named or 0) + (wrong == {fault.view(number + draw)})
         if row.total:
             rows.append(row)
             print(f"{kind:10s} {fault.name} {fault.size}: {row.caught}/{row.total}, warned {row.warned}", flush=True)
@@ -511,7 +518,8 @@ def rate(row: Row | None) -> str:
     if row is None:
         return "-"
     warned = f" (+{row.warned} warned)" if row.warned else ""
-    return f"{row.caught}/{row.total}{warned}"
+    named = "" if row.named is None else f", camera named {row.named}/{row.total}"
+    return f"{row.caught}/{row.total}{warned}{named}"
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -10,7 +10,7 @@ from pcdata.functional.edge_offset import EdgeVotes
 from pcdata.io.source import Source
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.cameras import intrinsics_checks, pose_checks
-from pcdata.validation.check import Check, Verdict
+from pcdata.validation.check import Check, Verdict, worst
 from pcdata.validation.clouds import cloud_checks
 from pcdata.validation.coverage import coverage_checks
 from pcdata.validation.limits import Limits
@@ -20,6 +20,7 @@ from pcdata.validation.readings import reading_checks
 from pcdata.validation.registration import frame_votes, registration_check
 from pcdata.validation.report import WHOLE, SampleReport
 from pcdata.validation.sequence import ClockChecks, RepeatChecks
+from pcdata.validation.view_overlap import overlap_checks
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
 READABLE = "readable"
@@ -132,6 +133,9 @@ def _frame_checks(frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits)
         checks += reading_checks(depth, limits, metres_per_unit=unit, view=view)
     checks += intrinsics_checks(frame.camera, limits)
     checks += pose_checks(frame)
-    checks += direction_checks(frame)
+    direction = direction_checks(frame)
+    checks += direction
+    if worst(direction) is not Verdict.FAIL:  # views carried the wrong way have no gap worth a number
+        checks += overlap_checks(frame)
     checks += [registration_check(one, limits, view) for view, one in enumerate(votes)]
     return checks
