@@ -404,7 +404,8 @@ def judge(recording: Recording, frames: Captures, check: str) -> list[Check]:
     if needs_series:
         reports = list(validate_source(Frames(frames), limits=recording.limits))
         return [one for report in reports for one in report.checks]
-    return validate_frame(frames[0], limits=recording.limits)
+    needs_views = check.startswith("view_") or check == "pose_direction"
+    return validate_frame(frames[0] if needs_views else frames[0].view(0), limits=recording.limits)
 
 
 def count(row: Row, checks: Sequence[Check], name: str) -> None:
@@ -452,7 +453,7 @@ def run(recordings: Sequence[Recording], kind: str) -> tuple[list[Row], Counter[
 
 def registers(recording: Recording) -> bool:
     """Whether the registration of the unbroken capture is measured and good: else a shift has nothing to spoil."""
-    checks = validate_frame(recording.frames[0], limits=recording.limits)
+    checks = validate_frame(recording.frames[0].view(0), limits=recording.limits)
     return all(one.verdict is Verdict.PASS for one in checks if one.name == "color_registration")
 
 

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from pcdata import open_source, validate_source
+from pcdata.errors import CaptureError
 from pcdata.functional import rigid
 from pcdata.io import read_depth, write_pcd
 from pcdata.structures import DepthFrame, PointCloud
@@ -207,6 +208,30 @@ def test_raw_values_are_counted_before_the_reader_cleans_them(folder: Path, valu
     assert verdicts(report.checks, "raw_values") == [verdict]
     check = next(one for one in report.checks if one.name == "raw_values")
     assert check.value == pytest.approx(0.0 if value == 0 else 15 / (240 * 320))
+
+
+def test_the_times_in_a_folder_are_judged(folder: Path) -> None:
+    (folder / "timestamps.json").write_text(json.dumps({"f0": 10.0, "f1": 10.5, "f2": 10.4}))
+    reports = {report.sample_id: report for report in validate_source(open_source(folder))}
+    assert verdicts(reports["f1"].checks, "clock") == [Verdict.PASS]
+    assert verdicts(reports["f2"].checks, "clock") == [Verdict.FAIL]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"f0": 1, "f1": 2}', "timestamp is missing for f2"),
+        ('{"f0": 1, "f1": 2, "f2": 3, "f3": 4}', "timestamp but no depth for f3"),
+        ('{"f0": 1, "f1": 2, "f2": "3"}', "seconds by name"),
+        ('{"f0": 1, "f1": 2, "f2": 1e400}', "seconds by name"),
+        ("[1, 2, 3]", "seconds by name"),
+        ("{", "not valid JSON"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(folder: Path, text: str, message: str) -> None:
+    (folder / "timestamps.json").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        open_source(folder)
 
 
 # -- clouds ------------------------------------------------------------------------------------------------------------
