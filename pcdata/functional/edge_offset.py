@@ -30,6 +30,7 @@ _GRID_STEP = 1.5  # pixels; the votes are blurred by as much, so nothing falls b
 _BLUR = 1.5  # pixels, standard deviation: how ragged rims are
 _BIAS_COST = 0.05  # of the score of chance, per pixel: of equal answers, the one with the smaller bias
 _COLOR_NOISE = 12.0  # grey levels of 255: colour steps below this are noise and compression
+_NOISE_STEPS = 4  # steps of that height, summed along a normal, have half a vote
 _MIN_EDGES = 150  # rim points; fewer come from a single small object
 _LEAST_SPREAD = 0.25  # pixels: nobody knows a shift better than that from rims of whole pixels
 
@@ -94,7 +95,7 @@ def edge_votes(
     empty = (samples == 0).all(2)
     step = step.masked_fill(empty[:, 2 * scale :] | empty[:, : -2 * scale], 0.0)
     power = step.square()
-    votes = power / (power.sum(1, keepdim=True) + _COLOR_NOISE**2 * step.shape[1] / NUM_GROUPS)
+    votes = power / (power.sum(1, keepdim=True) + _NOISE_STEPS * _COLOR_NOISE**2)
 
     turn = torch.atan2(normal[:, 1], normal[:, 0]) / (2 * math.pi)
     direction = (turn * _NUM_DIRECTIONS).round().long() % _NUM_DIRECTIONS
@@ -128,7 +129,7 @@ def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
     ]
     deviation = torch.tensor(without_one) - torch.tensor(without_one).mean(0)
     error = (deviation.square().sum(0) * (NUM_GROUPS - 1) / NUM_GROUPS).sqrt()
-    one_sided = 1.0 - _balance(votes.histogram)
+    one_sided = 1.0 - _balance(votes.histogram).cpu()
     spread = (2.0 * error).clamp_min(_LEAST_SPREAD) + abs(bias) * one_sided
     problem: str | None = None
     if bool((2.0 * error > TELLABLE).any()):
