@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -92,7 +92,7 @@ def align_views(
     if not 0 <= fixed < num_views:
         raise ConfigError(f"align_views: fixed must be a view, 0 to {num_views - 1}, got {fixed}")
     poses = world_from_view.double()
-    pivot = _middle(captures, poses)
+    pivot = scene_middle(captures, poses)
     motions = torch.eye(4, dtype=torch.float64, device=poses.device).repeat(num_views, 1, 1)
     before = measure_pairs(captures, poses, pivot, max_distances[0], max_angle)
     fits, iterations, converged = before, 0, False
@@ -106,7 +106,23 @@ def align_views(
             if float(step.abs().max()) < 2e-5:
                 converged = True
                 break
-    fits = measure_pairs(captures, motions @ poses, pivot, max_distances[-1], max_angle)
+    found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=max_distances[-1])
+    return replace(found, before=before, iterations=iterations, converged=converged)
+
+
+def assess_motions(
+    captures: Sequence[Sequence[Surface]],
+    world_from_view: Tensor,  # (V, 4, 4) float64
+    motions: Tensor,  # (V, 4, 4) float64 in the common frame, however they were found
+    pivot: Tensor,  # (3,) float64
+    *,
+    fixed: int,
+    max_distance: float = 0.015,
+) -> ViewAlignment:
+    """Measure how well the moved views fit, and what the surfaces say about motions near these."""
+    num_views = len(motions)
+    poses = world_from_view.double()
+    fits = measure_pairs(captures, motions @ poses, pivot, max_distance)
     solution = _solve(fits, num_views, fixed)
     return ViewAlignment(
         motions=motions,
@@ -114,10 +130,10 @@ def align_views(
         covariance=_SHARED_DATA * solution.covariance,
         unobservable=solution.unobservable,
         pivot=pivot,
-        before=before,
+        before=fits,
         after=fits,
-        iterations=iterations,
-        converged=converged,
+        iterations=0,
+        converged=True,
     )
 
 
@@ -212,7 +228,7 @@ def joint_system(fits: Sequence[PairFit], num_views: int) -> PlaneSystem:
     return PlaneSystem(information, gradient, feigned)
 
 
-def _middle(captures: Sequence[Sequence[Surface]], poses: Tensor) -> Tensor:
+def scene_middle(captures: Sequence[Sequence[Surface]], poses: Tensor) -> Tensor:
     """Return the coordinate-wise median of all samples: where a turn moves the scene least."""
     moved = [
         surface.samples.points @ pose[:3, :3].T + pose[:3, 3]
