@@ -16,6 +16,7 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_minimum,
 )
 
 __all__ = [
@@ -42,4 +43,5 @@ __all__ = [
     "voxel_majority",
     "voxel_mean",
     "voxel_mean_direction",
+    "voxel_minimum",
 ]
