@@ -36,9 +36,9 @@ class CameraRefinement:
 
     name: str
     world_from_camera: Tensor  # (4, 4) float64, refined
-    shift: float  # metres, at the middle of what it shares with the others
+    shift: float  # metres, of the camera's own position
     rotation_degrees: float
-    shift_sigma: float  # metres, of the refined pose against the fixed camera's
+    shift_sigma: float  # metres, at the scene, against the fixed camera
     rotation_sigma_degrees: float
     overlap: float  # share of its samples that have a partner in another view, 0..1
     rmse_before: float  # metres, of its point-to-plane distances to all other views
@@ -176,7 +176,7 @@ def refine_extrinsics(
         CameraRefinement(
             name=camera.name,
             world_from_camera=correction.to(poses[0].device) @ poses[0][view],
-            shift=camera.shift,
+            shift=float((correction @ poses[0][view].cpu() - poses[0][view].cpu())[:3, 3].norm()),
             rotation_degrees=camera.rotation_degrees,
             shift_sigma=camera.shift_sigma,
             rotation_sigma_degrees=camera.rotation_sigma_degrees,

@@ -24,6 +24,7 @@ from pcdata.functional.surfaces import Surface
 
 # Both directions of a pair measure the same surfaces with the same pixels, and neighbouring windows share some.
 _SHARED_DATA = 4.0
+_SETTLED = 5e-5  # metres and radians: a hundredth of what fails
 _MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
 
@@ -64,12 +65,12 @@ def align_views(
     fixed: int = 0,
     max_distances: Sequence[float] = (0.06, 0.03, 0.015, 0.008, 0.004),
     max_angle: float = 0.6,
-    max_iterations: int = 8,
+    max_iterations: int = 12,
 ) -> ViewAlignment:
     """Move all views but one so that their surfaces meet, over all pairs and captures in one least-squares.
 
     Gauss-Newton with Tukey's biweight, its scale measured per pair and round; a step goes only along directions that
-    the surfaces determine together. Each scale ends when no view moves by more than 0.02 mm or 2e-5 radians.
+    the surfaces determine together. Each scale ends when no view moves by more than 0.05 mm or 5e-5 radians.
 
     Args:
         captures: what each view saw; more captures of one rig add evidence.
@@ -103,7 +104,7 @@ def align_views(
             step = _solve(fits, num_views, fixed).twist.reshape(num_views, 6)
             motions = motion_from_twist(step, pivot) @ motions
             iterations += 1
-            if float(step.abs().max()) < 2e-5:
+            if float(step.abs().max()) < _SETTLED:
                 converged = True
                 break
     found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=max_distances[-1])
