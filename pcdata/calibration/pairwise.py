@@ -73,7 +73,7 @@ def _clouds_about(capture: DepthFrame, pivot: Tensor) -> list[Tensor]:
     shifted[:, :3, 3] -= pivot
     thin, thin_ptr, _ = voxel_downsample(rigid.transform_points(points, ptr, shifted), ptr, voxel_size=_VOXEL)
     bounds = thin_ptr.tolist()
-    return [thin[start:stop].cpu() for start, stop in zip(bounds, bounds[1:])]
+    return [thin[start:stop].cpu() for start, stop in itertools.pairwise(bounds)]
 
 
 def _by_small_gicp(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

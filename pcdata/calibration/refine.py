@@ -93,6 +93,17 @@ class Refinement:
     def _fixed_name(self) -> str:
         return next(camera.name for camera in self.cameras if camera.fixed)
 
+    def text(self) -> str:
+        """Return the numbers as lines for a terminal."""
+        lines = [f"refined by {self.method} from {self.num_captures} captures, {self._fixed_name} fixed"]
+        for camera in self.cameras:
+            lines.append(
+                f"  {camera.name}: moved {1e3 * camera.shift:.2f} mm, {camera.rotation_degrees:.3f} degrees "
+                f"(+- {1e3 * camera.shift_sigma:.2f} mm, {camera.rotation_sigma_degrees:.3f} degrees), overlap "
+                f"{100 * camera.overlap:.0f} %, RMSE {1e3 * camera.rmse_before:.2f} -> {1e3 * camera.rmse_after:.2f} mm"
+            )
+        return "\n".join(lines)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         cameras = [{**vars(camera), "world_from_camera": camera.world_from_camera.tolist()} for camera in self.cameras]
@@ -169,8 +180,7 @@ def refine_extrinsics(
     judged = judge_alignment(alignment, names, limits, reference=stays)
     corrections = [torch.tensor(camera.correction, dtype=torch.float64) for camera in judged.cameras]
     before, after = (
-        measure_pairs(surfaces, moved, alignment.pivot, _REACH)
-        for moved in (poses[0], alignment.motions @ poses[0])
+        measure_pairs(surfaces, moved, alignment.pivot, _REACH) for moved in (poses[0], alignment.motions @ poses[0])
     )
     refined = tuple(
         CameraRefinement(
@@ -190,9 +200,7 @@ def refine_extrinsics(
     _check(where, refined, judged, alignment, limits, max_shift, max_rotation_degrees)
     frame_id = captures[0].frame_id
     assert frame_id is not None  # poses and frame come together
-    return Refinement(
-        cameras=refined, method=method, frame_id=frame_id, overlap=judged, num_captures=len(captures)
-    )
+    return Refinement(cameras=refined, method=method, frame_id=frame_id, overlap=judged, num_captures=len(captures))
 
 
 def _held(alignment: ViewAlignment, fixed: int) -> ViewAlignment:

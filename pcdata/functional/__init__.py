@@ -9,6 +9,12 @@ from pcdata.functional.neighbors import ball_query, knn
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.registration import (
+    PlaneResiduals,
+    Registration,
+    icp_point_to_plane,
+    point_to_plane_residuals,
+)
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import (
     find_voxel_size,
@@ -21,6 +27,8 @@ from pcdata.functional.voxels import (
 
 __all__ = [
     "ImageGrid",
+    "PlaneResiduals",
+    "Registration",
     "ball_query",
     "chamfer_distance",
     "dbscan",
@@ -29,9 +37,11 @@ __all__ = [
     "estimate_normals",
     "farthest_point_sample",
     "find_voxel_size",
+    "icp_point_to_plane",
     "knn",
     "orient_normals",
     "pixel_rays",
+    "point_to_plane_residuals",
     "project_points",
     "radius_outlier_mask",
     "random_sample_index",

@@ -24,6 +24,7 @@ from pcdata.functional.surfaces import Surface
 
 # Both directions of a pair measure the same surfaces with the same pixels, and neighbouring windows share some.
 _SHARED_DATA = 4.0
+_WITHIN_NOISE = 0.25  # standard deviations
 _SETTLED = 5e-5  # metres and radians: a hundredth of what fails
 _MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
@@ -70,7 +71,8 @@ def align_views(
     """Move all views but one so that their surfaces meet, over all pairs and captures in one least-squares.
 
     Gauss-Newton with Tukey's biweight, its scale measured per pair and round; a step goes only along directions that
-    the surfaces determine together. Each scale ends when no view moves by more than 0.05 mm or 5e-5 radians.
+    the surfaces determine together. Each scale ends when no view moves by more than 0.05 mm or 5e-5 radians, or
+    by a quarter of the fit's own standard deviation.
 
     Args:
         captures: what each view saw; more captures of one rig add evidence.
@@ -101,10 +103,13 @@ def align_views(
         converged = False
         for _ in range(max_iterations):
             fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
-            step = _solve(fits, num_views, fixed).twist.reshape(num_views, 6)
+            solution = _solve(fits, num_views, fixed)
+            step = solution.twist.reshape(num_views, 6)
             motions = motion_from_twist(step, pivot) @ motions
             iterations += 1
-            if float(step.abs().max()) < _SETTLED:
+            # The Newton decrement is the step in standard deviations: what is left lies within the noise.
+            decrement = float(solution.decrement) / _SHARED_DATA**0.5
+            if decrement < _WITHIN_NOISE or float(step.abs().max()) < _SETTLED:
                 converged = True
                 break
     found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=max_distances[-1])
@@ -173,7 +178,9 @@ def _measure(
         sigma = (samples.sigma[found.row].square() + found.sigma.square()).sqrt()
         # The mean of both normals, each as heavy as it is certain: flat ground keeps the noisier one from feigning relief.
         own, other = samples.normal_sigma[found.row] ** -2, found.normal_sigma**-2
-        normal = torch.nn.functional.normalize(own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1)
+        normal = torch.nn.functional.normalize(
+            own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1
+        )
         residual = (normal * found.offset).sum(1)
         parts.append((residual, points[found.row], normal, sigma, (own + other).rsqrt()))
         num_samples += len(points)
@@ -195,9 +202,7 @@ def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution
     """Solve for all views but the fixed one, whose rows are 0 in the result."""
     joint = joint_system(fits, num_views)
     free = torch.tensor([row for row in range(6 * num_views) if row // 6 != fixed], device=joint.gradient.device)
-    part = PlaneSystem(
-        joint.information[free][:, free], joint.gradient[free], joint.feigned[free][:, free]
-    )
+    part = PlaneSystem(joint.information[free][:, free], joint.gradient[free], joint.feigned[free][:, free])
     solution = solve_observable(part)
     twist = torch.zeros_like(joint.gradient)
     twist[free] = solution.twist
@@ -205,7 +210,7 @@ def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution
     covariance[free[:, None], free] = solution.covariance
     unobservable = torch.zeros(len(solution.unobservable), len(twist), dtype=twist.dtype, device=twist.device)
     unobservable[:, free] = solution.unobservable
-    return TwistSolution(twist, covariance, unobservable)
+    return TwistSolution(twist, covariance, unobservable, solution.decrement)
 
 
 def joint_system(fits: Sequence[PairFit], num_views: int) -> PlaneSystem:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional import rigid
 from pcdata.functional.small_motions import motion_from_twist
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
 from pcdata.functional.view_consensus import Consensus, find_consensus
