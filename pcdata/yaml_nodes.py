@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
 
 from pcdata.errors import ConfigError, PcdataError
+from pcdata.sensors import SensorProfile
 
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
 
@@ -43,8 +45,18 @@ def yaml_text(data: Any) -> str:
         raise ConfigError(f"a configuration holds plain data only: {error}") from error
 
 
+@dataclass(frozen=True)
+class SensorChoice:
+    """The sensor that a configuration names, and the depth at which its defaults are taken."""
+
+    profile: SensorProfile
+    depth: float  # metres
+
+
 class YamlDocument:
     """One parsed file and the faults found in it so far; all are reported at once."""
+
+    sensor: SensorChoice | None = None  # what the word "sensor" stands for, where the file names one
 
     def __init__(self, text: str, name: str, *, error: type[PcdataError] = ConfigError) -> None:
         """Parse the text; ``name`` stands before every place, ``error`` is what a fault raises."""

@@ -11,6 +11,7 @@ import torch
 
 from pcdata.cli import main
 from pcdata.io import write_ply
+from pcdata.sensors import sensor_profile
 from pcdata.structures import PointCloud
 from tests.validation.captures import scene, store
 
@@ -68,6 +69,17 @@ def test_the_workspace_can_be_given(capsys, folder: Path) -> None:
     assert "FAIL workspace_fraction" in out
     assert run(capsys, folder, "--workspace", 9, 3)[0] == 2
     assert run(capsys, folder, "--workspace", 1)[0] == 2
+
+
+def test_the_workspace_can_be_that_of_a_sensor(capsys, folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "report.json"
+    assert run(capsys, folder, "--sensor", "realsense_d435", "--json", file)[0] == 0
+    limits = json.loads(file.read_text())["limits"]
+    assert tuple(limits["workspace"]) == sensor_profile("realsense_d435").range
+    code, _, err = run(capsys, folder, "--sensor", "realsense_d345")
+    assert code == 2
+    assert "'realsense_d435'" in err
+    assert run(capsys, folder, "--sensor", "realsense_d435", "--workspace", 1, 2)[0] == 2
 
 
 def test_a_calibration_that_cannot_be_is_a_failed_check(capsys, folder: Path, tmp_path: Path) -> None:

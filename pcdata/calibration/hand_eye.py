@@ -30,7 +30,7 @@ FINAL = "least squares over all poses"
 # Times the median residual. A board seen head-on is located several times worse than one that is tilted, so less would
 # name good poses; an error that matters (a pose of another moment, a slipped board) is far larger.
 _OUTLIER = 6.0
-_SMALLEST_RESIDUAL = 1e-6  # metres, radians; exact poses have no outliers
+_SMALLEST_OUTLIER = (0.0005, math.radians(0.5))  # metres, radians; a pose nearer than this is not worth leaving out
 _CLEARLY_BETTER = 0.2  # of the residual; poses read the right way round fit many times better
 
 
@@ -120,7 +120,7 @@ def calibrate_hand_eye(poses: RobotPoses, *, setup: Setup, limits: HandEyeLimits
     solutions = {"Park-Martin": closed, **opencv_solutions(holder_from_mount, target), FINAL: best.mount_from_camera}
     placed = holder_from_mount @ best.mount_from_camera @ target
     translation, rotation = _distances(placed, best.holder_from_target)
-    outliers = _outliers(translation) | _outliers(rotation)
+    outliers = _outliers(translation, _SMALLEST_OUTLIER[0]) | _outliers(rotation, _SMALLEST_OUTLIER[1])
     translation_spread, rotation_spread = _spread(list(solutions.values()))
     limits = limits or HandEyeLimits()
     findings = (
@@ -159,8 +159,8 @@ def _spread(solutions: list[Poses]) -> tuple[float, float]:
     return max(float(distance[0]) for distance, _ in apart), max(float(angle[0]) for _, angle in apart)
 
 
-def _outliers(residuals: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return residuals > max(_OUTLIER * float(np.median(residuals)), _SMALLEST_RESIDUAL)
+def _outliers(residuals: NDArray[np.float64], smallest: float) -> NDArray[np.bool_]:
+    return residuals > max(_OUTLIER * float(np.median(residuals)), smallest)
 
 
 def _advice(robot: Poses, target: Poses, setup: Setup, residual: float) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,27 +43,18 @@ def refine(
     Source: Tabb & Ahmad Yousef, "Solving the robot-world hand-eye(s) calibration problem with iterative methods",
     Machine Vision and Applications 28, 2017 (both placements over all poses); Huber, Robust Statistics, 1981.
     """
-    from scipy.optimize import least_squares
-
     target = mean_pose(holder_from_mount @ mount_from_camera @ camera_from_target)
-    sigma: NDArray[np.float64] | None = None
+    start, sigma = (mount_from_camera, target), np.ones(6)
     for _ in range(_MAX_ROUNDS):
-        start, sigma_before = (mount_from_camera, target), sigma
-        raw = _residuals(np.zeros(12), start, holder_from_mount, camera_from_target)
-        sigma = _noise(raw)
-        weights = np.tile(sigma, len(raw))
-
-        def whitened(change: NDArray[np.float64], start=start, weights=weights) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]
-            return _residuals(change, start, holder_from_mount, camera_from_target).ravel() / weights
-
-        fit = least_squares(whitened, np.zeros(12), loss="huber", f_scale=_HUBER, x_scale="jac")
-        mount_from_camera, target = _moved(fit.x, start)
-        if sigma_before is not None and np.abs(sigma / sigma_before - 1).max() < _SETTLED:
+        before, sigma = sigma, _noise(_residuals(np.zeros(12), start, holder_from_mount, camera_from_target))
+        fit = _fit(start, sigma, holder_from_mount, camera_from_target)
+        start = _moved(fit.x, start)
+        if np.abs(sigma / before - 1).max() < _SETTLED:
             break
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac)
     return Refined(
-        mount_from_camera=mount_from_camera,
-        holder_from_target=target,
+        mount_from_camera=start[0],
+        holder_from_target=start[1],
         rotation_sigma=float(np.sqrt(np.trace(covariance[:3, :3]))),
         translation_sigma=float(np.sqrt(np.trace(covariance[3:6, 3:6]))),
     )
@@ -71,6 +63,18 @@ def refine(
 def mean_pose(poses: Poses) -> Poses:  # (4, 4)
     """Return the chordal mean rotation and the median position of (N, 4, 4) poses."""
     return pose_of(nearest_rotation(poses[:, :3, :3].sum(axis=0)), np.median(poses[:, :3, 3], axis=0))
+
+
+def _fit(
+    start: tuple[Poses, Poses], sigma: NDArray[np.float64], holder_from_mount: Poses, camera_from_target: Poses
+) -> Any:
+    """Return SciPy's answer: the change to both placements that explains the poses best, and its Jacobian."""
+    from scipy.optimize import least_squares
+
+    def whitened(change: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (_residuals(change, start, holder_from_mount, camera_from_target) / sigma).ravel()
+
+    return least_squares(whitened, np.zeros(12), loss="huber", f_scale=_HUBER, x_scale="jac")
 
 
 def _residuals(

@@ -123,7 +123,7 @@ def check_plane(
         normal_distance=normal_distance,
         tilt=math.acos(min(cosine, 1.0)),
         bias=None if distance is None else measured - distance,
-        expected_noise=None if noise is None else noise(float(points[inlier, 2].double().mean())),
+        expected_noise=None if noise is None else _expected(noise, float(points[inlier, 2].double().mean())),
         findings=(),
     )
     return _judged(check, limits, distance, along)
@@ -176,6 +176,13 @@ def _judged(check: PlaneCheck, limits: PlaneLimits, distance: float | None, alon
         part = abs(check.bias) / distance
         findings.append(at_most("bias, part of the distance", part, limits.max_bias, "%", factor=100))
     return PlaneCheck(**{**vars(check), "findings": tuple(findings)})
+
+
+def _expected(noise: Callable[[float], float], depth: float) -> float:
+    sigma = noise(depth)
+    if not 0 < sigma < math.inf:
+        raise ConfigError(f"check_plane: noise must be metres above 0, got {sigma} at a depth of {depth:g} m")
+    return sigma
 
 
 def _central(depth: Tensor, roi: float) -> Tensor:

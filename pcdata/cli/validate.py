@@ -19,7 +19,9 @@ def add_to(commands: Any) -> None:
     validate.add_argument("path", metavar="PATH", help="folder of captures, or one cloud file")
     add_capture_options(validate)
     validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
-    validate.add_argument(
+    depths = validate.add_mutually_exclusive_group()
+    depths.add_argument("--sensor", metavar="NAME", help="depths of interest: the range of a sensor (pcdata profiles)")
+    depths.add_argument(
         "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
     )
     validate.add_argument("--json", metavar="FILE", help="write every check on every capture to a new file")
@@ -32,7 +34,9 @@ def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.report.validation import validation_text
     from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict, check_of_error, validate_source
 
-    limits = Limits(workspace=tuple(arguments.workspace)) if arguments.workspace else Limits()
+    limits = Limits.for_sensor(arguments.sensor) if arguments.sensor else Limits()
+    if arguments.workspace:
+        limits = Limits(workspace=tuple(arguments.workspace))
     summary = Summary()
     total = 0
     try:

@@ -13,6 +13,12 @@ from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.occlusion_edges import occlusion_edges
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.registration import (
+    PlaneResiduals,
+    Registration,
+    icp_point_to_plane,
+    point_to_plane_residuals,
+)
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.view_agreement import view_agreement
 from pcdata.functional.voxels import (
@@ -21,12 +27,15 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_minimum,
 )
 
 __all__ = [
     "EdgeOffset",
     "EdgeVotes",
     "ImageGrid",
+    "PlaneResiduals",
+    "Registration",
     "ball_query",
     "chamfer_distance",
     "dbscan",
@@ -36,6 +45,7 @@ __all__ = [
     "estimate_normals",
     "farthest_point_sample",
     "find_voxel_size",
+    "icp_point_to_plane",
     "knn",
     "largest_missing_region",
     "occlusion_edges",
@@ -43,6 +53,7 @@ __all__ = [
     "orient_normals",
     "pile_at_extreme",
     "pixel_rays",
+    "point_to_plane_residuals",
     "project_points",
     "radius_outlier_mask",
     "random_sample_index",
@@ -55,4 +66,5 @@ __all__ = [
     "voxel_majority",
     "voxel_mean",
     "voxel_mean_direction",
+    "voxel_minimum",
 ]

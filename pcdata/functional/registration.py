@@ -66,9 +66,7 @@ def point_to_plane_residuals(
     """
     where = "point_to_plane_residuals"
     values = {"source": source, "target": target, "target_normals": target_normals, "source_normals": source_normals}
-    check_tensors(
-        where, values, {"source": "N 3", "target": "M 3", "target_normals": "M 3", "source_normals": "N 3"}
-    )
+    check_tensors(where, values, {"source": "N 3", "target": "M 3", "target_normals": "M 3", "source_normals": "N 3"})
     require_length(where, "max_distance", max_distance)
     require_length(where, "max_normal_angle", max_normal_angle)
     device = source.device

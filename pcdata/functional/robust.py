@@ -39,7 +39,9 @@ def robust_weights(residuals: Tensor, scale: Tensor, kernel: str) -> Tensor:  # 
         kept = max(1, round(_KEPT_BY_TRIMMING * len(size)))
         return (size <= size.kthvalue(kept).values).to(residuals.dtype)
     if kernel not in KERNELS:
-        raise ConfigError(f"kernel {kernel!r} is unknown: use one of {', '.join(KERNELS)}{near_matches(kernel, KERNELS)}")
+        raise ConfigError(
+            f"kernel {kernel!r} is unknown: use one of {', '.join(KERNELS)}{near_matches(kernel, KERNELS)}"
+        )
     in_scales = torch.where(size > 0, size / scale.clamp(min=1e-300), 0.0)
     if kernel == "huber":
         return (_HUBER / in_scales.clamp(min=_HUBER)).to(residuals.dtype)

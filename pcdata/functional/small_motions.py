@@ -40,6 +40,7 @@ class TwistSolution:
     twist: Tensor  # (D,) float64, 0 along unobservable directions
     covariance: Tensor  # (D, D) float64 for residuals of unit variance, 0 along unobservable directions
     unobservable: Tensor  # (M, D) float64, a basis of what the residuals do not determine; unit vectors
+    decrement: Tensor  # () float64, Newton decrement: the step's length in its standard deviations
 
 
 def plane_system(
@@ -95,7 +96,8 @@ def solve_observable(system: PlaneSystem) -> TwistSolution:
     amount = -(basis @ system.gradient) / share[seen]
     spread = basis / (2 * share[seen] - 1).sqrt()[:, None]  # the feigned part determines nothing: 1 - 2 (1 - share)
     unobservable = torch.nn.functional.normalize(directions[~seen], dim=1)
-    return TwistSolution(amount @ basis, spread.T @ spread, unobservable)
+    decrement = (amount.square() * share[seen]).sum().sqrt()
+    return TwistSolution(amount @ basis, spread.T @ spread, unobservable, decrement)
 
 
 def motion_from_twist(twist: Tensor, pivot: Tensor) -> Tensor:  # (..., 6), (3,) -> (..., 4, 4) float64

@@ -116,8 +116,8 @@ class DepthSurface:
         plane = planes.coefficients.reshape(-1, 3)[index]
         normal = planes.normals.reshape(-1, 3)[index]
         reached = (plane * points[rows]).sum(1, keepdim=True)  # 1 on the plane, along the sample's own ray
-        offset = points[rows] * (1 - 1 / reached)
-        residual = (normal * offset).sum(1)
+        residual = (1 - reached[:, 0]) / plane.norm(dim=1)
+        offset = normal * residual[:, None]
         near = (reached[:, 0] > 0) & (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
         near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
         index = index[near]

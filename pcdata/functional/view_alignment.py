@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,6 +24,8 @@ from pcdata.functional.surfaces import Surface
 
 # Both directions of a pair measure the same surfaces with the same pixels, and neighbouring windows share some.
 _SHARED_DATA = 4.0
+_WITHIN_NOISE = 0.25  # standard deviations
+_SETTLED = 5e-5  # metres and radians: a hundredth of what fails
 _MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
 
@@ -64,12 +66,13 @@ def align_views(
     fixed: int = 0,
     max_distances: Sequence[float] = (0.06, 0.03, 0.015, 0.008, 0.004),
     max_angle: float = 0.6,
-    max_iterations: int = 8,
+    max_iterations: int = 12,
 ) -> ViewAlignment:
     """Move all views but one so that their surfaces meet, over all pairs and captures in one least-squares.
 
     Gauss-Newton with Tukey's biweight, its scale measured per pair and round; a step goes only along directions that
-    the surfaces determine together. Each scale ends when no view moves by more than 0.02 mm or 2e-5 radians.
+    the surfaces determine together. Each scale ends when no view moves by more than 0.05 mm or 5e-5 radians, or
+    by a quarter of the fit's own standard deviation.
 
     Args:
         captures: what each view saw; more captures of one rig add evidence.
@@ -92,7 +95,7 @@ def align_views(
     if not 0 <= fixed < num_views:
         raise ConfigError(f"align_views: fixed must be a view, 0 to {num_views - 1}, got {fixed}")
     poses = world_from_view.double()
-    pivot = _middle(captures, poses)
+    pivot = scene_middle(captures, poses)
     motions = torch.eye(4, dtype=torch.float64, device=poses.device).repeat(num_views, 1, 1)
     before = measure_pairs(captures, poses, pivot, max_distances[0], max_angle)
     fits, iterations, converged = before, 0, False
@@ -100,13 +103,32 @@ def align_views(
         converged = False
         for _ in range(max_iterations):
             fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
-            step = _solve(fits, num_views, fixed).twist.reshape(num_views, 6)
+            solution = _solve(fits, num_views, fixed)
+            step = solution.twist.reshape(num_views, 6)
             motions = motion_from_twist(step, pivot) @ motions
             iterations += 1
-            if float(step.abs().max()) < 2e-5:
+            # The Newton decrement is the step in standard deviations: what is left lies within the noise.
+            decrement = float(solution.decrement) / _SHARED_DATA**0.5
+            if decrement < _WITHIN_NOISE or float(step.abs().max()) < _SETTLED:
                 converged = True
                 break
-    fits = measure_pairs(captures, motions @ poses, pivot, max_distances[-1], max_angle)
+    found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=max_distances[-1])
+    return replace(found, before=before, iterations=iterations, converged=converged)
+
+
+def assess_motions(
+    captures: Sequence[Sequence[Surface]],
+    world_from_view: Tensor,  # (V, 4, 4) float64
+    motions: Tensor,  # (V, 4, 4) float64 in the common frame, however they were found
+    pivot: Tensor,  # (3,) float64
+    *,
+    fixed: int,
+    max_distance: float = 0.015,
+) -> ViewAlignment:
+    """Measure how well the moved views fit, and what the surfaces say about motions near these."""
+    num_views = len(motions)
+    poses = world_from_view.double()
+    fits = measure_pairs(captures, motions @ poses, pivot, max_distance)
     solution = _solve(fits, num_views, fixed)
     return ViewAlignment(
         motions=motions,
@@ -114,10 +136,10 @@ def align_views(
         covariance=_SHARED_DATA * solution.covariance,
         unobservable=solution.unobservable,
         pivot=pivot,
-        before=before,
+        before=fits,
         after=fits,
-        iterations=iterations,
-        converged=converged,
+        iterations=0,
+        converged=True,
     )
 
 
@@ -156,7 +178,9 @@ def _measure(
         sigma = (samples.sigma[found.row].square() + found.sigma.square()).sqrt()
         # The mean of both normals, each as heavy as it is certain: flat ground keeps the noisier one from feigning relief.
         own, other = samples.normal_sigma[found.row] ** -2, found.normal_sigma**-2
-        normal = torch.nn.functional.normalize(own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1)
+        normal = torch.nn.functional.normalize(
+            own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1
+        )
         residual = (normal * found.offset).sum(1)
         parts.append((residual, points[found.row], normal, sigma, (own + other).rsqrt()))
         num_samples += len(points)
@@ -178,9 +202,7 @@ def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution
     """Solve for all views but the fixed one, whose rows are 0 in the result."""
     joint = joint_system(fits, num_views)
     free = torch.tensor([row for row in range(6 * num_views) if row // 6 != fixed], device=joint.gradient.device)
-    part = PlaneSystem(
-        joint.information[free][:, free], joint.gradient[free], joint.feigned[free][:, free]
-    )
+    part = PlaneSystem(joint.information[free][:, free], joint.gradient[free], joint.feigned[free][:, free])
     solution = solve_observable(part)
     twist = torch.zeros_like(joint.gradient)
     twist[free] = solution.twist
@@ -188,7 +210,7 @@ def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution
     covariance[free[:, None], free] = solution.covariance
     unobservable = torch.zeros(len(solution.unobservable), len(twist), dtype=twist.dtype, device=twist.device)
     unobservable[:, free] = solution.unobservable
-    return TwistSolution(twist, covariance, unobservable)
+    return TwistSolution(twist, covariance, unobservable, solution.decrement)
 
 
 def joint_system(fits: Sequence[PairFit], num_views: int) -> PlaneSystem:
@@ -212,7 +234,7 @@ def joint_system(fits: Sequence[PairFit], num_views: int) -> PlaneSystem:
     return PlaneSystem(information, gradient, feigned)
 
 
-def _middle(captures: Sequence[Sequence[Surface]], poses: Tensor) -> Tensor:
+def scene_middle(captures: Sequence[Sequence[Surface]], poses: Tensor) -> Tensor:
     """Return the coordinate-wise median of all samples: where a turn moves the scene least."""
     moved = [
         surface.samples.points @ pose[:3, :3].T + pose[:3, 3]

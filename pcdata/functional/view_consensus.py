@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.functional import rigid
+from pcdata.functional.small_motions import twist_from_motion
 from pcdata.functional.view_alignment import ViewAlignment
 
 # What is unknown about a direction that the surfaces do not determine, in metres and radians: far beyond any limit.
@@ -25,7 +27,9 @@ class Consensus:
     covariance: Tensor  # (V, 6, 6) float64; enormous along directions that nothing determines
 
 
-def find_consensus(alignment: ViewAlignment, *, max_shift: float, max_angle: float) -> Consensus:
+def find_consensus(
+    alignment: ViewAlignment, *, max_shift: float, max_angle: float, reference: int | None = None
+) -> Consensus:
     """Find the fewest views whose removal leaves a majority in which every two agree within the limits.
 
     Of equally few, those that leave the closest agreement are named, if they do so at least twice as well as any
@@ -35,6 +39,7 @@ def find_consensus(alignment: ViewAlignment, *, max_shift: float, max_angle: flo
         alignment: the joint fit of all views.
         max_shift: metres, between two views at the pivot.
         max_angle: radians, between two views.
+        reference: the view to measure against; None = of those that agree, the one that makes the rest most certain.
     """
     num_views = len(alignment.twists)
     apart = _apart(alignment.twists, max_shift, max_angle)
@@ -47,12 +52,13 @@ def find_consensus(alignment: ViewAlignment, *, max_shift: float, max_angle: flo
         own, other = blocks[range(num_views), range(num_views)], blocks[reference, reference]
         return own + other - blocks[:, reference] - blocks[reference]
 
-    reference = min(agreeing, key=lambda view: float(relative(view).diagonal(dim1=1, dim2=2).sqrt().sum()))
+    if reference is None:
+        reference = min(agreeing, key=lambda view: float(relative(view).diagonal(dim1=1, dim2=2).sum()))
     return Consensus(
         wrong=wrong,
         candidates=candidates,
         reference=reference,
-        twists=alignment.twists - alignment.twists[reference],
+        twists=twist_from_motion(rigid.invert_rigid(alignment.motions[reference]) @ alignment.motions, alignment.pivot),
         covariance=relative(reference),
     )
 

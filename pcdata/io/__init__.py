@@ -9,6 +9,7 @@ from pcdata.io.capture_camera import (
     write_capture_camera,
     write_pose,
 )
+from pcdata.io.confidence import read_confidence, write_confidence
 from pcdata.io.detect import LAYOUTS, open_source
 from pcdata.io.images import read_color, read_depth, read_labels, read_mask, write_color, write_depth
 from pcdata.io.pcd import read_pcd, write_pcd
@@ -24,6 +25,7 @@ __all__ = [
     "open_source",
     "read_capture_camera",
     "read_color",
+    "read_confidence",
     "read_depth",
     "read_intrinsics",
     "read_labels",
@@ -33,6 +35,7 @@ __all__ = [
     "read_pose",
     "write_capture_camera",
     "write_color",
+    "write_confidence",
     "write_depth",
     "write_pcd",
     "write_ply",

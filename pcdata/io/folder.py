@@ -24,17 +24,19 @@ _PARTNERS = {  # role: folder, suffixes
     "color": ("color", COLOR_SUFFIXES),
     "labels": ("labels", (".png",)),
     "mask": ("masks", (".png",)),
+    "confidence": ("confidence", (".png",)),
     "pose": ("poses", (".txt", ".npy")),
 }
 
 
 class FolderSource(Source):
-    """``intrinsics.json``, ``depth/NAME.png``; for all names or none ``color``, ``labels``, ``masks``, ``poses``."""
+    """``intrinsics.json``, ``depth/NAME.png``; for all names or none colour, labels, masks, confidence and poses."""
 
     kind = "folder"
     needs = (
         "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
-        "masks/NAME.png, poses/NAME.txt (4x4, world from camera), timestamps.json (seconds by NAME)"
+        "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera), "
+        "timestamps.json (seconds by NAME)"
     )
 
     def __init__(

@@ -1,6 +1,7 @@
 """The nouns: cameras, depth frames, point clouds."""
 
 from pcdata.structures.camera import Camera
+from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
 from pcdata.structures.fields import Kind
 from pcdata.structures.padded import PaddedClouds
@@ -11,6 +12,7 @@ __all__ = [
     "METRE",
     "NORMALIZED",
     "Camera",
+    "Confidence",
     "DepthFrame",
     "ImageLayout",
     "Kind",

@@ -4,6 +4,7 @@ from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, R
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
+from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
@@ -14,6 +15,7 @@ from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
 from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
+from pcdata.transforms.sensor_noise import RandomSensorNoise
 
 __all__ = [
     "REGISTRY",
@@ -24,6 +26,7 @@ __all__ = [
     "Deproject",
     "EstimateNormals",
     "FarthestPointSample",
+    "KeepConfidence",
     "MaskDepth",
     "MergeViews",
     "NormalizeUnitSphere",
@@ -39,6 +42,7 @@ __all__ = [
     "RandomRotation",
     "RandomSample",
     "RandomScale",
+    "RandomSensorNoise",
     "RandomTranslation",
     "RemovePlane",
     "RemoveRadiusOutliers",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
@@ -14,20 +14,22 @@ from pcdata.functional.ragged import cloud_of_rows
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Metres
+from pcdata.transforms.fields import ConfidenceName, FromSensor, Metres, confidence_named
 
 
 class MaskDepth(Transform):
-    """Set depth to "no reading" outside a range, outside the frame's mask, or on unwanted labels."""
+    """Set depth to "no reading" outside a range, outside the frame's mask, on unwanted labels or below a confidence."""
 
     takes = DepthFrame
     gives = DepthFrame
 
-    near: Metres | None = None  # readings closer than this are dropped
-    far: Metres | None = None  # readings beyond this are dropped
+    # Readings closer than near or beyond far are dropped.
+    near: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[0])] = None
+    far: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[1])] = None
     use_mask: bool = True  # drop pixels outside frame.mask where the capture has one
     require_mask: bool = False  # refuse a capture without a mask
     drop_labels: Sequence[int] = ()  # drop pixels with these labels
+    min_confidence: ConfidenceName | None = None  # drop pixels that are less to be trusted
 
     def check_fields(self) -> None:
         """Require near < far."""
@@ -49,6 +51,13 @@ class MaskDepth(Transform):
             if data.labels is None:
                 raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
             keep &= ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+        if self.min_confidence is not None:
+            if data.confidence is None:
+                raise CaptureError(
+                    f"MaskDepth: min_confidence is set but the capture {data.sample_id!r} has no confidence; put "
+                    "MarkUnreliableDepth or CompleteDepth before it"
+                )
+            keep &= data.confidence >= confidence_named(self.min_confidence)
         return replace(data, depth=torch.where(keep, data.depth, 0.0))
 
 
@@ -89,7 +98,7 @@ class Deproject(Transform):
             labels=None if data.labels is None else data.labels.flatten()[source_index],
             source_index=source_index,
             extra=extra,
-            kinds=dict.fromkeys(extra, Kind.INVARIANT),
+            kinds=dict.fromkeys(extra, Kind.MINIMUM),
             layout=None if camera.distortion is not None else ImageLayout(size=data.size, intrinsics=camera.intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,

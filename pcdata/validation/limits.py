@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pcdata.errors import ConfigError
+from pcdata.sensors import sensor_profile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,15 @@ class Limits:
     color_shift: float = 1.5
     # Seconds between the views of one capture: half a frame and a whole one at 30 per second.
     sync: tuple[float, float] = (0.0167, 0.0334)
+
+    @classmethod
+    def for_sensor(cls, name: str) -> Limits:
+        """Return limits whose workspace is the range in which the named sensor works well.
+
+        Raises:
+            ConfigError: there is no profile of this name.
+        """
+        return cls(workspace=sensor_profile(name).range)
 
     def __post_init__(self) -> None:
         near, far = self.workspace

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional import rigid
 from pcdata.functional.small_motions import motion_from_twist
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
 from pcdata.functional.view_consensus import Consensus, find_consensus
@@ -62,10 +61,22 @@ def verify_overlap(
     return judge_alignment(alignment, names, limits)
 
 
-def judge_alignment(alignment: ViewAlignment, names: Sequence[str], limits: OverlapLimits) -> OverlapResult:
-    """Turn a joint fit of the views into numbers per pair and per camera, a verdict and advice."""
+def judge_alignment(
+    alignment: ViewAlignment, names: Sequence[str], limits: OverlapLimits, *, reference: int | None = None
+) -> OverlapResult:
+    """Turn a joint fit of the views into numbers per pair and per camera, a verdict and advice.
+
+    Args:
+        alignment: the joint fit.
+        names: one per view.
+        limits: what passes and what fails.
+        reference: the view that the others are compared with; None = the best known of those that agree.
+    """
     consensus = find_consensus(
-        alignment, max_shift=limits.shift[0], max_angle=math.radians(limits.rotation_degrees[0])
+        alignment,
+        max_shift=limits.shift[0],
+        max_angle=math.radians(limits.rotation_degrees[0]),
+        reference=reference,
     )
     pairs = tuple(
         _pair(one, _opposite(alignment.before, one), names, limits)

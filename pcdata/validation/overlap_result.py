@@ -30,7 +30,9 @@ class OverlapLimits:
         for name in ("residual", "shift", "rotation_degrees"):
             passes, fails = getattr(self, name)
             if not 0 < passes <= fails < math.inf:
-                raise ConfigError(f"OverlapLimits: {name} must be (pass, fail) with 0 < pass <= fail, got {passes, fails}")
+                raise ConfigError(
+                    f"OverlapLimits: {name} must be (pass, fail) with 0 < pass <= fail, got {passes, fails}"
+                )
         if not (self.max_shift_sigma > 0 and self.max_rotation_sigma_degrees > 0):
             raise ConfigError("OverlapLimits: the largest sigmas must be more than 0")
 
@@ -116,11 +118,13 @@ class OverlapResult:
         for pair in self.pairs:
             if pair.meeting is not None and pair.verdict == "fail" and not pair.median <= self.limits.residual[1]:
                 yield (
-                    f"{pair.first} and {pair.second}: only {100 * pair.meeting:.0f} % of what both could see lies "
-                    "within reach of the other's surface; check that the poses are world_from_camera, in metres, and "
-                    "that nothing moved between the views"
-                ) if pair.meeting < 0.3 else (
-                    f"{pair.first} and {pair.second}: their surfaces lie {1e3 * pair.median:.1f} mm apart"
+                    (
+                        f"{pair.first} and {pair.second}: only {100 * pair.meeting:.0f} % of what both could see lies "
+                        "within reach of the other's surface; check that the poses are world_from_camera, in metres, and "
+                        "that nothing moved between the views"
+                    )
+                    if pair.meeting < 0.3
+                    else (f"{pair.first} and {pair.second}: their surfaces lie {1e3 * pair.median:.1f} mm apart")
                 )
         for camera in self.cameras:
             if camera.unmeasurable:

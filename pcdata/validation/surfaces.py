@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -67,7 +69,7 @@ def _of_clouds(where: str, cloud: PointCloud, max_samples: int) -> tuple[list[Su
             None if seen_from is None else seen_from[start:stop],
             max_samples=max_samples,
         )
-        for start, stop in zip(bounds, bounds[1:])
+        for start, stop in itertools.pairwise(bounds)
     ]
     return surfaces, torch.eye(4, dtype=torch.float64, device=cloud.device).repeat(cloud.num_clouds, 1, 1)
 
@@ -79,7 +81,7 @@ def _of_images(cloud: PointCloud, max_samples: int) -> list[Surface]:
     depth = rigid.transform_points(cloud.points, cloud.ptr, cloud.source_from_cloud)[:, 2]
     bounds = cloud.ptr.tolist()
     surfaces: list[Surface] = []
-    for view, (start, stop) in enumerate(zip(bounds, bounds[1:])):
+    for view, (start, stop) in enumerate(itertools.pairwise(bounds)):
         image = depth.new_zeros(grid.size[0] * grid.size[1])
         image[grid.pixel_index[start:stop]] = depth[start:stop]
         surfaces.append(

@@ -124,6 +124,6 @@ def test_what_cannot_be_measured_is_refused() -> None:
     two = Camera(intrinsics=CAMERA.intrinsics.repeat(2, 1, 1), size=SIZE)
     with pytest.raises(ShapeError, match="one view at a time, got 2"):
         check_plane(DepthFrame(depth=torch.ones(2, *SIZE), camera=two))
-    for arguments in ({"roi": 0.0}, {"roi": 1.5}, {"distance": -1.0}, {"along": "ray"}):
+    for arguments in ({"roi": 0.0}, {"roi": 1.5}, {"distance": -1.0}, {"along": "ray"}, {"noise": lambda z: 0.0}):
         with pytest.raises(ConfigError, match="check_plane"):
             check_plane(wall(), **arguments)  # type: ignore[arg-type]

@@ -56,10 +56,12 @@ EXAMPLES: dict[str, list[Example]] = {
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
+    "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MaskDepth": _of(
         T.MaskDepth(near=0.6, far=0.9),
         T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
         T.MaskDepth(require_mask=True),
+        T.MaskDepth(min_confidence="completed"),
         make=frame_with_counts,
     ),
     "MergeViews": _of(T.MergeViews()),
@@ -93,6 +95,11 @@ EXAMPLES: dict[str, list[Example]] = {
         *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
     "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
+    "RandomSensorNoise": _of(
+        T.RandomSensorNoise(sensor="realsense_d435"),
+        T.RandomSensorNoise(sensor="azure_kinect_nfov", strength=0.5, edge_dropout=0.1, grazing_degrees=70.0),
+        make=frame_with_counts,
+    ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),
