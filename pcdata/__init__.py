@@ -74,6 +74,7 @@ _HOMES = {
     ],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
+    "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _SUBMODULES = [
@@ -88,6 +89,7 @@ _SUBMODULES = [
     "structures",
     "synthetic",
     "transforms",
+    "validation",
 ]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]

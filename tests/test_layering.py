@@ -24,8 +24,8 @@ LAYERS = [
     {"sensors"},
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
-    {"datasets", "calibration"},
-    {"build"},
+    {"datasets", "validation"},
+    {"build", "calibration"},
     {"report"},
     {"demo", "cli", "__main__"},
 ]

@@ -7,6 +7,7 @@ from pcdata.calibration.findings import Finding
 from pcdata.calibration.hand_eye import HandEyeLimits, HandEyeResult, calibrate_hand_eye
 from pcdata.calibration.intrinsics import IntrinsicsLimits, IntrinsicsResult, calibrate_intrinsics, find_board
 from pcdata.calibration.plane_check import PlaneCheck, PlaneLimits, check_plane
+from pcdata.calibration.refine import CameraRefinement, Refinement, refine_extrinsics
 from pcdata.calibration.robot_poses import RobotPoses, read_robot_poses
 from pcdata.io.calibration import Calibration, Evidence
 
@@ -14,6 +15,7 @@ __all__ = [
     "Board",
     "BoardView",
     "Calibration",
+    "CameraRefinement",
     "Charuco",
     "Chessboard",
     "Evidence",
@@ -24,6 +26,7 @@ __all__ = [
     "IntrinsicsResult",
     "PlaneCheck",
     "PlaneLimits",
+    "Refinement",
     "RobotPoses",
     "calibrate_hand_eye",
     "calibrate_intrinsics",
@@ -33,4 +36,5 @@ __all__ = [
     "parse_board",
     "read_board_images",
     "read_robot_poses",
+    "refine_extrinsics",
 ]
