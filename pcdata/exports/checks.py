@@ -148,6 +148,6 @@ def object_ids(where: str, frame: DepthFrame, offset: int, highest: int) -> NDAr
     if taken.any() or ids.max() > highest:
         raise CaptureError(
             f"{where}: objects must have the numbers 1 .. {highest}, since 0 is the background, but labels plus "
-            f"label_offset={offset} reach {int(ids[labels >= 0].min())} .. {int(ids.max())}; choose a label_offset that fits"
+            f"label_offset={offset} reach {int(ids[labels >= 0].min())} .. {int(ids.max())}; choose another"
         )
     return ids

@@ -62,4 +62,4 @@ class ContactGraspNet(Target):
                 note(
                     f"some captures have no depth within {_NEAR}..{_FAR} m, which inference.py crops to; use --z_range"
                 )
-            np.savez(folder / item.paths[0], allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(folder / item.paths[0], allow_pickle=False, **arrays)

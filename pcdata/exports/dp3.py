@@ -50,7 +50,8 @@ class DP3(Target):
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One array of all timesteps: one item."""
-        known, order = set(ids), []
+        known = set(ids)
+        order: list[str] = []
         names = episode_names(self.name, self.episodes)
         assert self.episodes is not None
         for episode in read_episodes(self.name, self.episodes, names):
@@ -147,7 +148,7 @@ class _Ranges:
             else "the range that DP3 scales x, y, z by does not change"
         )
         return (
-            f"{self.padded} clouds have points at exactly 0 0 0, which looks like padding (first: sample {self.first!r}); "
+            f"{self.padded} clouds have points at exactly 0 0 0, as padding has (first: sample {self.first!r}); "
             f"{effect}. Pad by repeated points instead: FarthestPointSample(if_short='repeat')"
         )
 

@@ -37,9 +37,9 @@ def episode_names(where: str, given: Given | None) -> list[str]:
     """
     if given is None:
         raise ConfigError(
-            f"{where}: needs the option episodes: a folder with one .npz per episode that has samples (T,) sample ids in "
-            "order, state (T, Ds) and action (T, Da); clouds alone know no actions. In Python also a mapping from name to "
-            "such arrays"
+            f"{where}: needs the option episodes, since clouds know no actions: a folder with one .npz per episode that "
+            "has samples (T,), the sample ids in order, state (T, Ds) and action (T, Da); in Python also a mapping from "
+            "name to such arrays"
         )
     if isinstance(given, Mapping):
         names = sorted(given)
@@ -87,7 +87,7 @@ def _numbers(place: str, key: str, value: Any, count: int) -> NDArray[np.float32
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or len(array) != count or array.shape[1] < 1:
         raise ConfigError(
-            f"{place}: {key} must be numbers ({count}, D), a row for each of its samples, got {array.dtype} {array.shape}"
+            f"{place}: {key} must be numbers ({count}, D), a row per sample, got {array.dtype} {array.shape}"
         )
     with np.errstate(over="ignore"):
         narrow = array.astype(np.float32)

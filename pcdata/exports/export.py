@@ -43,12 +43,12 @@ def export_dataset(
 ) -> ExportReport:
     """Write samples in the layout of an official loader.
 
-    One sample is in memory at a time. The folder appears under its name only when it is complete. With ``resume`` it is
-    made at once and items (a file, a folder, a scene, as the target says) are moved into it one by one, each complete, so
-    that a later call with ``resume`` goes on where an interrupted one stopped.
+    One sample is in memory at a time. The folder appears under its name only when it is complete. With ``resume`` it
+    is made at once and items (a file, a folder, a scene, as the target says) are moved into it one by one, each
+    complete, so that a later call with ``resume`` goes on where an interrupted one stopped.
 
     Args:
-        source: a dataset that ``pcdata build`` wrote (for targets of clouds), captures (for targets of depth images), as
+        source: what ``pcdata build`` wrote (for targets of clouds) or captures (for targets of depth images), as
             a path or an object with ``ids`` and ``load``.
         target: one of :data:`pcdata.exports.TARGETS`.
         out: the folder of the export.
@@ -161,7 +161,7 @@ def _continue(run: _Run, plan: ExportRecord, folder: Path) -> None:
 
 
 def _move(paths: Sequence[str], scratch: Path, folder: Path) -> None:
-    """Put finished files and folders into place, in order; left over are only what an interrupted move had put there."""
+    """Put finished files and folders into place, in order; what an interrupted move had put there is replaced."""
     try:
         for number, path in enumerate(paths):
             new, place = scratch / path, folder / path

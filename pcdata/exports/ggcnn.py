@@ -33,11 +33,11 @@ _CORNERS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class GGCNN(Target):
-    """``01/pcd0100d.tiff``, ``01/pcd0100r.png``, ``01/pcd0100cpos.txt``; the loader calls the folder ``--dataset-path``.
+    """``01/pcd0100d.tiff``, ``01/pcd0100r.png``, ``01/pcd0100cpos.txt``; the folder is the loader's ``--dataset-path``.
 
     Args:
-        grasps: the folder of ``<sample>.txt`` files with the corners of good grasps, four lines "x y" each, in pixels (as
-            Cornell's cpos files), or a mapping from sample id to (G, 4, 2) corners; None = to be added later.
+        grasps: the folder of ``<sample>.txt`` files with the corners of good grasps, four lines "x y" each, in pixels
+            (as Cornell's cpos files), or a mapping from sample id to (G, 4, 2) corners; None = to be added later.
         holes: pixels without a reading: "smooth" and "nearest" fill them in (see CompleteDepth), "nan" and "zero" mark
             them. The loader subtracts the mean of the image: a NaN makes all of it NaN, zeros shift it.
         colors: write ``r.png``; False = depth alone (``--use-rgb 0``).

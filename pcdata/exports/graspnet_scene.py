@@ -27,8 +27,8 @@ from pcdata.io.images import write_color
 class GraspNetScenes(GraspNetImages):
     """``scenes/scene_XXXX/CAMERA/...``; give the folder to the loader as its ``root``.
 
-    The captures, in order, are cut into scenes of ``frames_per_scene``. Their poses must lead to a frame whose z axis is
-    up from the table, since the loader crops in it.
+    The captures, in order, are cut into scenes of ``frames_per_scene``. Their poses must lead to a frame whose z axis
+    is up from the table, since the loader crops in it.
 
     Args:
         camera: the folder of the camera.
@@ -51,8 +51,8 @@ class GraspNetScenes(GraspNetImages):
         size = self.frames_per_scene
         if len(ids) % size:
             raise ConfigError(
-                f"{self.name}: {len(ids)} captures do not fill scenes of {size}; the loader reads frames 0..255 of every "
-                "scene. Give whole scenes, or say frames_per_scene=N for a loader changed to yours"
+                f"{self.name}: {len(ids)} captures do not fill scenes of {size}; the loader reads frames 0..255 of "
+                "every scene. Give whole scenes, or say frames_per_scene=N for a loader changed to yours"
             )
         cuts = [ids[start : start + size] for start in range(0, len(ids), size)]
         return [Item(tuple(cut), (f"scenes/scene_{self.first_scene + n:04d}",)) for n, cut in enumerate(cuts)]
@@ -70,7 +70,7 @@ class GraspNetScenes(GraspNetImages):
                 raise CaptureError(f"{where}: the loader needs camera poses, the capture has none; give poses/NAME.txt")
             if frame.labels is None:
                 raise CaptureError(
-                    f"{where}: the loader reads label images even for testing, the capture has none; add labels/NAME.png"
+                    f"{where}: the loader reads labels even for testing, the capture has none; add labels/NAME.png"
                 )
             intrinsics = frame.camera.intrinsics[0]
             matrix = intrinsics if matrix is None else matrix

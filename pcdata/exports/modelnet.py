@@ -24,7 +24,7 @@ _EXACT = "%.9g"  # nine digits give every float32 back
 
 @dataclass(frozen=True, kw_only=True)
 class ModelNet(Target):
-    """``<class>/<class>_0001.txt``, lists of shapes and of classes; the loaders call this ``modelnet40_normal_resampled``.
+    """``<class>/<class>_0001.txt``, lists of shapes and classes; the loaders look for ``modelnet40_normal_resampled``.
 
     Args:
         table: class and split (train or test) of every sample; see :func:`pcdata.exports.table.read_table`.

@@ -27,10 +27,10 @@ class Pointcept(Target):
     """``<split>/<sample>/{coord,color,normal,segment,instance}.npy``; give the folder to the loader as ``data_root``.
 
     Args:
-        table: split of every sample, any names; None = all are in ``train``. See :func:`pcdata.exports.table.read_table`.
+        table: split of every sample, any name; None = all in ``train``. See :func:`pcdata.exports.table.read_table`.
         segment: the per-point field of semantic classes, -1 = ignored; None = do without.
         instance: the per-point field of objects, -1 = none; None = do without.
-        frame: the frame that the clouds must be in; None = that of the first.
+        frame: the frame that the clouds must be in; None = any.
     """
 
     name: ClassVar[str] = "pointcept"
@@ -57,7 +57,8 @@ class Pointcept(Target):
             where = f"pointcept: sample {sample_id!r}"
             cloud = one_cloud(where, data)
             check_metres(where, cloud, "its grids and crops are in metres")
-            SameFrame(self.frame).check(where, cloud)
+            if self.frame is not None:
+                SameFrame(self.frame).check(where, cloud)
             arrays = {"coord": cloud.points.numpy()}
             if cloud.colors is not None:
                 arrays["color"] = (cloud.colors * 255).round().clamp(0, 255).to(torch.uint8).numpy()

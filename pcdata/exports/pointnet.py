@@ -30,8 +30,8 @@ class PointNet(Target):
 
     Args:
         table: class and split (train or test) of every sample; see :func:`pcdata.exports.table.read_table`.
-        prefix: put before the file names in the lists. ``train.py`` opens those names as they are, from the repository's
-            folder, where it also looks for the lists.
+        prefix: put before the file names in the lists. ``train.py`` opens those names as they are, from the
+            repository's folder; the default is the folder in which it looks for the lists.
     """
 
     name: ClassVar[str] = "pointnet"

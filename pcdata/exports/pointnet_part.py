@@ -72,7 +72,7 @@ class PointNetPart(PointNet):
             owner = class_of_part.setdefault(part, class_name)
             if owner != class_name:
                 raise CaptureError(
-                    f"{where}: part {part} belongs to class {owner!r} in the samples before and to {class_name!r} here; "
+                    f"{where}: part {part} belongs to class {owner!r} in samples before, to {class_name!r} here; "
                     "number parts through all classes"
                 )
         file["pid"][number] = cloud.labels.numpy()
@@ -85,8 +85,8 @@ class PointNetPart(PointNet):
         missing = sorted(set(range(count)) - class_of_part.keys())
         if missing:
             raise CaptureError(
-                f"{self.name}: part numbers must go from 0 to {count - 1} without gaps, since the loader counts them, but "
-                f"no sample has {missing[:10]}; renumber the labels"
+                f"{self.name}: part numbers must go from 0 to {count - 1} without gaps, since the loader counts them, "
+                f"but no sample has {missing[:10]}; renumber the labels"
             )
         owners = [class_of_part[part] for part in range(count)]
         parts = [[owner, owners[:part].count(owner)] for part, owner in enumerate(owners)]

@@ -79,7 +79,7 @@ def check_replaceable(folder: Path, overwrite: bool) -> None:
             return
         if not overwrite:
             raise CacheError(
-                f"{folder} exists already; choose another folder, finish an export that was interrupted (--continue), or "
+                f"{folder} exists already; choose another folder, finish an interrupted export (--continue), or "
                 "replace it (--overwrite)"
             )
         record = ExportRecord.read(folder)
@@ -90,8 +90,8 @@ def check_replaceable(folder: Path, overwrite: bool) -> None:
         raise CacheError(f"{folder}: cannot be examined: {error}") from error
     if foreign:
         raise CacheError(
-            f"{folder} also holds {', '.join(foreign[:5])}, which the export did not write and overwriting would delete; "
-            "move that out first, or choose another folder"
+            f"{folder} also holds {', '.join(foreign[:5])}, which the export did not write and overwriting would "
+            "delete; move that out first, or choose another folder"
         )
 
 

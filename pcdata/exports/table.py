@@ -29,8 +29,8 @@ class Row:
 def read_table(where: str, given: Given | None, ids: Sequence[str], *, needs: Sequence[str]) -> dict[str, Row]:
     """Return the row of every sample id.
 
-    A file has a header ``sample,class,split`` (in any order; which columns must be there, the target says); a mapping goes
-    from sample id to ``{"class": ..., "split": ...}``. Rows of other samples do not matter.
+    A file has a header ``sample,class,split`` (in any order; which columns must be there, the target says); a mapping
+    goes from sample id to ``{"class": ..., "split": ...}``. Rows of other samples do not matter.
 
     Raises:
         ConfigError: nothing was given, a sample or a column is missing, or a name cannot become a file name.
@@ -87,8 +87,8 @@ def _name(where: str, sample_id: str, column: str, value: Any) -> str | None:
         return None
     if not isinstance(value, str) or not _NAME.fullmatch(value):
         raise ConfigError(
-            f"{where}: the {column} of sample {sample_id!r} must be of letters, digits, '_', '-' and '.', since it becomes "
-            f"a file name, got {value!r:.100}"
+            f"{where}: the {column} of sample {sample_id!r} must be of letters, digits, '_', '-' and '.', since it "
+            f"becomes a file name, got {value!r:.100}"
         )
     return value
 

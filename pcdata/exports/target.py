@@ -50,7 +50,8 @@ class Target(ABC):
         """
 
     def finish(self, items: Sequence[Item], folder: Path, note: Note) -> None:
-        """Write what goes over all items, such as lists of files."""
+        """Write what goes over all items, such as lists of files; here nothing."""
+        return
 
     def options(self) -> dict[str, Any]:
         """Return the options as JSON can hold them; of a mapping, the names in it."""
