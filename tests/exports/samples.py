@@ -73,5 +73,3 @@ def frame(size: tuple[int, int] = (12, 16), seed: int = 0, **changes: object) ->
 def tree(folder: Path) -> dict[str, bytes | None]:
     """Everything below a folder, hidden names too."""
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
-
-

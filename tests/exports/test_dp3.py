@@ -1,7 +1,6 @@
-"""DP3: read as 3D-Diffusion-Policy's ReplayBuffer and AdroitDataset read it (common/replay_buffer.py, adroit_dataset.py)."""
+"""DP3, read as 3D-Diffusion-Policy reads it: common/replay_buffer.py, dataset/adroit_dataset.py."""
 
 from __future__ import annotations
-
 
 import tracemalloc
 import weakref

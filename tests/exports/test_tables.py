@@ -37,7 +37,7 @@ def write_csv(path: Path) -> Path:
 
 def get_data_files(path: Path) -> list[str]:
     """pointnet provider.getDataFiles."""
-    return [line.rstrip() for line in path.open()]
+    return [line.rstrip() for line in path.read_text().splitlines()]
 
 
 def test_pointnet_opens_the_files_that_its_lists_name(tmp_path, monkeypatch):
@@ -91,7 +91,7 @@ def test_pointnet_part_has_a_part_for_every_point_and_the_files_on_categories(tm
     table = {name: row | {"split": row.get("split", "train").replace("test", "val")} for name, row in TABLE.items()}
     export_dataset(source, "pointnet_part", tmp_path / "out", table=table)
     out = tmp_path / "out"
-    lines = [line.rstrip() for line in (out / "all_object_categories.txt").open()]  # part_seg/train.py from here on
+    lines = get_data_files(out / "all_object_categories.txt")  # part_seg/train.py from here on
     assert [(line.split()[0], line.split()[1]) for line in lines] == [("bowl", "bowl"), ("mug", "mug")]
     parts = json.loads((out / "overallid_to_catid_partid.json").read_text())
     assert parts == [["bowl", n] for n in range(4)] + [["mug", n] for n in range(4)]
@@ -132,9 +132,8 @@ def test_a_part_of_two_classes_is_refused(tmp_path):
 
 def modelnet(root: Path, split: str, catfile: str):
     """pointnet2 modelnet_dataset.py (catfile shape_names.txt), ModelNetDataLoader.py (modelnet40_shape_names.txt)."""
-    classes = {name: n for n, name in enumerate(line.rstrip() for line in (root / catfile).open())}
-    ids = [line.rstrip() for line in (root / f"modelnet40_{split}.txt").open()]
-    for shape in ids:
+    classes = {name: n for n, name in enumerate(get_data_files(root / catfile))}
+    for shape in get_data_files(root / f"modelnet40_{split}.txt"):
         name = "_".join(shape.split("_")[0:-1])
         points = np.loadtxt(root / name / f"{shape}.txt", delimiter=",").astype(np.float32)
         yield points[0:1024, :], classes[name]

@@ -55,7 +55,9 @@ def test_the_zarr_package_reads_the_same(tmp_path, compression):
     zarr = pytest.importorskip("zarr", reason="zarr is not installed: only the specification is tested")
     write_group(tmp_path / "store")
     write_group(tmp_path / "store" / "data")
-    arrays = {str(n): (np.random.default_rng(n).random(shape) * 200).astype(dtype) for n, (shape, dtype) in enumerate(CASES)}
+    arrays = {
+        str(n): (np.random.default_rng(n).random(shape) * 200).astype(dtype) for n, (shape, dtype) in enumerate(CASES)
+    }
     for name, array in arrays.items():
         write(tmp_path / "store" / "data" / name, array, chunk_rows=3, compression=compression)
     data = zarr.open(str(tmp_path / "store"), mode="r")["data"]
