@@ -38,8 +38,8 @@ def episode_names(where: str, given: Given | None) -> list[str]:
     if given is None:
         raise ConfigError(
             f"{where}: needs the option episodes, since clouds know no actions: a folder with one .npz per episode "
-            "that has samples (T,), the sample ids in order, state (T, Ds) and action (T, Da); in Python also a mapping "
-            "from name to such arrays"
+            "that has samples (T,), the sample ids in order, state (T, Ds) and action (T, Da); in Python also a "
+            "mapping from name to such arrays"
         )
     if isinstance(given, Mapping):
         names = sorted(given)
