@@ -6,11 +6,13 @@ OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel ce
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.dispatch import op
+from pcdata.dispatch import inner, op
 from pcdata.errors import CaptureError
 from pcdata.functional.lens import check_distortion, distort_normalized, fold_radius, undistort_normalized
 from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
@@ -46,6 +48,26 @@ def deproject_depth(
     points = torch.cat([rays[valid] * z[:, None], z[:, None]], dim=1)
     pixel_index = valid.reshape(len(depth), height * width).nonzero()[:, 1]
     return points, ptr_from_counts(valid.sum(dim=(1, 2))), pixel_index
+
+
+@inner
+def deproject_images(
+    depth: Tensor,  # (V, H, W) float32
+    intrinsics: Tensor,  # (V, 3, 3)
+    distortion: Tensor | None,  # (V, D)
+    colors: Tensor | None,  # (V, H, W, 3) uint8
+    images: Mapping[str, Tensor],  # each (V, H, W, ...)
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, dict[str, Tensor]]:
+    """Run :func:`deproject_depth` and pick what other images say about the same pixels.
+
+    Returns:
+        points (M, 3), ptr (V+1,), source_index (M,): the pixel counted over all views, colors (M, 3) float32 in [0, 1],
+        and the rows of the images.
+    """
+    points, ptr, pixel_index = deproject_depth(depth, intrinsics, distortion=distortion)
+    source_index = cloud_of_rows(ptr) * depth[0].numel() + pixel_index
+    rgb = None if colors is None else colors.reshape(-1, 3)[source_index].float() / 255
+    return points, ptr, source_index, rgb, {name: image.flatten(0, 2)[source_index] for name, image in images.items()}
 
 
 def pixel_rays(

@@ -5,10 +5,14 @@ Cloud b of a batch is rows ``ptr[b]:ptr[b+1]``; any cloud may be empty.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from pcdata.dispatch import inner
 
 
 def counts_from_ptr(ptr: Tensor) -> Tensor:
@@ -30,8 +34,30 @@ def cloud_of_rows(ptr: Tensor) -> Tensor:
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
+    if mask.device.type == "cpu":
+        ones = mask.numpy()  # numpy counts booleans many times faster than torch
+        return ptr_from_counts([np.count_nonzero(ones[start:stop]) for start, stop in pairwise(ptr.tolist())])
     kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return kept[ptr]
+
+
+@inner
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask."""
+    index = torch.nonzero(rows).squeeze(1) if rows.dtype is torch.bool else rows
+    return {name: field[index] for name, field in fields.items()}
+
+
+@inner
+def count_falls(values: Tensor) -> int:
+    """Count the (N,) int64 values that are not above the one before them."""
+    return int((values[1:] <= values[:-1]).sum())
+
+
+def rises_within_clouds(values: Tensor, ptr: Tensor) -> bool:
+    """Say whether (N,) int64 values increase from row to row of every cloud."""
+    starts = torch.unique(ptr[(ptr > 0) & (ptr < len(values))])  # rows that follow another cloud's last
+    return count_falls(values) == int((values[starts] <= values[starts - 1]).sum())
 
 
 def segment_sum(values: Tensor, ptr: Tensor) -> Tensor:

@@ -10,14 +10,14 @@ import ctypes
 import functools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-INTERFACE_VERSION = 1
+INTERFACE_VERSION = 2
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.
@@ -81,6 +81,12 @@ def call(function: str, *arguments: Any) -> None:
         raise KeyboardInterrupt
     if status != _OK:
         raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
+
+
+def addresses(tensors: Sequence[Tensor]) -> Tensor:
+    """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
+    assert all(one.is_contiguous() and one.device.type == "cpu" for one in tensors)
+    return torch.tensor([one.data_ptr() for one in tensors], dtype=torch.int64)
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:

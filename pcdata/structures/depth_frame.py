@@ -13,8 +13,10 @@ from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
 from pcdata.structures.camera import Camera, check_view
+from pcdata.structures.derive import derived
 
 CAMERA_FRAME = "camera"
+_KEEP = {"depth": "V H W", "keep": "V H W : bool"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,7 +65,7 @@ class DepthFrame:
             {"depth": "V H W : float32", "world_from_camera": "V 4 4 : float64"},
             check_values=False,
         )
-        if bool((self.depth < 0).any()):
+        if self.depth.numel() and float(self.depth.detach().min()) < 0:
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
         if self.camera.num_views != self.num_views or self.camera.size != self.size:
             raise ShapeError(
@@ -102,6 +104,15 @@ class DepthFrame:
         keep = slice(index, index + 1)
         images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
         return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]
+
+    def blanked(self, keep: Tensor) -> DepthFrame:
+        """Return the frame with "no reading" wherever ``keep`` (V, H, W) bool is False."""
+        check_tensors("DepthFrame.blanked", {"depth": self.depth, "keep": keep}, _KEEP, finite=False)
+        return derived(self, depth=torch.where(keep, self.depth, 0.0))
+
+    def with_provenance(self, entries: Mapping[str, Any]) -> DepthFrame:
+        """Merge JSON-able facts into the provenance."""
+        return derived(self, provenance={**self.provenance, **entries})
 
     def to(self, device: torch.device | str) -> DepthFrame:
         """Move all tensors to a device."""

@@ -13,7 +13,8 @@ from pcdata.checks import check_ptr_values, check_tensors
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
 from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, pick_rows, ptr_from_counts
+from pcdata.structures.derive import derived
 from pcdata.structures.fields import CORE_KINDS, Kind
 from pcdata.structures.padded import PaddedClouds, pad_rows
 
@@ -183,8 +184,7 @@ class PointCloud:
         if self.layout is None or self.source_index is None:
             return None
         height, width = self.layout.size
-        pixel_index = self.source_index % (height * width)
-        return ImageGrid(pixel_index, self.layout.size, self.layout.intrinsics, self.source_from_cloud)
+        return ImageGrid(_within_image(self.source_index, self.ptr, height * width), self.layout.size, self.layout.intrinsics, self.source_from_cloud)
 
     def viewpoint_per_point(self) -> Tensor | None:
         """(N, 3): where the sensor stood that saw each point, or None when unknown."""
@@ -216,7 +216,11 @@ class PointCloud:
 
     def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
         """Merge one mapping of JSON-able findings into the meta of each cloud."""
-        return replace(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+        return derived(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+
+    def with_steps(self, steps: Sequence[Step]) -> PointCloud:
+        """Add one JSON-able step to the history of each cloud."""
+        return derived(self, history=tuple((*old, new) for old, new in zip(self.history, steps, strict=True)))
 
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
@@ -224,8 +228,7 @@ class PointCloud:
         Rows of a cloud must stay within that cloud. A mask keeps their order, and so the image they lie on.
         """
         layout = self.layout if index.dtype is torch.bool else None
-        rows = torch.nonzero(index).squeeze(1) if index.dtype is torch.bool else index
-        return self._rebuilt({name: value[rows] for name, value in self.fields().items()}, ptr=ptr, layout=layout)
+        return self._rebuilt(pick_rows(self.fields(), index), ptr=ptr, layout=layout)
 
     def _rebuilt(self, rows: Mapping[str, Tensor], *, layout: ImageLayout | None, **others: Any) -> PointCloud:
         """Replace all per-point fields at once, and any other attributes."""
@@ -375,6 +378,15 @@ class PointCloud:
         sizes = f"{counts[0]} points" if len(counts) == 1 else f"{len(counts)} clouds of {min(counts)}-{max(counts)}"
         carried = ", ".join(name for name in self.fields() if name != "points")
         return f"PointCloud({sizes} in {self.frame_id!r} [{self.unit}]{': ' + carried if carried else ''})"
+
+
+def _within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:
+    """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
+    if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
+        last = ptr[1:][ptr[1:] > ptr[:-1]] - 1
+        if bool((source_index[last] < num_pixels).all()):
+            return source_index
+    return source_index % num_pixels
 
 
 def _layout_of(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None)) -> ImageLayout | None:

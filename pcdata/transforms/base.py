@@ -166,10 +166,10 @@ class Transform(nn.Module):
     def _record(self, data: Any, result: Any, params: Params) -> Any:
         if isinstance(result, DepthFrame):
             steps = [*result.provenance.get("history", ()), self._step({}, {})]
-            return dataclasses.replace(result, provenance={**result.provenance, "history": steps})
+            return result.with_provenance({"history": steps})
         before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
         after = result.counts.tolist()
-        history = []
+        steps = []
         for b, count in enumerate(after):
             facts: dict[str, Any] = {"points": count}
             if before is not None and len(before) == len(after):
@@ -181,8 +181,8 @@ class Transform(nn.Module):
                     )
             elif count == 0:
                 raise TooFewPointsError(f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points")
-            history.append((*result.history[b], self._step(facts, _small(params, b, len(after)))))
-        return dataclasses.replace(result, history=tuple(history))
+            steps.append(self._step(facts, _small(params, b, len(after))))
+        return result.with_steps(steps)
 
     def _step(self, facts: dict[str, Any], params: dict[str, Any]) -> dict[str, Any]:
         (name, fields), *_ = self.to_config().items()

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.depth import deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -49,7 +47,7 @@ class MaskDepth(Transform):
             if data.labels is None:
                 raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
             keep &= ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
-        return replace(data, depth=torch.where(keep, data.depth, 0.0))
+        return data.blanked(keep)
 
 
 class Deproject(Transform):
@@ -73,23 +71,25 @@ class Deproject(Transform):
     def apply(self, data: DepthFrame, params: Params) -> PointCloud:
         """Deproject all views in one call."""
         camera = data.camera.to(data.device)
-        points, ptr, pixel_index = deproject_depth(data.depth, camera.intrinsics, distortion=camera.distortion)
-        source_index = cloud_of_rows(ptr) * (data.size[0] * data.size[1]) + pixel_index
+        images = {name: image for name in ("labels", "confidence") if (image := getattr(data, name)) is not None}
+        points, ptr, source_index, colors, rows = deproject_images(
+            data.depth, camera.intrinsics, camera.distortion, data.colors, images
+        )
+        labels = rows.pop("labels", None)
         identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
         frames = {CAMERA_FRAME: identity}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
-        extra = {} if data.confidence is None else {"confidence": data.confidence.flatten()[source_index]}
         history = tuple(data.provenance.get("history", ()))
         return PointCloud(
             points=points,
             ptr=ptr,
             frame_id=CAMERA_FRAME,
-            colors=None if data.colors is None else data.colors.reshape(-1, 3)[source_index].float() / 255,
-            labels=None if data.labels is None else data.labels.flatten()[source_index],
+            colors=colors,
+            labels=labels,
             source_index=source_index,
-            extra=extra,
-            kinds=dict.fromkeys(extra, Kind.INVARIANT),
+            extra=rows,
+            kinds=dict.fromkeys(rows, Kind.INVARIANT),
             layout=None if camera.distortion is not None else ImageLayout(size=data.size, intrinsics=camera.intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,

@@ -1,0 +1,123 @@
+"""Row kernels: picking rows of many fields at once, moving points, cutting out a box.
+
+Clouds of any size come here, also tiny ones, and some of them on the way to an error that the reference words best: it
+takes over whatever a kernel does not cover.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import pcdata.functional.boxes
+import pcdata.functional.ragged
+import pcdata.functional.rigid  # noqa: F401 - the functions must be registered before their kernels
+from pcdata.dispatch import INNER, kernel
+from pcdata.kernels.native import addresses, call
+
+_ROWS_PER_PIECE = 16384  # as in rows.cpp
+
+
+@kernel("pick_rows", "cpu")
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """Copy the rows of all fields piece by piece."""
+    sources = list(fields.values())
+    num_rows = len(sources[0]) if sources and sources[0].ndim else 0
+    if num_rows == 0 or rows.ndim != 1 or not all(_is_plain(field) and len(field) == num_rows for field in sources):
+        return _reference("pick_rows", fields, rows)
+    if rows.dtype is torch.bool and len(rows) == num_rows:
+        return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
+    if rows.dtype is torch.int64:
+        picked = _take_rows(sources, rows.contiguous())
+        if picked is not None:
+            return dict(zip(fields, picked))
+    return _reference("pick_rows", fields, rows)
+
+
+def _keep_rows(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
+    starts = torch.empty(-(-len(mask) // _ROWS_PER_PIECE) + 1, dtype=torch.int64)
+    call("pc_count_kept", mask, len(mask), starts)
+    sources, picked, sizes = _sources_and_picked(fields, int(starts[-1]))
+    call("pc_keep_rows", mask, len(mask), starts, len(fields), addresses(sources), sizes, addresses(picked))
+    return picked
+
+
+def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
+    """Return the rows of all fields; None if an index is negative, which counts from the end, or out of range."""
+    sources, picked, sizes = _sources_and_picked(fields, len(index))
+    possible = torch.empty(1, dtype=torch.int64)
+    of_all = len(fields), addresses(sources), sizes, addresses(picked)
+    call("pc_take_rows", index, len(index), len(fields[0]), *of_all, possible)
+    return picked if possible else None
+
+
+def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
+    sources = [field.contiguous() for field in fields]
+    picked = [field.new_empty((count, *field.shape[1:])) for field in fields]
+    return sources, picked, torch.tensor([field.nbytes // len(field) for field in sources])
+
+
+def _is_plain(field: Tensor) -> bool:
+    """Whether a row is its bytes."""
+    plain = field.layout is torch.strided and field.device.type == "cpu" and field.ndim > 0
+    return plain and not field.is_conj() and not field.is_neg()
+
+
+@kernel("count_falls", "cpu")
+def count_falls(values: Tensor) -> int:
+    """Compare every value with the one before it."""
+    if values.dtype is not torch.int64 or values.ndim != 1:
+        return _reference("count_falls", values)
+    falls = torch.empty(1, dtype=torch.int64)
+    call("pc_count_falls", values.contiguous(), len(values), falls)
+    return int(falls)
+
+
+@kernel("transform_points", "cpu")
+def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
+    """Move every point once, through registers."""
+    if not _covers(points, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+        return _reference("transform_points", points, ptr, matrix)
+    moved = points.new_empty(points.shape)
+    call("pc_transform_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _wide(matrix), moved)
+    return moved
+
+
+@kernel("transform_directions", "cpu")
+def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
+    """Turn every direction once, through registers."""
+    if not _covers(directions, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+        return _reference("transform_directions", directions, ptr, matrix)
+    turned = directions.new_empty(directions.shape)
+    linear = torch.linalg.inv(_wide(matrix)[:, :3, :3]).mT.contiguous()
+    call("pc_transform_directions", directions.contiguous(), ptr.contiguous(), len(ptr) - 1, linear, turned)
+    return turned
+
+
+def _covers(points: Tensor, ptr: Tensor) -> bool:
+    """Whether these are float32 points that the row pointers cut completely."""
+    fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and ptr.dtype is torch.int64 and len(ptr) > 1
+    return fits and int(ptr[0]) == 0 and int(ptr[-1]) == len(points)
+
+
+def _wide(matrix: Tensor) -> Tensor:
+    return matrix.double().contiguous()
+
+
+@kernel("inside_box", "cpu")
+def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -> Tensor | None:
+    """Look at every point once."""
+    if points.dtype is not torch.float32:
+        return _reference("inside_box", points, lower, upper)
+    inside, finite = torch.empty(len(points), dtype=torch.bool), torch.empty(1, dtype=torch.int64)
+    corners = points.new_tensor(lower), points.new_tensor(upper)
+    call("pc_inside_box", points.contiguous(), len(points), *corners, inside, finite)
+    return inside if finite else None
+
+
+def _reference(function: str, *args: Any) -> Any:
+    return INNER[function].reference(*args)
