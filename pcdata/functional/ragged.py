@@ -36,7 +36,7 @@ def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
     if mask.device.type == "cpu":
         ones = mask.numpy()  # numpy counts booleans many times faster than torch
-        return ptr_from_counts([np.count_nonzero(ones[start:stop]) for start, stop in pairwise(ptr.tolist())])
+        return ptr_from_counts([int(np.count_nonzero(ones[start:stop])) for start, stop in pairwise(ptr.tolist())])
     kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return kept[ptr]
 

@@ -1,29 +1,44 @@
-"""Image kernels: from depth images to points."""
+"""Image kernels: from depth images to points.
+
+Deprojection takes two passes over the pixels: the first decides which become points, so that the second can write them,
+and all that goes along with them, where they belong.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import INNER, OPERATIONS, Operation, kernel
-from pcdata.functional.depth import check_intrinsics, check_rays, pixel_rays
-from pcdata.kernels.native import addresses, call
+from pcdata.dispatch import INNER, OPERATIONS, kernel
+from pcdata.functional.depth import Deprojected, check_intrinsics, pixel_rays
+from pcdata.kernels.native import addresses, call, room_for
+
+
+@kernel("mask_depth", "cpu")
+def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tensor | None) -> Tensor:
+    """Decide and write in one pass."""
+    if mask is not None and mask.shape != depth.shape:
+        return INNER["mask_depth"].reference(depth, near, far, mask)
+    masked = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    limits = _limits(near, far)
+    call("pc_mask_depth", depth.contiguous(), depth.numel(), *limits, _contiguous(mask), masked)
+    return masked
 
 
 @kernel("deproject_depth", "cpu")
 def deproject_depth(depth: Tensor, intrinsics: Tensor, *, distortion: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Count the readings of every image row, then write every row's points at once."""
-    check_intrinsics("deproject_depth", intrinsics)
-    depth = depth.contiguous()
-    starts = _row_starts(depth)
-    if starts is None:
-        return _reference(OPERATIONS["deproject_depth"], depth, intrinsics, distortion=distortion)
-    points, pixel_index, _, _ = _deproject(depth, intrinsics, distortion, starts, over_all_views=False)
-    return points, _ptr_of(starts, depth), pixel_index
+    """Write the points and their pixels."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return OPERATIONS["deproject_depth"].reference(depth, intrinsics, distortion=distortion)
+    made = cameras.deproject(chosen, over_all_views=False)
+    return made.points, made.ptr, made.source_index
 
 
 @kernel("deproject_images", "cpu")
@@ -33,63 +48,126 @@ def deproject_images(
     distortion: Tensor | None,
     colors: Tensor | None,
     images: Mapping[str, Tensor],
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, dict[str, Tensor]]:
-    """Write the points and all that goes along with them in the same pass."""
-    check_intrinsics("deproject_depth", intrinsics)
-    depth = depth.contiguous()
-    starts = _row_starts(depth)
-    if starts is None:
-        return _reference(INNER["deproject_images"], depth, intrinsics, distortion, colors, images)
-    points, source_index, rgb, rows = _deproject(
-        depth, intrinsics, distortion, starts, over_all_views=True, colors=colors, images=list(images.values())
-    )
-    return points, _ptr_of(starts, depth), source_index, rgb, dict(zip(images, rows))
+) -> Deprojected:
+    """Write the points and all that goes along with them."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
+    return cameras.deproject(chosen, colors=colors, images=images)
 
 
-def _row_starts(depth: Tensor) -> Tensor | None:
-    """Return (V * H + 1,): where the points of each image row start; None for a depth that the reference refuses."""
-    views, height, width = depth.shape
-    starts, possible = torch.empty(views * height + 1, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
-    call("pc_count_readings", depth, views, height, width, starts, possible)
-    return starts if possible else None
-
-
-def _deproject(
+@kernel("deproject_into_box", "cpu")
+def deproject_into_box(
     depth: Tensor,
     intrinsics: Tensor,
     distortion: Tensor | None,
-    starts: Tensor,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
     *,
-    over_all_views: bool,
-    colors: Tensor | None = None,
-    images: Sequence[Tensor] = (),
-) -> tuple[Tensor, Tensor, Tensor | None, list[Tensor]]:
-    """Return points, pixel numbers, colours and the rows of the images."""
-    views, height, width = depth.shape
-    count = int(starts[-1])
-    points, pixel_index = torch.empty((count, 3), dtype=torch.float32), torch.empty(count, dtype=torch.int64)
-    rgb = None if colors is None else torch.empty_like(points)
-    images = [image.contiguous() for image in images]
-    rows = [image.new_empty((count, *image.shape[3:])) for image in images]
-    crossed = None if distortion is not None else _crossed_rays(intrinsics, (height, width))
-    rays = None
-    if crossed is None:
-        crossed = None, None
-        rays = _cached_rays(_Key(intrinsics), (height, width), None if distortion is None else _Key(distortion))
-        check_rays("deproject_depth", rays, depth > 0)
-    pixel_bytes = torch.tensor([image[0, 0, 0].nbytes for image in images], dtype=torch.int64)
-    call(
-        "pc_deproject",
-        *(depth, views, height, width, *crossed, rays, starts),
-        *(points, pixel_index, over_all_views, None if colors is None else colors.contiguous(), rgb),
-        *(len(images), addresses(images), pixel_bytes, addresses(rows)),
-    )
-    return points, pixel_index, rgb, rows
+    matrix: Tensor | None,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    near: float | None,
+    far: float | None,
+    mask: Tensor | None,
+) -> tuple[Deprojected, Tensor] | None:
+    """Write only what is inside the box."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    matrix = None if matrix is None else matrix.double().contiguous()
+    corners = depth.new_tensor(lower), depth.new_tensor(upper)
+    chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
+    if chosen is None:
+        region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
+        return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
+    return cameras.deproject(chosen, matrix=matrix, colors=colors, images=images), chosen.readings
 
 
-def _ptr_of(starts: Tensor, depth: Tensor) -> Tensor:
-    views, height, _ = depth.shape
-    return starts[torch.arange(views + 1) * height]
+@dataclass(frozen=True)
+class _Chosen:
+    """Which pixels become points."""
+
+    keep: Tensor  # (V, H, W) bool
+    readings: Tensor  # (V,) int64: those that the box decided about
+    starts: Tensor  # (V * H + 1,) int64: where the points of each image row start
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """Depth images and the directions in which their pixels look."""
+
+    depth: Tensor  # (V, H, W)
+    rays: tuple[Tensor | None, Tensor | None, Tensor | None]  # of columns and rows, or of every pixel
+
+    @classmethod
+    def of(cls, depth: Tensor, intrinsics: Tensor, distortion: Tensor | None) -> _Cameras:
+        check_intrinsics("deproject_depth", intrinsics)
+        size = depth.shape[1], depth.shape[2]
+        crossed = None if distortion is not None else _crossed_rays(intrinsics, size)
+        if crossed is not None:
+            return cls(depth.contiguous(), (*crossed, None))
+        rays = _cached_rays(_Key(intrinsics), size, None if distortion is None else _Key(distortion))
+        return cls(depth.contiguous(), (None, None, rays))
+
+    def choose(
+        self,
+        limits: tuple[float, float] = (0.0, math.inf),
+        mask: Tensor | None = None,
+        matrix: Tensor | None = None,
+        lower: Tensor | None = None,
+        upper: Tensor | None = None,
+    ) -> _Chosen | None:
+        """Decide about every pixel; None where something is wrong, which the reference says best."""
+        views, height, width = self.depth.shape
+        keep = torch.empty(self.depth.shape, dtype=torch.bool)
+        readings, possible = torch.empty(views, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
+        starts = torch.empty(views * height + 1, dtype=torch.int64)
+        call(
+            "pc_choose_pixels",
+            *(self.depth, views, height, width, *self.rays),
+            *(*limits, _contiguous(mask), matrix, lower, upper),
+            *(keep, readings, starts, possible),
+        )
+        return _Chosen(keep, readings, starts) if possible else None
+
+    def deproject(
+        self,
+        chosen: _Chosen,
+        *,
+        over_all_views: bool = True,
+        matrix: Tensor | None = None,
+        colors: Tensor | None = None,
+        images: Mapping[str, Tensor] | None = None,
+    ) -> Deprojected:
+        """Write the chosen points, moved by the matrix."""
+        views, height, width = self.depth.shape
+        count = int(chosen.starts[-1])
+        sources = {name: image.contiguous() for name, image in (images or {}).items()}
+        core = [
+            ((count, 3), torch.float32),
+            ((count,), torch.int64),
+            ((count if colors is not None else 0, 3), torch.float32),
+        ]
+        copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
+        points, pixel_index, rgb, *rows = room_for(*core, *copied)
+        pixels = max(self.depth.numel(), 1)
+        pixel_bytes = torch.tensor([image.nbytes // pixels for image in sources.values()], dtype=torch.int64)
+        call(
+            "pc_deproject",
+            *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
+            *(points, pixel_index, over_all_views, _contiguous(colors), rgb),
+            *(len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)),
+        )
+        ptr = chosen.starts[torch.arange(views + 1) * height]
+        return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+
+
+def _limits(near: float | None, far: float | None) -> tuple[float, float]:
+    return 0.0 if near is None else float(near), math.inf if far is None else float(far)
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()
 
 
 def _crossed_rays(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
@@ -119,8 +197,3 @@ class _Key:
 @functools.lru_cache(maxsize=4)  # 7 MB each at 1280x720: one per camera of a usual rig
 def _cached_rays(intrinsics: _Key, size: tuple[int, int], distortion: _Key | None) -> Tensor:
     return pixel_rays(intrinsics.tensor, size, None if distortion is None else distortion.tensor).float().contiguous()
-
-
-def _reference(operation: Operation, *args: Any, **kwargs: Any) -> Any:
-    """Let the reference say what is wrong with the depth."""
-    return operation.reference(*args, **kwargs)

@@ -16,7 +16,7 @@ import pcdata.functional.boxes
 import pcdata.functional.ragged
 import pcdata.functional.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.dispatch import INNER, kernel
-from pcdata.kernels.native import addresses, call
+from pcdata.kernels.native import addresses, call, room_for
 
 _ROWS_PER_PIECE = 16384  # as in rows.cpp
 
@@ -57,7 +57,7 @@ def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
 def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
     sources = [field.contiguous() for field in fields]
-    picked = [field.new_empty((count, *field.shape[1:])) for field in fields]
+    picked = room_for(*(((count, *field.shape[1:]), field.dtype) for field in fields))
     return sources, picked, torch.tensor([field.nbytes // len(field) for field in sources])
 
 
@@ -82,7 +82,7 @@ def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Move every point once, through registers."""
     if not _covers(points, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
         return _reference("transform_points", points, ptr, matrix)
-    moved = points.new_empty(points.shape)
+    (moved,) = room_for((points.shape, points.dtype))
     call("pc_transform_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _wide(matrix), moved)
     return moved
 
@@ -92,7 +92,7 @@ def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Ten
     """Turn every direction once, through registers."""
     if not _covers(directions, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
         return _reference("transform_directions", directions, ptr, matrix)
-    turned = directions.new_empty(directions.shape)
+    (turned,) = room_for((directions.shape, directions.dtype))
     linear = torch.linalg.inv(_wide(matrix)[:, :3, :3]).mT.contiguous()
     call("pc_transform_directions", directions.contiguous(), ptr.contiguous(), len(ptr) - 1, linear, turned)
     return turned

@@ -10,7 +10,7 @@ import ctypes
 import functools
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.
 FORCE_VARIABLE = "PCDATA_INSTRUCTION_SET"
+
+_LARGE = 4 << 20  # bytes: holds a huge page (2 MB) wherever it starts
 
 _OK, _OUT_OF_MEMORY, _INTERRUPTED = 0, 1, 2
 
@@ -83,10 +85,19 @@ def call(function: str, *arguments: Any) -> None:
         raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
 
 
-def addresses(tensors: Sequence[Tensor]) -> Tensor:
+def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
+    """Return uninitialised memory for results of these shapes; if large, in huge pages where the system has them."""
+    room = [torch.empty(tuple(shape), dtype=dtype) for shape, dtype in results]
+    if sum(one.nbytes for one in room) >= _LARGE:
+        call("pc_advise_huge_pages", len(room), addresses(room), torch.tensor([one.nbytes for one in room]))
+    return room
+
+
+def addresses(tensors: Iterable[Tensor]) -> Tensor:
     """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
-    assert all(one.is_contiguous() and one.device.type == "cpu" for one in tensors)
-    return torch.tensor([one.data_ptr() for one in tensors], dtype=torch.int64)
+    given = list(tensors)
+    assert all(one.is_contiguous() and one.device.type == "cpu" for one in given)
+    return torch.tensor([one.data_ptr() for one in given], dtype=torch.int64)
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:

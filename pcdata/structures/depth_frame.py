@@ -12,11 +12,12 @@ from torch import Tensor
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
+from pcdata.functional.depth import mask_depth
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.derive import derived
 
 CAMERA_FRAME = "camera"
-_KEEP = {"depth": "V H W", "keep": "V H W : bool"}
+_MASKED = {"depth": "V H W", "mask": "V H W : bool"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,10 +106,10 @@ class DepthFrame:
         images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
         return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]
 
-    def blanked(self, keep: Tensor) -> DepthFrame:
-        """Return the frame with "no reading" wherever ``keep`` (V, H, W) bool is False."""
-        check_tensors("DepthFrame.blanked", {"depth": self.depth, "keep": keep}, _KEEP, finite=False)
-        return derived(self, depth=torch.where(keep, self.depth, 0.0))
+    def masked(self, *, near: float | None = None, far: float | None = None, mask: Tensor | None = None) -> DepthFrame:
+        """Return the frame with "no reading" wherever depth is not in [near, far] or ``mask`` (V, H, W) is False."""
+        check_tensors("DepthFrame.masked", {"depth": self.depth, "mask": mask}, _MASKED, check_values=False)
+        return derived(self, depth=mask_depth(self.depth, near, far, mask))
 
     def with_provenance(self, entries: Mapping[str, Any]) -> DepthFrame:
         """Merge JSON-able facts into the provenance."""

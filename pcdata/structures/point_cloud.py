@@ -184,7 +184,12 @@ class PointCloud:
         if self.layout is None or self.source_index is None:
             return None
         height, width = self.layout.size
-        return ImageGrid(_within_image(self.source_index, self.ptr, height * width), self.layout.size, self.layout.intrinsics, self.source_from_cloud)
+        return ImageGrid(
+            _within_image(self.source_index, self.ptr, height * width),
+            self.layout.size,
+            self.layout.intrinsics,
+            self.source_from_cloud,
+        )
 
     def viewpoint_per_point(self) -> Tensor | None:
         """(N, 3): where the sensor stood that saw each point, or None when unknown."""

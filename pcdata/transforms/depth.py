@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth import deproject_images
+from pcdata.functional.depth import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -34,20 +35,19 @@ class MaskDepth(Transform):
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Return the frame with the dropped pixels at 0."""
-        keep = data.depth > 0
-        if self.near is not None:
-            keep &= data.depth >= self.near
-        if self.far is not None:
-            keep &= data.depth <= self.far
+        return data.masked(near=self.near, far=self.far, mask=self.mask_of(data))
+
+    def mask_of(self, data: DepthFrame) -> Tensor | None:
+        """Return the (V, H, W) bool mask that the capture's mask and labels make, or None without any."""
         if data.mask is None and self.require_mask:
             raise CaptureError(f"MaskDepth: capture {data.sample_id!r} has no mask; add one or set require_mask: false")
-        if data.mask is not None and self.use_mask:
-            keep &= data.mask
-        if self.drop_labels:
-            if data.labels is None:
-                raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
-            keep &= ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
-        return data.blanked(keep)
+        mask = data.mask if self.use_mask else None
+        if not self.drop_labels:
+            return mask
+        if data.labels is None:
+            raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
+        wanted = ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+        return wanted if mask is None else wanted & mask
 
 
 class Deproject(Transform):
@@ -70,27 +70,38 @@ class Deproject(Transform):
 
     def apply(self, data: DepthFrame, params: Params) -> PointCloud:
         """Deproject all views in one call."""
+        made = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
+        return self.cloud_of(data, made)
+
+    def cameras_of(self, data: DepthFrame) -> tuple[Tensor, Tensor | None]:
+        """Return the intrinsics (V, 3, 3) and distortion (V, D) where the depth lies."""
         camera = data.camera.to(data.device)
-        images = {name: image for name in ("labels", "confidence") if (image := getattr(data, name)) is not None}
-        points, ptr, source_index, colors, rows = deproject_images(
-            data.depth, camera.intrinsics, camera.distortion, data.colors, images
-        )
-        labels = rows.pop("labels", None)
+        return camera.intrinsics, camera.distortion
+
+    def images_of(self, data: DepthFrame) -> dict[str, Tensor]:
+        """Return the images that become per-point fields as they are."""
+        images = {"labels": data.labels, "confidence": data.confidence}
+        return {name: image for name, image in images.items() if image is not None}
+
+    def cloud_of(self, data: DepthFrame, made: Deprojected) -> PointCloud:
+        """Return the points with all that the capture knows about them."""
+        intrinsics, distortion = self.cameras_of(data)
         identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
         frames = {CAMERA_FRAME: identity}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
         history = tuple(data.provenance.get("history", ()))
+        extra = {name: rows for name, rows in made.rows.items() if name != "labels"}
         return PointCloud(
-            points=points,
-            ptr=ptr,
+            points=made.points,
+            ptr=made.ptr,
             frame_id=CAMERA_FRAME,
-            colors=colors,
-            labels=labels,
-            source_index=source_index,
-            extra=rows,
-            kinds=dict.fromkeys(rows, Kind.INVARIANT),
-            layout=None if camera.distortion is not None else ImageLayout(size=data.size, intrinsics=camera.intrinsics),
+            colors=made.colors,
+            labels=made.rows.get("labels"),
+            source_index=made.source_index,
+            extra=extra,
+            kinds=dict.fromkeys(extra, Kind.INVARIANT),
+            layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,
             meta=[_view_meta(data, view) for view in range(data.num_views)],

@@ -1,6 +1,7 @@
 // Points under affine maps, and inside a box.
 #include <cmath>
 
+#include "pc/affine.hpp"
 #include "pc/common.hpp"
 
 namespace pc {
@@ -28,15 +29,12 @@ PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* po
   return pc::guarded([&] {
     pc::parallel_for(*context, ptr[num_clouds], pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       pc::each_cloud(ptr, num_clouds, first, last, [&](int64_t cloud, int64_t begin, int64_t end) {
-        const double* m = matrices + 16 * cloud;
-        const double xx = m[0], xy = m[1], xz = m[2], x0 = m[3];
-        const double yx = m[4], yy = m[5], yz = m[6], y0 = m[7];
-        const double zx = m[8], zy = m[9], zz = m[10], z0 = m[11];
+        const pc::Affine move(matrices + 16 * cloud);
         for (int64_t i = begin; i < end; ++i) {
-          const double x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-          moved[3 * i] = static_cast<float>(((x * xx + y * xy) + z * xz) + x0);
-          moved[3 * i + 1] = static_cast<float>(((x * yx + y * yy) + z * yz) + y0);
-          moved[3 * i + 2] = static_cast<float>(((x * zx + y * zy) + z * zz) + z0);
+          const pc::Point p = move({points[3 * i], points[3 * i + 1], points[3 * i + 2]});
+          moved[3 * i] = p.x;
+          moved[3 * i + 1] = p.y;
+          moved[3 * i + 2] = p.z;
         }
       });
     });
@@ -72,12 +70,12 @@ PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, 
   return pc::guarded([&] {
     std::atomic<bool> all_finite{true};
     pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      const float x0 = lower[0], y0 = lower[1], z0 = lower[2], x1 = upper[0], y1 = upper[1], z1 = upper[2];
+      const pc::Box box{{lower[0], lower[1], lower[2]}, {upper[0], upper[1], upper[2]}};
       int32_t wrong = 0;
       for (int64_t i = first; i < last; ++i) {
-        const float x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-        inside[i] = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1);
-        wrong |= !((x * 0 + y * 0) + z * 0 == 0);  // 0 * inf and 0 * NaN are NaN
+        const pc::Point p{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+        inside[i] = box.contains(p);
+        wrong |= !pc::is_finite(p);
       }
       if (wrong != 0) all_finite.store(false, std::memory_order_relaxed);
     });

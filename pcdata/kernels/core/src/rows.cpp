@@ -2,6 +2,7 @@
 #include <type_traits>
 
 #include "pc/common.hpp"
+#include "pc/runs.hpp"
 
 namespace pc {
 namespace {
@@ -32,31 +33,6 @@ void with_row_size(int64_t bytes, const Body& body) {
     case 12: return body(std::integral_constant<int64_t, 12>());
     default: return body(bytes);
   }
-}
-
-struct Run {
-  int64_t start, length;
-};
-
-// Append the runs of ones of mask[first, last) to `runs`; returns how many.
-int64_t find_runs(const uint8_t* mask, int64_t first, int64_t last, Run* runs) {
-  constexpr uint64_t kOnes = 0x0101010101010101;
-  auto skip = [&](int64_t row, uint8_t value) {  // to the first row that differs
-    uint64_t word;
-    for (; row + 8 <= last; row += 8) {
-      std::memcpy(&word, mask + row, 8);
-      if (word != value * kOnes) break;
-    }
-    while (row < last && mask[row] == value) ++row;
-    return row;
-  };
-  int64_t found = 0;
-  for (int64_t row = skip(first, 0); row < last;) {
-    const int64_t end = skip(row, 1);
-    runs[found++] = {row, end - row};
-    row = skip(end, 0);
-  }
-  return found;
 }
 
 // Copy runs of rows one after another.
