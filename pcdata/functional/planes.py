@@ -13,6 +13,7 @@ from torch import Tensor
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional.parameters import require_count, require_length
+from pcdata.functional.ragged import count_true, same_mask
 from pcdata.functional.rigid import angle_between
 from pcdata.rng import seeded
 
@@ -229,9 +230,9 @@ def _refine(
         if refitted is None or not bool(allowed(refitted)):
             break
         refitted_inliers = work.inlier_mask(points, refitted, distance)
-        if int(refitted_inliers.sum()) < 3:
+        if count_true(refitted_inliers) < 3:
             break
-        settled = torch.equal(refitted_inliers, inliers)
+        settled = same_mask(refitted_inliers, inliers)
         plane, inliers = refitted, refitted_inliers
         if settled:
             break

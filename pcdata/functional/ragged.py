@@ -35,10 +35,22 @@ def cloud_of_rows(ptr: Tensor) -> Tensor:
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
     if mask.device.type == "cpu":
-        ones = mask.numpy()  # numpy counts booleans many times faster than torch
-        return ptr_from_counts([int(np.count_nonzero(ones[start:stop])) for start, stop in pairwise(ptr.tolist())])
+        return ptr_from_counts([count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())])
     kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return kept[ptr]
+
+
+def count_true(mask: Tensor) -> int:
+    """Count the True values of a (N,) bool mask."""
+    # numpy counts booleans many times faster than torch
+    return int(np.count_nonzero(mask.numpy())) if mask.device.type == "cpu" else int(mask.sum())
+
+
+def same_mask(one: Tensor, other: Tensor) -> bool:
+    """Say whether two (N,) bool masks are equal."""
+    if one.device.type == "cpu":
+        return np.array_equal(one.numpy(), other.numpy())
+    return torch.equal(one, other)
 
 
 @inner

@@ -105,13 +105,13 @@ def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
 
 def _fit(points: Tensor, chosen: Tensor) -> Tensor | None:
     sums, centre = torch.empty(11, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    call("pc_plane_sums", points, chosen, len(points), centre, sums)
+    call("pc_moments", points, chosen, len(points), centre, sums)
     count, largest = float(sums[0]), sums[1].clone()
     if count < 3:
         return None
     centre += sums[2:5] / count
     # Again about the centre: squares of the offsets from afar would lose most of their digits.
-    call("pc_plane_sums", points, chosen, len(points), centre, sums)
+    call("pc_moments", points, chosen, len(points), centre, sums)
     left = sums[2:5] / count  # of rounding; next to nothing
     xx, xy, xz, yy, yz, zz = (sums[5:] / count).unbind()
     covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(left, left)
