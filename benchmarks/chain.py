@@ -7,9 +7,9 @@ DBSCAN (2 cm, 50) with objects of 100 to 50,000 points, 1024 farthest points, no
 its own, with a crop: mask, deproject with colours, crop.
 
 Method: everything runs once to warm up, then ours and the short Open3D chain ``--repeats`` times in turn; Open3D's
-whole chain, which takes a minute, ``--open3d`` times in the same run. Medians and interquartile ranges, wall and process
-time. Parameters are equal, and Open3D's RANSAC may not stop early (probability 1.0). Without the real frame a synthetic
-one serves; without Open3D only ours is measured.
+whole chain, which takes a minute, ``--open3d`` times in the same run. Medians and interquartile ranges of wall time,
+medians of process time. Parameters are equal, and Open3D's RANSAC may not stop early (probability 1.0). A synthetic
+frame stands in for the real one; without Open3D only ours is measured.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 def inner(reference: Callable[P, R]) -> Callable[P, R]:
     """Register the decorated reference as a function without a contract: its callers pass what they have checked.
 
-    The first tensor among its arguments, or in a mapping among them, says the device.
+    The first tensor among its arguments, or inside mappings and sequences among them, says the device.
     """
     name = reference.__name__
 
@@ -163,6 +163,8 @@ def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
             yield one
         elif isinstance(one, Mapping):
             yield from _tensors_in(one.values())
+        elif isinstance(one, (list, tuple)):
+            yield from _tensors_in(one)
 
 
 def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:

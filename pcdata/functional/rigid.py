@@ -14,7 +14,9 @@ from pcdata.functional.ragged import cloud_of_rows
 
 def from_rotation_translation(rotation: Tensor, translation: Tensor) -> Tensor:
     """Assemble (..., 4, 4) float64 from (..., 3, 3) and (..., 3)."""
-    shape = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    shape = rotation.shape[:-2]
+    if translation.shape[:-1] != shape:
+        shape = torch.broadcast_shapes(shape, translation.shape[:-1])
     matrix = torch.zeros((*shape, 4, 4), dtype=torch.float64, device=rotation.device)
     matrix[..., :3, :3] = rotation
     matrix[..., :3, 3] = translation

@@ -6,6 +6,8 @@ takes over whatever a kernel does not cover.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,12 +15,13 @@ import torch
 from torch import Tensor
 
 import pcdata.functional.boxes
-import pcdata.functional.ragged
 import pcdata.functional.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.dispatch import INNER, kernel
+from pcdata.functional.ragged import padding_of
 from pcdata.kernels.native import addresses, call, room_for
 
 _ROWS_PER_PIECE = 16384  # as in rows.cpp
+_MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
 
 
 @kernel("pick_rows", "cpu")
@@ -65,6 +68,54 @@ def _is_plain(field: Tensor) -> bool:
     """Whether a row is its bytes."""
     plain = field.layout is torch.strided and field.device.type == "cpu" and field.ndim > 0
     return plain and not field.is_conj() and not field.is_neg()
+
+
+@kernel("join_rows", "cpu")
+def join_rows(parts: Mapping[str, Sequence[Tensor]]) -> dict[str, Tensor]:
+    """Copy the parts of all fields, part by part; torch is as good at a few."""
+    rows = sum(len(part) for field in parts.values() for part in field)
+    counts = _counts_of_equal_parts(parts) if rows > _MANY_ROWS else None
+    if counts is None:
+        return _reference("join_rows", parts)
+    return _placed(parts, counts, [0, *itertools.accumulate(counts)])
+
+
+@kernel("pad_rows", "cpu")
+def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Tensor]:
+    """Copy and fill the parts of all fields, part by part."""
+    counts = _counts_of_equal_parts(parts)
+    if counts is None or max(counts) > width:
+        return _reference("pad_rows", parts, width)
+    placed = _placed(parts, counts, [width * part for part in range(len(counts) + 1)])
+    return {name: block.reshape(len(counts), width, *block.shape[1:]) for name, block in placed.items()}
+
+
+def _counts_of_equal_parts(parts: Mapping[str, Sequence[Tensor]]) -> list[int] | None:
+    """Return the rows of each part; None where fields differ in them, or parts in what a row is."""
+    fields = list(parts.values())
+    if not fields or not fields[0]:
+        return None
+    counts = [len(part) if part.ndim else -1 for part in fields[0]]
+    for field in fields:
+        kind = field[0].dtype, field[0].shape[1:]
+        if [len(part) if _is_plain(part) and (part.dtype, part.shape[1:]) == kind else -1 for part in field] != counts:
+            return None
+    return counts
+
+
+def _placed(parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: list[int]) -> dict[str, Tensor]:
+    """Return one block per field with every part where it starts; the rest is padding."""
+    firsts = [field[0] for field in parts.values()]
+    blocks = room_for(*(((starts[-1], *first.shape[1:]), first.dtype) for first in firsts))
+    sources = [part.contiguous() for field in parts.values() for part in field]
+    row_bytes = [math.prod(first.shape[1:]) * first.element_size() for first in firsts]
+    fillers = [padding_of(first.dtype) & 0xFF for first in firsts]  # -1 is a row of such bytes
+    call(
+        "pc_place_rows",
+        *(len(counts), torch.tensor(counts), torch.tensor(starts), len(firsts), addresses(sources)),
+        *(torch.tensor(row_bytes), torch.tensor(fillers), addresses(blocks)),
+    )
+    return dict(zip(parts, blocks))
 
 
 @kernel("count_falls", "cpu")

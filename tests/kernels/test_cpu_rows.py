@@ -91,6 +91,34 @@ def test_no_rows_and_no_fields():
     assert_same(*both("pick_rows", fields(0), torch.empty(0, dtype=torch.bool)))
 
 
+PARTS = [[5], [0, 3, 0], [20_000, 7, 0, 45_000], [1] * 70]
+
+
+def parts_of(counts: list[int]) -> dict[str, list[Tensor]]:
+    split = {name: list(value.split(counts)) for name, value in fields(sum(counts)).items() if name != "complex"}
+    return {name: value if name != "wide" else [one[:, :2] for one in value] for name, value in split.items()}
+
+
+@pytest.mark.parametrize("counts", PARTS, ids=str)
+def test_joined_parts_equal_the_reference(counts):
+    assert_same(*both("join_rows", parts_of(counts)))
+
+
+@pytest.mark.parametrize("more", [0, 9])
+@pytest.mark.parametrize("counts", PARTS, ids=str)
+def test_padded_parts_equal_the_reference(counts, more):
+    parts = parts_of(counts)
+    parts["small"] = [part.to(torch.int16) for part in parts["row"]]
+    assert_same(*both("pad_rows", parts, max(counts) + more))
+
+
+def test_parts_of_different_dtypes_are_joined_as_torch_joins_them():
+    mixed = {"weight": [torch.rand(400_000), torch.rand(3).double()], "row": [torch.arange(400_000), torch.arange(3)]}
+    ours, theirs = both("join_rows", mixed)
+    assert ours["weight"].dtype == torch.float64
+    assert_same(ours, theirs)
+
+
 def test_gradients_reach_the_picked_rows():
     points = torch.rand(100, 3, requires_grad=True)
     mask = torch.arange(100) % 3 == 0

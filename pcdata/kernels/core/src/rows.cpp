@@ -109,6 +109,29 @@ PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, 
   });
 }
 
+// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1] of
+// the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
+PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, const int64_t* counts,
+                                const int64_t* starts, int64_t num_fields, const int64_t* sources,
+                                const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks) {
+  return pc::guarded([&] {
+    const int64_t rows = std::max<int64_t>(1, starts[num_parts] / std::max<int64_t>(1, num_parts));
+    const int64_t parts_per_piece = std::max<int64_t>(1, pc::kRowsPerPiece / rows);
+    pc::parallel_for(*context, num_parts, parts_per_piece, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t part = first; part < last; ++part) {
+        for (int64_t field = 0; field < num_fields; ++field) {
+          const int64_t bytes = row_bytes[field];
+          const auto filled = static_cast<size_t>(counts[part] * bytes);
+          const auto all = static_cast<size_t>((starts[part + 1] - starts[part]) * bytes);
+          char* to = reinterpret_cast<char*>(blocks[field]) + starts[part] * bytes;
+          if (filled != 0) std::memcpy(to, reinterpret_cast<const char*>(sources[field * num_parts + part]), filled);
+          if (all != filled) std::memset(to + filled, static_cast<int>(fillers[field]), all - filled);
+        }
+      }
+    });
+  });
+}
+
 // *falls becomes the number of values (count,) that are not above the one before them.
 PC_EXPORT int32_t pc_count_falls(const pc_context* context, const int64_t* values, int64_t count, int64_t* falls) {
   return pc::guarded([&] {
