@@ -3,9 +3,9 @@
     python benchmarks/scaling.py             # 50k to 5M points; prints a table, writes results/scaling.json
     python benchmarks/scaling.py --only dbscan --points 5000000
 
-A synthetic surface, hills on a table at an even density: a neighbourhood holds about as many points at every size. Every
-measurement is a process of its own: it makes the cloud, runs the operation once (its peak of resident memory above what
-was there before, less the result, is the working space), then ``--repeats`` times for the median.
+A synthetic surface, hills on a table at an even density: a neighbourhood holds about as many points at every size.
+Every measurement is a process of its own: it makes the cloud, runs the operation once (its peak of resident memory
+above what was there before, less the result, is the working space), then ``--repeats`` times for the median.
 
 Held: no operation takes more than 100 bytes per point beside its result; DBSCAN of 5 million points stays below 1 GB.
 """

@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from pcdata.checks import rising
 from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import counts_from_ptr, rises_within_clouds
+from pcdata.functional.ragged import counts_from_ptr
 
 
 def require_count(where: str, name: str, value: int, *, minimum: int = 1) -> None:
@@ -62,8 +63,7 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
     filled = counts_from_ptr(ptr) > 0
     first, last = ptr[:-1][filled], ptr[1:][filled] - 1
     # Where pixels rise, only the ends of a cloud can lie outside the image.
-    inside = int(pixel[first].min()) >= 0 and int(pixel[last].max()) < height * width
-    if not (inside and rises_within_clouds(pixel, ptr)):
+    if not rising(pixel, ptr) or int(pixel[first].min()) < 0 or int(pixel[last].max()) >= height * width:
         raise ShapeError(
             f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
             "the points were reordered or repeated since they were read, so pass grid=None"

@@ -10,10 +10,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from pcdata.checks import count_true, equal_values
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional.parameters import require_count, require_length
-from pcdata.functional.ragged import count_true, same_mask
 from pcdata.functional.rigid import angle_between
 from pcdata.rng import seeded
 
@@ -232,7 +232,7 @@ def _refine(
         refitted_inliers = work.inlier_mask(points, refitted, distance)
         if count_true(refitted_inliers) < 3:
             break
-        settled = same_mask(refitted_inliers, inliers)
+        settled = equal_values(refitted_inliers, inliers)
         plane, inliers = refitted, refitted_inliers
         if settled:
             break

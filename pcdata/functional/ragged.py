@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.checks import count_true
 from pcdata.dispatch import inner
 
 
@@ -38,19 +38,6 @@ def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
         return ptr_from_counts([count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())])
     kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return kept[ptr]
-
-
-def count_true(mask: Tensor) -> int:
-    """Count the True values of a (N,) bool mask."""
-    # numpy counts booleans many times faster than torch
-    return int(np.count_nonzero(mask.numpy())) if mask.device.type == "cpu" else int(mask.sum())
-
-
-def same_mask(one: Tensor, other: Tensor) -> bool:
-    """Say whether two (N,) bool masks are equal."""
-    if one.device.type == "cpu":
-        return np.array_equal(one.numpy(), other.numpy())
-    return torch.equal(one, other)
 
 
 @inner
@@ -81,18 +68,6 @@ def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Ten
 def padding_of(dtype: torch.dtype) -> int:
     """What stands for no value: -1 where that is a signed integer, else 0."""
     return -1 if dtype in (torch.int16, torch.int32, torch.int64) else 0
-
-
-@inner
-def count_falls(values: Tensor) -> int:
-    """Count the (N,) int64 values that are not above the one before them."""
-    return int((values[1:] <= values[:-1]).sum())
-
-
-def rises_within_clouds(values: Tensor, ptr: Tensor) -> bool:
-    """Say whether (N,) int64 values increase from row to row of every cloud."""
-    starts = torch.unique(ptr[(ptr > 0) & (ptr < len(values))])  # rows that follow another cloud's last
-    return count_falls(values) == int((values[starts] <= values[starts - 1]).sum())
 
 
 def segment_sum(values: Tensor, ptr: Tensor) -> Tensor:

@@ -117,7 +117,9 @@ class _Cameras:
         lower: Tensor | None = None,
         upper: Tensor | None = None,
     ) -> _Chosen | None:
-        """Decide about every pixel; None where something is wrong, which the reference says best."""
+        """Decide about every pixel; None where there is none, or something wrong that the reference says best."""
+        if self.depth.numel() == 0:
+            return None
         views, height, width = self.depth.shape
         keep = torch.empty(self.depth.shape, dtype=torch.bool)
         readings, possible = torch.empty(views, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
@@ -150,8 +152,9 @@ class _Cameras:
         ]
         copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
         points, pixel_index, rgb, *rows = room_for(*core, *copied)
-        pixels = max(self.depth.numel(), 1)
-        pixel_bytes = torch.tensor([image.nbytes // pixels for image in sources.values()], dtype=torch.int64)
+        pixel_bytes = torch.tensor(
+            [image.nbytes // self.depth.numel() for image in sources.values()], dtype=torch.int64
+        )
         call(
             "pc_deproject",
             *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),

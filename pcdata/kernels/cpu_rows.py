@@ -118,16 +118,6 @@ def _placed(parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: li
     return dict(zip(parts, blocks))
 
 
-@kernel("count_falls", "cpu")
-def count_falls(values: Tensor) -> int:
-    """Compare every value with the one before it."""
-    if values.dtype is not torch.int64 or values.ndim != 1:
-        return _reference("count_falls", values)
-    falls = torch.empty(1, dtype=torch.int64)
-    call("pc_count_falls", values.contiguous(), len(values), falls)
-    return int(falls)
-
-
 @kernel("transform_points", "cpu")
 def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Move every point once, through registers."""

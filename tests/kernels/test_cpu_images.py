@@ -43,7 +43,8 @@ def companions(depth: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
 
 def poses(views: int) -> Tensor:
     quaternion = torch.randn(views, 4, generator=seeded(3), dtype=torch.float64)
-    return rigid.from_rotation_translation(rigid.rotation_from_quaternion(quaternion), torch.rand(views, 3))
+    offset = 0.2 * torch.rand(views, 3, generator=seeded(4))
+    return rigid.from_rotation_translation(rigid.rotation_from_quaternion(quaternion), offset)
 
 
 def both(name: str, *args: Any, **options: Any) -> tuple[Any, Any]:
@@ -105,6 +106,17 @@ def test_points_and_companions_equal_the_reference(camera, holes, threads):
         assert_same(*both("deproject_images", depth, intrinsics, distortion, colors, images))
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("size", [(0, 5), (5, 0), (1, 1), (1, 7), (7, 1)], ids=str)
+@pytest.mark.parametrize("distortion", [None, LENS.repeat(2, 1)], ids=["pinhole", "lens"])
+def test_images_of_any_size_equal_the_reference(distortion, size):
+    depth = depth_image(2, size)
+    colors, images = companions(depth)
+    cameras = depth, K.repeat(2, 1, 1), distortion
+    assert_same(*both("mask_depth", depth, 0.4, None, None))
+    assert_same(*both("deproject_images", *cameras, colors, images))
+    assert_same(*both("deproject_into_box", *cameras, colors, images, **region((-1.0,) * 3, (1.0,) * 3)))
 
 
 def test_all_256_colours_equal_the_reference():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.dispatch import INNER, why_unavailable
 from pcdata.functional import rigid
-from pcdata.functional.ragged import count_falls, pick_rows, ptr_after_mask, ptr_from_counts, rises_within_clouds
+from pcdata.functional.ragged import pick_rows, ptr_after_mask, ptr_from_counts
 from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")
@@ -133,22 +133,6 @@ def test_row_pointers_after_a_mask_count_what_stays(counts, seed):
     mask = torch.rand(sum(counts), generator=seeded(seed)) < 0.5
     expected = [int(part.sum()) for part in torch.split(mask, counts)]
     assert torch.equal(ptr_after_mask(mask, ptr), ptr_from_counts(expected))
-
-
-@few
-@given(st.lists(st.lists(st.integers(0, 20), max_size=8), min_size=1, max_size=5))
-def test_values_rise_within_clouds_whatever_they_do_between_them(clouds):
-    values = torch.tensor([value for cloud in clouds for value in cloud], dtype=torch.int64)
-    ptr = ptr_from_counts([len(cloud) for cloud in clouds])
-    assert rises_within_clouds(values, ptr) == all(list(cloud) == sorted(set(cloud)) for cloud in clouds)
-
-
-def test_falls_of_a_long_list_equal_the_reference():
-    values = torch.randint(1000, (100_000,), generator=seeded(0))
-    ours, theirs = both("count_falls", values)
-    assert ours == theirs > 0
-    assert count_falls(torch.arange(100_000)) == 0
-    assert count_falls(torch.empty(0, dtype=torch.int64)) == 0
 
 
 def motions(count: int) -> Tensor:

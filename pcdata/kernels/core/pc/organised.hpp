@@ -304,17 +304,18 @@ class WindowSearch {
     }
   }
 
-  // Show again every pixel of the last window: body(x, y, z, row of the point in each lane).
+  // Show again every pixel of the last window: body(x, y, z, id), where row_in_lane(id, lane) is the point's row.
   template <class Body>
   void replay(const QueryGroup&, const Floats&, Body&& body) const {
     for (int ring = 0; ring <= reach_; ++ring)
       for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
         const int64_t at = pixel(*offset);
         body(Floats::load(cloud_.x() + at), Floats::load(cloud_.y() + at), Floats::load(cloud_.z() + at),
-             [&](int lane) { return cloud_.row(at + lane); });
+             static_cast<uint32_t>(at));
       }
   }
   uint32_t row(uint32_t id) const { return cloud_.row(id); }
+  uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(int64_t{id} + lane); }
 
  private:
   // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each

@@ -131,16 +131,3 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
     });
   });
 }
-
-// *falls becomes the number of values (count,) that are not above the one before them.
-PC_EXPORT int32_t pc_count_falls(const pc_context* context, const int64_t* values, int64_t count, int64_t* falls) {
-  return pc::guarded([&] {
-    std::atomic<int64_t> all{0};
-    pc::parallel_for(*context, count - 1, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      int64_t own = 0;
-      for (int64_t i = first; i < last; ++i) own += values[i + 1] <= values[i];
-      all += own;
-    });
-    *falls = all;
-  });
-}
