@@ -147,12 +147,11 @@ def rising(values: Tensor, ptr: Tensor) -> bool:
     starts = starts[(starts > 0) & (starts < len(values))]
     if values.device.type == "cpu":
         array = values.numpy()
-        rises = array[1:] > array[:-1]
-        rises[starts.numpy() - 1] = True
+        rises = torch.from_numpy(array[1:] > array[:-1])
     else:
         rises = values[1:] > values[:-1]
-        rises[starts - 1] = True
-    return bool(rises.all())
+    rises[starts - 1] = True
+    return count_true(rises) == len(rises)
 
 
 def check_ptr_values(where: str, name: str, ptr: Tensor, num_rows: int | None) -> None:

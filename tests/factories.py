@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.functional import rigid
 from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.sensor_noise import facing_depth
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, Kind, PointCloud
 from pcdata.synthetic import tabletop
@@ -69,12 +70,14 @@ def cloud_in_camera(counts: Sequence[int] = (120, 90, 150), *, seed: int = 0) ->
             "weight": torch.rand(total, generator=generator),
             "anchor": points.clone(),
             "heading": normals.clone(),
+            "confidence": torch.randint(4, (total,), generator=generator, dtype=torch.uint8),
         },
         kinds={
             "row": Kind.INVARIANT,
             "weight": Kind.INVARIANT,
             "anchor": Kind.POSITION,
             "heading": Kind.DIRECTION,
+            "confidence": Kind.MINIMUM,
         },
         viewpoint=torch.zeros(len(counts), 3),
         frames={"camera": torch.eye(4, dtype=torch.float64).repeat(len(counts), 1, 1), "base": pose},
@@ -104,7 +107,7 @@ def frame_with_counts(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> De
         camera=camera,
         colors=torch.randint(256, (views, *size, 3), generator=generator, dtype=torch.uint8),
         labels=torch.randint(-1, 4, (views, *size), generator=generator),
-        confidence=torch.randint(256, (views, *size), generator=generator, dtype=torch.uint8),
+        confidence=torch.randint(4, (views, *size), generator=generator, dtype=torch.uint8),
         mask=torch.rand(views, *size, generator=generator) < 0.7,
         world_from_camera=base_from_camera(views, seed=seed),
         frame_id="base",
@@ -117,6 +120,12 @@ def frame_with_counts(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> De
 def tabletop_frame(num_views: int = 2, *, seed: int = 0, num_objects: int = 3) -> DepthFrame:
     """A rendered capture of 60 x 80 pixels."""
     return tabletop(seed, num_objects=num_objects, num_views=num_views, size=(60, 80), floor=False).frame
+
+
+def depth_edges(depth: Tensor, jump: float) -> tuple[Tensor, Tensor]:
+    """The depth of the 4-neighbour that differs most, and where it differs by more than ``jump`` of the nearer one."""
+    across = facing_depth(depth)
+    return across, (across - depth).abs() > jump * torch.minimum(depth, across)
 
 
 def tree(data: Any) -> Any:

@@ -12,7 +12,7 @@ import pytest
 
 import pcdata
 
-HEAVY = ["open3d", "torch_cluster", "matplotlib", "h5py", "kornia", "scipy", "pydantic"]
+HEAVY = ["cv2", "small_gicp", "open3d", "torch_cluster", "matplotlib", "h5py", "kornia", "scipy", "pydantic"]
 
 
 def in_a_new_process(code: str) -> str:
@@ -67,7 +67,8 @@ def test_every_public_name_resolves():
 
 
 @pytest.mark.parametrize(
-    "package", ["functional", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"]
+    "package",
+    ["calibration", "functional", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"],
 )
 def test_every_public_name_of_a_package_resolves(package):
     module = getattr(pcdata, package)

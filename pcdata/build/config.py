@@ -14,7 +14,8 @@ from pcdata.errors import near_matches
 from pcdata.io.stores import COMPRESSIONS, Compression, Format
 from pcdata.transforms.config import read_config
 from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at
+from pcdata.transforms.sensor_words import SENSOR
+from pcdata.yaml_nodes import YamlDocument, node_at
 
 Collate = Literal["packed", "padded", "fixed"]
 
@@ -53,7 +54,10 @@ _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
 def load_config(path: str | Path) -> BuildConfig:
-    """Read a YAML file with the sections depth, cloud, augment, output and loader, each optional.
+    """Read a YAML file with the sections sensor, depth, cloud, augment, output and loader, each optional.
+
+    ``sensor`` is a name that ``pcdata profiles`` lists, or ``{name: ..., depth: metres}``: what the steps' values
+    ``sensor`` are computed from.
 
     Raises:
         ConfigError: every fault, as ``file:line:column: what``.
@@ -65,7 +69,7 @@ def config_from_yaml(text: str, *, name: str = "<yaml>") -> BuildConfig:
     """Parse the text of a configuration; see :func:`load_config`."""
     document = YamlDocument(text, name)
     entries = document.mapping(document.root, "a configuration")
-    known = [*SECTIONS, *_SETTINGS]
+    known = [SENSOR, *SECTIONS, *_SETTINGS]
     for section, (key, _) in entries.items():
         if section not in known:
             document.fault(key, f"unknown section {section!r}{near_matches(section, known) or f'; known: {known}'}")

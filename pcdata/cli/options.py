@@ -10,13 +10,24 @@ def add_capture_options(command: argparse.ArgumentParser) -> None:
     """Add what says how captures are to be read."""
     command.add_argument("--kind", metavar="LAYOUT", help="capture layout, where it cannot be told from the files")
     command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
+    command.add_argument(
+        "--calibration", metavar="FILE", help="calibration file that replaces the capture's intrinsics"
+    )
+    command.add_argument("--camera", metavar="NAME", help="which camera of the calibration (default: the only one)")
+    command.add_argument("--frame", metavar="NAME", help="frame that the camera's pose leads to, such as base")
 
 
 def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:
     """Open the captures at a path as the options say."""
     from pcdata.io import open_source
 
-    options = {} if arguments.metres_per_unit is None else {"metres_per_unit": arguments.metres_per_unit}
+    given = {
+        "metres_per_unit": arguments.metres_per_unit,
+        "calibration": arguments.calibration,
+        "camera": arguments.camera,
+        "frame_id": arguments.frame,
+    }
+    options = {name: value for name, value in given.items() if value is not None}
     return open_source(path, kind=arguments.kind, limit=limit, **options)
 
 

@@ -166,6 +166,16 @@ def voxel_majority(
     return torch.where(best < 0, -1, names[winner]) if len(names) else best
 
 
+def voxel_minimum(
+    values: Tensor,  # (N,) integer
+    inverse: Tensor,  # (N,) int64
+    num_voxels: int,
+) -> Tensor:  # (M,) in the dtype of the values
+    """Return the lowest value of each voxel; 0 for an empty voxel."""
+    lowest = torch.zeros(num_voxels, dtype=torch.int64, device=values.device)
+    return lowest.scatter_reduce_(0, inverse, values.long(), "amin", include_self=False).to(values.dtype)
+
+
 def _search_size(
     points: Tensor,
     num_points: int,

@@ -1,26 +1,36 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
-from pcdata.io.calibration import (
-    Calibration,
-    read_calibration,
+from pcdata.io.averaged import AveragedSource
+from pcdata.io.calibration import Calibration, Evidence
+from pcdata.io.capture_camera import (
+    CaptureCamera,
+    read_capture_camera,
     read_intrinsics,
     read_pose,
-    write_calibration,
+    write_capture_camera,
     write_pose,
 )
+from pcdata.io.confidence import read_confidence, write_confidence
 from pcdata.io.detect import LAYOUTS, open_source
 from pcdata.io.images import read_color, read_depth, read_labels, read_mask, write_color, write_depth
 from pcdata.io.pcd import read_pcd, write_pcd
 from pcdata.io.ply import read_ply, write_ply
 from pcdata.io.source import Source
+from pcdata.io.temporal import TemporalFilterDepth, TemporallyFilteredSource
 
 __all__ = [
     "LAYOUTS",
+    "AveragedSource",
     "Calibration",
+    "CaptureCamera",
+    "Evidence",
     "Source",
+    "TemporalFilterDepth",
+    "TemporallyFilteredSource",
     "open_source",
-    "read_calibration",
+    "read_capture_camera",
     "read_color",
+    "read_confidence",
     "read_depth",
     "read_intrinsics",
     "read_labels",
@@ -28,8 +38,9 @@ __all__ = [
     "read_pcd",
     "read_ply",
     "read_pose",
-    "write_calibration",
+    "write_capture_camera",
     "write_color",
+    "write_confidence",
     "write_depth",
     "write_pcd",
     "write_ply",

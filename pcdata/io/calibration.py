@@ -1,227 +1,255 @@
-"""Intrinsics and poses from the small text files that travel with a capture."""
+"""A calibration: cameras and the rigid transforms between named frames, each with the evidence it rests on."""
 
 from __future__ import annotations
 
-import json
-import math
 import os
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import re
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, PcdataError, PoseError, near_matches
+from pcdata.errors import CalibrationError, FrameError, PoseError, near_matches
 from pcdata.functional import rigid
-from pcdata.io.files import map_npy, read_text, replacing
-from pcdata.io.images import check_metres_per_unit
+from pcdata.io.files import read_text, replacing
 from pcdata.structures import Camera
 
-_REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("distortion", "metres_per_unit", "frame_id")
-_REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
-_DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
-_HINTS = {
-    "depth_scale": "depth_scale has three incompatible meanings; write metres_per_unit (0.001 for millimetres)",
-    "factor_depth": "write metres_per_unit = 1 / factor_depth",
-    "intrinsic_matrix": "write fx, fy, cx, cy as four numbers (Open3D stores the matrix column by column)",
-    "k": "write fx, fy, cx, cy as four numbers",
-    "coeffs": "write the lens coefficients as distortion",
-    "dist_coeffs": "write the lens coefficients as distortion",
-}
+# An inverse by transposition is off by as much as the rotation is from orthonormal: 0.1 mm at 1 m.
+RIGID_TOLERANCE = 1e-4
+# No work cell is as wide; a transform in millimetres nearly always is "longer".
+LARGEST_TRANSLATION = 100.0  # metres
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-/]*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """How one camera or transform was found, so that a reader can judge it."""
+
+    method: str  # e.g. "chessboard 9x6, squares of 0.025 m"
+    num_observations: int | None = None  # views or poses
+    residuals: Mapping[str, float] = field(default_factory=dict)  # each name ends in its unit: "reprojection_rms_px"
+    date: str | None = None  # recorded only when given, so that equal input makes equal bytes
+    notes: str | None = None
+
+
+class FramePair(NamedTuple):
+    """The two frames that a transform's name joins."""
+
+    to: str
+    from_: str
+
+    @classmethod
+    def parse(cls, name: str) -> FramePair:
+        """Split ``base_from_camera``.
+
+        Raises:
+            FrameError: the name is not two frame names around one ``_from_``.
+        """
+        parts = name.split("_from_")
+        if len(parts) != 2 or not all(_NAME.fullmatch(part) for part in parts) or parts[0] == parts[1]:
+            raise FrameError(
+                f"a transform is named to_from, such as base_from_camera (base <- camera), between two frames; "
+                f"got {name!r}"
+            )
+        return cls(*parts)
+
+    @property
+    def name(self) -> str:
+        """The transform's name."""
+        return f"{self.to}_from_{self.from_}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
-    """What a calibration file states of one camera."""
+    """Cameras by name and rigid transforms by ``to_from`` name, in metres.
 
-    camera: Camera
-    metres_per_unit: float | None = None  # length of one stored depth unit; None = the file does not say
-    frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
-
-
-def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read the intrinsics of one camera from a JSON file.
-
-    Such as::
-
-        {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
-         "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
-
-    The last three are optional; ``notes``, ``sensor``, ``serial``, ``registered_to`` and ``date`` are free remarks. Any
-    other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
+    The frame of a camera (OpenCV axes) bears the camera's name: the transform ``base_from_wrist`` maps points that the
+    camera ``wrist`` sees into the frame ``base``. Between two frames there is one way at most, so no two entries can
+    contradict each other.
 
     Raises:
-        CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
-        UnitError: ``metres_per_unit`` is not a number above 0 and at most 1.
+        CalibrationError: a camera is more than one, has skew or a name of no use; evidence belongs to nothing; a loop.
+        FrameError: a transform is not named ``to_from``.
+        PoseError: a transform is not rigid, or too long to be in metres.
     """
-    where = f"read_calibration: {path}"
-    data = _json_object(where, read_text(where, path))
-    _check_keys(where, data)
-    width, height = (_whole(where, data, key) for key in ("width", "height"))
-    fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
-    unit = data.get("metres_per_unit")
-    frame_id = data.get("frame_id")
-    if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
-        raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r}")
-    camera = _camera(
-        where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
-    )
-    return Calibration(
-        camera=camera,
-        metres_per_unit=None if unit is None else check_metres_per_unit(where, unit),
-        frame_id=frame_id,
-    )
+
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    transforms: Mapping[str, Tensor] = field(default_factory=dict)  # to_from -> (4, 4) float64
+    evidence: Mapping[str, Evidence] = field(default_factory=dict)  # by the name of a camera or transform
+
+    def __post_init__(self) -> None:
+        for name, camera in self.cameras.items():
+            check_camera(name, camera)
+        for name, matrix in self.transforms.items():
+            check_transform(name, matrix)
+        for name in self.evidence:
+            if name not in self.cameras and name not in self.transforms:
+                raise CalibrationError(f"Calibration: there is evidence for {name!r}, which is no camera or transform")
+        check_no_loop([FramePair.parse(name) for name in self.transforms])
+        for name in ("cameras", "transforms", "evidence"):  # the class is frozen: what the caller does later is his own
+            object.__setattr__(self, name, dict(getattr(self, name)))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Calibration:
+        """Read a calibration file; ``docs/calibration.md`` describes every key.
+
+        Raises:
+            CaptureError: the file is missing or not text.
+            CalibrationError: every fault in it, as ``file:line:column: what``.
+        """
+        from pcdata.io.calibration_yaml import calibration_from_yaml
+
+        return calibration_from_yaml(read_text("Calibration.load", path), name=str(path))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file that :meth:`load` reads back exactly; equal calibrations give equal bytes.
+
+        The file appears complete or not at all; one that is there already is replaced.
+
+        Raises:
+            CaptureError: it cannot be written.
+        """
+        from pcdata.io.calibration_yaml import calibration_to_yaml
+
+        with replacing("Calibration.save", path) as temporary:
+            temporary.write_text(calibration_to_yaml(self), encoding="utf-8")
+
+    @property
+    def frames(self) -> list[str]:
+        """The names of all frames, those of the cameras included, sorted."""
+        return sorted({*self.cameras, *(frame for name in self.transforms for frame in FramePair.parse(name))})
+
+    def camera(self, name: str | None = None) -> Camera:
+        """Return a camera; None = the only one.
+
+        Raises:
+            CalibrationError: there is no such camera, or None does not say which.
+        """
+        return self.cameras[self.camera_name(name)]
+
+    def camera_name(self, name: str | None = None) -> str:
+        """Return the name of an existing camera; None = that of the only one.
+
+        Raises:
+            CalibrationError: as :meth:`camera`.
+        """
+        known = ", ".join(sorted(self.cameras)) or "none"
+        if name is None and len(self.cameras) == 1:
+            return next(iter(self.cameras))
+        if name is None:
+            raise CalibrationError(f"Calibration: say which camera; it has {known}")
+        if name not in self.cameras:
+            raise CalibrationError(
+                f"Calibration: no camera {name!r}{near_matches(name, self.cameras) or f'; it has {known}'}"
+            )
+        return name
+
+    def transform(self, to: str, from_: str) -> Tensor:  # (4, 4) float64
+        """Return ``to_from``, inverting and chaining entries where needed: ``points_to = to_from @ points_from``.
+
+        Raises:
+            FrameError: a frame is unknown, or nothing joins the two.
+        """
+        for frame in (to, from_):
+            if frame not in self.frames:
+                hint = near_matches(frame, self.frames) or f"; known: {', '.join(self.frames) or 'none'}"
+                raise FrameError(f"Calibration: no frame {frame!r}{hint}")
+        reached = {from_: torch.eye(4, dtype=torch.float64)}
+        waiting = deque([from_])
+        while waiting and to not in reached:
+            frame = waiting.popleft()
+            for neighbour, step in self._steps_from(frame):
+                if neighbour not in reached:
+                    reached[neighbour] = step @ reached[frame]
+                    waiting.append(neighbour)
+        if to not in reached:
+            raise FrameError(
+                f"Calibration: nothing joins {to!r} and {from_!r}; from {from_!r} one gets to "
+                f"{', '.join(sorted(set(reached) - {from_})) or 'no other frame'}; add a transform between them"
+            )
+        return reached[to]
+
+    def with_camera(self, name: str, camera: Camera, evidence: Evidence | None = None) -> Calibration:
+        """Return the calibration with one camera added or replaced."""
+        return replace(self, cameras={**self.cameras, name: camera}, evidence=self._evidence_with(name, evidence))
+
+    def with_transform(self, name: str, matrix: Tensor, evidence: Evidence | None = None) -> Calibration:
+        """Return the calibration with one ``to_from`` transform added, or replaced whichever way round it stands."""
+        to, from_ = FramePair.parse(name)
+        others = {key: value for key, value in self.transforms.items() if key not in (name, f"{from_}_from_{to}")}
+        kept = {key: value for key, value in self.evidence.items() if key in others or key in self.cameras}
+        evidences = kept if evidence is None else {**kept, name: evidence}
+        return replace(self, transforms={**others, name: matrix}, evidence=evidences)
+
+    def _evidence_with(self, name: str, evidence: Evidence | None) -> dict[str, Evidence]:
+        kept = {key: value for key, value in self.evidence.items() if key != name}
+        return kept if evidence is None else {**kept, name: evidence}
+
+    def _steps_from(self, frame: str) -> list[tuple[str, Tensor]]:
+        """Return the neighbours of a frame, each with ``neighbour_from_frame``."""
+        steps = []
+        for name, matrix in self.transforms.items():
+            to, from_ = FramePair.parse(name)
+            if from_ == frame:
+                steps.append((to, matrix))
+            elif to == frame:
+                steps.append((from_, rigid.invert_rigid(matrix)))
+        return steps
+
+    def __repr__(self) -> str:
+        return f"Calibration(cameras: {', '.join(self.cameras)}; transforms: {', '.join(self.transforms)})"
 
 
-def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write the JSON file from which :func:`read_calibration` returns the same numbers.
+def check_camera(name: str, camera: Camera) -> None:
+    """Require one camera without skew under a usable name.
 
     Raises:
-        CaptureError: there is more than one camera, its axes are skewed, or the file cannot be written.
+        CalibrationError: otherwise.
     """
-    where = f"write_calibration: {path}"
-    camera = calibration.camera
-    k = camera.intrinsics[0].tolist()
-    if camera.num_views != 1 or k[0][1] != 0.0:
-        raise CaptureError(f"{where}: the file describes one camera without skew, got {camera!r}; write one per view")
-    data: dict[str, Any] = {"width": camera.size[1], "height": camera.size[0]}
-    data |= {"fx": k[0][0], "fy": k[1][1], "cx": k[0][2], "cy": k[1][2]}
-    if camera.distortion is not None:
-        data["distortion"] = camera.distortion[0].tolist()
-    data |= {name: value for name in _OPTIONAL[1:] if (value := getattr(calibration, name)) is not None}
-    with replacing(where, path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
-def read_intrinsics(
-    path: str | os.PathLike[str],
-    *,
-    size: tuple[int, int],  # (height, width) of the image they belong to
-) -> Camera:
-    """Read a 3x3 intrinsics matrix in pixels from a text file, which does not state its image size.
-
-    Raises:
-        CaptureError: the file is missing, not nine numbers, or not the intrinsics of an image of this size.
-    """
-    where = f"read_intrinsics: {path}"
-    values = _numbers(where, read_text(where, path))
-    if len(values) != 9:
-        raise CaptureError(f"{where}: must hold a 3x3 matrix, nine numbers, got {len(values)}")
-    fx, skew, cx, zero, fy, cy, *last = values
-    if skew != 0 or zero != 0 or last != [0.0, 0.0, 1.0]:
-        raise CaptureError(
-            f"{where}: must be fx 0 cx / 0 fy cy / 0 0 1, got {values}; is it transposed, or a 3x4 projection matrix?"
+    if not _NAME.fullmatch(name) or "_from_" in name:
+        raise CalibrationError(f"a camera's name is of letters, digits and _ . - / without '_from_', got {name!r}")
+    if camera.num_views != 1 or float(camera.intrinsics[0, 0, 1]) != 0.0:
+        raise CalibrationError(
+            f"camera {name!r}: an entry is one camera without skew, got {camera!r}; add one per view"
         )
-    return _camera(where, fx=fx, fy=fy, cx=cx, cy=cy, size=size)
 
 
-def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
-    """Read a rigid 4x4 pose from text (16 numbers, row by row) or ``.npy``. Its direction is the caller's to know.
+def check_transform(name: str, matrix: Tensor) -> None:
+    """Require a rigid (4, 4) float64 matrix in metres under a ``to_from`` name.
 
     Raises:
-        CaptureError: the file is missing, or not a 4x4 matrix of numbers.
-        PoseError: the matrix is not rigid, or has NaN or infinite values (tracking lost).
+        FrameError: the name. PoseError: the matrix.
     """
-    where = f"read_pose: {path}"
-    if Path(path).suffix.lower() == ".npy":
-        matrix = map_npy(where, path, max_bytes=4096)
-        if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu":
-            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {matrix.dtype} {matrix.shape}")
-        pose = torch.from_numpy(matrix.astype(np.float64))
-    else:
-        values = _numbers(where, read_text(where, path))
-        if len(values) != 16:
-            short = "; the last row 0 0 0 1 is missing" if len(values) == 12 else ""
-            raise CaptureError(f"{where}: a pose must be 4x4, sixteen numbers row by row, got {len(values)}{short}")
-        pose = torch.tensor(values, dtype=torch.float64).reshape(4, 4)
-    rigid.check_rigid(where, pose)
-    return pose
+    FramePair.parse(name)
+    if matrix.shape != (4, 4) or matrix.dtype != torch.float64:
+        raise PoseError(f"{name}: must be a (4, 4) float64 matrix, got {matrix.dtype} {tuple(matrix.shape)}")
+    rigid.check_rigid(name, matrix, tolerance=RIGID_TOLERANCE)
+    length = float(matrix[:3, 3].norm())
+    if length > LARGEST_TRANSLATION:
+        raise PoseError(f"{name}: the translation is {length:g} m long; is it in millimetres? Write metres")
 
 
-def write_pose(path: str | os.PathLike[str], pose: Tensor) -> None:
-    """Write a rigid (4, 4) pose as text that :func:`read_pose` reads back exactly."""
-    where = f"write_pose: {path}"
-    if tuple(pose.shape) != (4, 4):
-        raise PoseError(f"{where}: one pose is (4, 4), got {tuple(pose.shape)}")
-    rigid.check_rigid(where, pose)
-    rows = "\n".join(" ".join(map(repr, row)) for row in pose.double().tolist())
-    with replacing(where, path) as temporary:
-        temporary.write_text(rows + "\n", encoding="utf-8")
+def check_no_loop(pairs: list[FramePair]) -> None:
+    """Require that no transform joins frames that are joined already.
 
+    Raises:
+        CalibrationError: with the first that does.
+    """
+    root: dict[str, str] = {}
 
-def _camera(where: str, **values: Any) -> Camera:
-    try:
-        return Camera.pinhole(**values)
-    except PcdataError as error:
-        raise CaptureError(f"{where}: {error}") from error
+    def find(frame: str) -> str:
+        while root.setdefault(frame, frame) != frame:
+            frame = root[frame]
+        return frame
 
-
-def _json_object(where: str, text: str) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        if len(set(keys)) != len(keys):
-            raise ValueError(f"a key is repeated in {keys}")
-        return dict(pairs)
-
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is not a number a camera can have")
-
-    try:
-        data = json.loads(text, object_pairs_hook=unique, parse_constant=refuse)
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{where}: not valid JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise CaptureError(f"{where}: must be a JSON object with {', '.join(_REQUIRED)}, got a {type(data).__name__}")
-    return data
-
-
-def _check_keys(where: str, data: dict[str, Any]) -> None:
-    known = (*_REQUIRED, *_OPTIONAL, *_REMARKS)
-    faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
-    for key in data:
-        if key not in known:
-            hint = _HINTS.get(key.lower())
-            faults.append(f"{key!r} is not known{'; ' + hint if hint else near_matches(key, known)}")
-    if faults:
-        raise CaptureError(f"{where}: {', '.join(faults)}")
-
-
-def _number(where: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise CaptureError(f"{where}: {key!r} must be a number, got {value!r}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise CaptureError(f"{where}: {key!r} must be a finite number")
-    return number
-
-
-def _whole(where: str, data: dict[str, Any], key: str) -> int:
-    number = _number(where, key, data[key])
-    if number != int(number) or not 1 <= number <= 1 << 16:
-        raise CaptureError(f"{where}: {key!r} must be a whole number of pixels, got {data[key]!r}")
-    return int(number)
-
-
-def _distortion(where: str, value: Any) -> list[float] | None:
-    if value is None or value == []:
-        return None
-    if not isinstance(value, list) or len(value) not in _DISTORTION_LENGTHS:
-        raise CaptureError(
-            f"{where}: 'distortion' must be a list of {', '.join(map(str, _DISTORTION_LENGTHS))} numbers "
-            f"(OpenCV order k1 k2 p1 p2 k3 ...), got {value!r:.200}"
-        )
-    return [_number(where, "distortion", entry) for entry in value]
-
-
-def _numbers(where: str, text: str) -> list[float]:
-    words = text.replace(",", " ").split()
-    try:
-        return [float(word) for word in words[:100]]
-    except ValueError as error:
-        raise CaptureError(f"{where}: must hold numbers only: {error}") from error
+    for pair in pairs:
+        if find(pair.to) == find(pair.from_):
+            raise CalibrationError(
+                f"{pair.name}: {pair.to!r} and {pair.from_!r} are joined by other transforms already, and two ways "
+                "would give two answers; remove one"
+            )
+        root[find(pair.to)] = find(pair.from_)

@@ -67,7 +67,7 @@ def to_cloud(
         labels=None if arrays.labels is None else torch.from_numpy(_whole(where, arrays.labels[rows])),
         source_index=torch.from_numpy(np.flatnonzero(keep)),
         extra=extra,
-        kinds=dict.fromkeys(extra, Kind.INVARIANT),
+        kinds={name: _kind(name, value) for name, value in extra.items()},
         viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32) * unit,
         meta=(dict(meta or {}),),
     )
@@ -86,7 +86,7 @@ def from_cloud(where: str, cloud: PointCloud) -> CloudArrays:
         raise ShapeError(f"{where}: a file holds one cloud, got a batch of {cloud.num_clouds}; write each of unbatch()")
     if cloud.unit != METRE:
         raise UnitError(f"{where}: the cloud is {cloud.unit}, a file is in metres; call in_source_frame() first")
-    moving = [name for name, kind in cloud.kinds.items() if kind is not Kind.INVARIANT]
+    moving = [name for name, kind in cloud.kinds.items() if kind in (Kind.POSITION, Kind.DIRECTION)]
     if moving:
         raise CaptureError(
             f"{where}: the file cannot say that {', '.join(moving)} move with the cloud, so a later step would leave "
@@ -193,6 +193,11 @@ def _array(where: str, value: torch.Tensor) -> NDArray[Any]:
         )
     array: NDArray[Any] = value.detach().cpu().numpy()
     return array.astype(np.uint8) if array.dtype == bool else array
+
+
+def _kind(name: str, value: torch.Tensor) -> Kind:
+    # Scanners write a "confidence" of their own as floats; pcdata's levels are bytes.
+    return Kind.MINIMUM if name == "confidence" and value.dtype == torch.uint8 else Kind.INVARIANT
 
 
 def _free_name(name: str, taken: Mapping[str, Any]) -> str:

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
-from pcdata.errors import CaptureError, UnitError
-from pcdata.io.calibration import read_calibration
+from torch import Tensor
+
+from pcdata.errors import CaptureError, ConfigError, UnitError
+from pcdata.io.calibration import Calibration
+from pcdata.io.capture_camera import read_capture_camera
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, check_metres_per_unit, read_depth
 from pcdata.io.source import Source, absolute, by_stem, check_partners, sequence_positions
-from pcdata.structures import CAMERA_FRAME, DepthFrame
+from pcdata.io.timestamps import read_timestamps
+from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
+_TIMESTAMPS = "timestamps.json"
 _PARTNERS = {  # role: folder, suffixes
     "color": ("color", COLOR_SUFFIXES),
     "labels": ("labels", (".png",)),
     "mask": ("masks", (".png",)),
+    "confidence": ("confidence", (".png",)),
     "pose": ("poses", (".txt", ".npy")),
 }
 
 
 class FolderSource(Source):
-    """``intrinsics.json``, ``depth/NAME.png``; for all names or none ``color``, ``labels``, ``masks``, ``poses``."""
+    """``intrinsics.json``, ``depth/NAME.png``; for all names or none colour, labels, masks, confidence and poses."""
 
     kind = "folder"
     needs = (
         "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
-        "masks/NAME.png, poses/NAME.txt (4x4, world from camera)"
+        "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera), "
+        "timestamps.json (seconds by NAME)"
     )
 
     def __init__(
@@ -38,6 +47,8 @@ class FolderSource(Source):
         invalid_values: Collection[int] = (),
         background_label: int | None = None,
         frame_id: str | None = None,
+        calibration: Calibration | str | os.PathLike[str] | None = None,
+        camera: str | None = None,
     ) -> None:
         """Read the calibration and the file names.
 
@@ -47,9 +58,15 @@ class FolderSource(Source):
             invalid_values: stored depth values besides 0 that mean "no reading".
             background_label: the label in the files that means "no object" and becomes -1; None = keep all.
             frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
+            calibration: a :class:`Calibration` or its file, whose camera replaces that of ``intrinsics.json``. Where it
+                has transforms, the capture has no ``poses`` and a ``frame_id`` is stated, it also gives the pose.
+            camera: its name in the calibration; None = the only one.
 
         Raises:
-            CaptureError: the calibration is missing or wrong, or a sample lacks a file that others have.
+            CaptureError: the calibration is missing, wrong or of another image size, or a sample lacks a file that
+                others have.
+            CalibrationError, FrameError: the calibration cannot be read, or lacks the camera or the frame.
+            ConfigError: a camera is named without a calibration.
             UnitError: the unit is not stated, or stated twice and differently.
         """
         path = absolute(path)
@@ -57,13 +74,23 @@ class FolderSource(Source):
         if len(present) != 1:
             found = "both" if present else "neither"
             raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
-        calibration = read_calibration(present[0])
-        self.camera = calibration.camera
-        self.metres_per_unit = _one_unit(present[0], calibration.metres_per_unit, metres_per_unit)
-        if frame_id and calibration.frame_id not in (None, frame_id):
-            stated = calibration.frame_id
-            raise CaptureError(f"{present[0]}: says frame_id {stated!r}, the argument {frame_id!r}; drop one")
-        self.frame_id = frame_id or calibration.frame_id or "world"
+        stated = read_capture_camera(present[0])
+        self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
+        if frame_id and stated.frame_id not in (None, frame_id):
+            raise CaptureError(f"{present[0]}: says frame_id {stated.frame_id!r}, the argument {frame_id!r}; drop one")
+        self.frame_id = frame_id or stated.frame_id or "world"
+        self.camera = stated.camera
+        self.world_from_camera: Tensor | None = None  # of a camera that stands still
+        self._calibrated: dict[str, str] = {}
+        if calibration is not None:
+            frame = None if (path / "poses").is_dir() else frame_id or stated.frame_id
+            self.camera, self.world_from_camera, self._calibrated = _override(
+                present[0], stated.camera, calibration, camera, frame
+            )
+        elif camera is not None:
+            raise ConfigError(
+                f"folder source {path}: camera={camera!r} names one of a calibration; give calibration too"
+            )
         self.invalid_values = tuple(invalid_values)
         self.background_label = background_label
         if not (path / "depth").is_dir():
@@ -77,6 +104,8 @@ class FolderSource(Source):
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
         self._positions = sequence_positions(self._ids)
+        times = path / _TIMESTAMPS
+        self._times = read_timestamps(times, self._ids) if times.is_file() else {}
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -89,16 +118,24 @@ class FolderSource(Source):
 
     def _load(self, sample_id: str) -> DepthFrame:
         files = self.files(sample_id)
-        return make_frame(
+        frame = make_frame(
             files,
             depth=read_depth(files["depth"], metres_per_unit=self.metres_per_unit, invalid_values=self.invalid_values),
             camera=self.camera,
             sample_id=sample_id,
             frame_id=self.frame_id,
             capture_index=self._positions[sample_id],
-            provenance={**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit},
+            provenance={
+                **self.provenance(sample_id),
+                "metres_per_unit": self.metres_per_unit,
+                **self._calibrated,
+                **({"timestamps": [self._times[sample_id]]} if self._times else {}),
+            },
             background_label=self.background_label,
         )
+        if self.world_from_camera is None:
+            return frame
+        return replace(frame, world_from_camera=self.world_from_camera[None], frame_id=self.frame_id)
 
 
 def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
@@ -110,3 +147,24 @@ def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
     if stated is not None and given is not None and stated != given:
         raise UnitError(f"{file}: says metres_per_unit {stated:g}, the argument {given:g}; correct the wrong one")
     return check_metres_per_unit(str(file), stated if given is None else given)  # type: ignore[arg-type]
+
+
+def _override(
+    file: Path,
+    stated: Camera,
+    calibration: Calibration | str | os.PathLike[str],
+    name: str | None,
+    frame: str | None,  # where the camera's pose shall lead to; None = its pose is not asked for
+) -> tuple[Camera, Tensor | None, dict[str, str]]:  # camera, its pose, provenance
+    """Take the camera from a calibration, and its pose too if that is asked for and there are transforms."""
+    known = calibration if isinstance(calibration, Calibration) else Calibration.load(calibration)
+    name = known.camera_name(name)
+    camera = known.camera(name)
+    if camera.size != stated.size:
+        raise CaptureError(
+            f"{file}: is {stated.size[1]}x{stated.size[0]} but camera {name!r} of the calibration is "
+            f"{camera.size[1]}x{camera.size[0]}; calibrate at this resolution, or rescale with Camera.resized"
+        )
+    pose = known.transform(frame, name) if frame and known.transforms else None
+    origin = "given as an object" if calibration is known else Path(os.fspath(calibration)).name  # type: ignore[arg-type]
+    return camera, pose, {"calibration": origin, "camera": name}

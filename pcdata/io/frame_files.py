@@ -8,16 +8,17 @@ from typing import Any
 
 from torch import Tensor
 
-from pcdata.errors import CaptureError
-from pcdata.io.calibration import read_pose
+from pcdata.errors import CaptureError, IntrinsicsError
+from pcdata.io.capture_camera import read_pose
+from pcdata.io.confidence import read_confidence
 from pcdata.io.images import read_color, read_labels, read_mask
 from pcdata.structures import Camera, DepthFrame
 
-_IMAGES = {"color": read_color, "labels": read_labels, "mask": read_mask}
+_IMAGES = {"color": read_color, "labels": read_labels, "mask": read_mask, "confidence": read_confidence}
 
 
 def make_frame(
-    files: Mapping[str, Path],  # by role: depth, and any of color, labels, mask, pose
+    files: Mapping[str, Path],  # by role: depth, and any of color, labels, mask, confidence, pose
     *,
     depth: Tensor,  # (H, W) float32 metres
     camera: Camera,
@@ -45,7 +46,7 @@ def make_frame(
     """
     size = (depth.shape[0], depth.shape[1])
     if size != camera.size:
-        raise CaptureError(
+        raise IntrinsicsError(
             f"{files['depth']}: the depth is {_words(size)} but the intrinsics belong to {_words(camera.size)}; use "
             f"those of the stream that the depth is registered to, or rescale them with Camera.resized({size})"
         )
@@ -61,12 +62,13 @@ def make_frame(
     if labels is not None and background_label is not None:
         labels = labels.masked_fill(labels == background_label, -1)
     pose = read_pose(files["pose"]) if "pose" in files else None
-    color, mask = images.get("color"), images.get("mask")
+    color, mask, confidence = images.get("color"), images.get("mask"), images.get("confidence")
     return DepthFrame(
         depth=depth[None],
         camera=camera,
         colors=None if color is None else color[None],
         labels=None if labels is None else labels[None],
+        confidence=None if confidence is None else confidence[None],
         mask=None if mask is None else mask[None],
         world_from_camera=None if pose is None else pose[None],
         frame_id=None if pose is None else frame_id,

@@ -8,13 +8,14 @@ import numpy as np
 from torch import Tensor
 
 from pcdata.errors import CaptureError
-from pcdata.io.calibration import Calibration, write_calibration, write_pose
+from pcdata.io.capture_camera import CaptureCamera, write_capture_camera, write_pose
+from pcdata.io.confidence import write_confidence
 from pcdata.io.images import write_color, write_depth
 from pcdata.structures import DepthFrame
 
 
 def write_capture(frame: DepthFrame, folder: Path) -> None:
-    """Write depth, colour, pose and calibration of every view to ``folder/view<v>``.
+    """Write depth, colour, confidence, pose and calibration of every view to ``folder/view<v>``.
 
     Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
 
@@ -31,11 +32,14 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
 def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
     (view / "depth").mkdir(parents=True)
     unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
-    calibration = Calibration(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
-    write_calibration(view / "intrinsics.json", calibration)
+    calibration = CaptureCamera(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
+    write_capture_camera(view / "intrinsics.json", calibration)
     if frame.colors is not None:
         (view / "color").mkdir()
         write_color(view / "color" / "0.png", frame.colors[v])
+    if frame.confidence is not None:
+        (view / "confidence").mkdir()
+        write_confidence(view / "confidence" / "0.png", frame.confidence[v])
     if frame.world_from_camera is not None:
         (view / "poses").mkdir()
         write_pose(view / "poses" / "0.txt", frame.world_from_camera[v])

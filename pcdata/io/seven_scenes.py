@@ -11,7 +11,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from pcdata.errors import CaptureError
-from pcdata.io.calibration import read_intrinsics
+from pcdata.io.capture_camera import read_intrinsics
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import check_metres_per_unit, read_depth
 from pcdata.io.source import Source, absolute, check_partners, visible_files

@@ -14,6 +14,7 @@ from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
 from pcdata.functional.depth import mask_depth
 from pcdata.structures.camera import Camera, check_view
+from pcdata.structures.confidence import Confidence
 from pcdata.structures.derive import derived
 
 CAMERA_FRAME = "camera"
@@ -32,7 +33,7 @@ class DepthFrame:
     camera: Camera  # V cameras of size (H, W)
     colors: Tensor | None = None  # (V, H, W, 3) uint8 RGB
     labels: Tensor | None = None  # (V, H, W) int64, -1 = none
-    confidence: Tensor | None = None  # (V, H, W) uint8
+    confidence: Tensor | None = None  # (V, H, W) uint8, values of Confidence; None = every reading is RELIABLE
     mask: Tensor | None = None  # (V, H, W) bool, True = inside the region of interest
     world_from_camera: Tensor | None = None  # (V, 4, 4) float64 rigid
     frame_id: str | None = None  # the frame that world_from_camera leads to, e.g. "base"
@@ -68,6 +69,11 @@ class DepthFrame:
         )
         if any_negative(self.depth):
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
+        if self.confidence is not None and bool((self.confidence > max(Confidence)).any()):
+            raise CaptureError(
+                f"{where}: confidence must hold the values of Confidence, 0 .. {max(Confidence)}, got "
+                f"{int(self.confidence.max())}; translate a sensor's own confidence where it is read"
+            )
         if self.camera.num_views != self.num_views or self.camera.size != self.size:
             raise ShapeError(
                 f"{where}: depth has {self.num_views} views of {self.size} but the camera describes "

@@ -11,6 +11,9 @@ class Kind(str, Enum):
     POSITION = "position"  # (N, 3) float: moved by the 4x4; averaged
     DIRECTION = "direction"  # (N, 3) float: moved by the inverse transpose, renormalised; averaged and renormalised
     INVARIANT = "invariant"  # anything: not moved; floats averaged, integers voted, never averaged
+    MINIMUM = (
+        "minimum"  # integers: not moved; of several the lowest counts, as a chain is as strong as its weakest link
+    )
 
 
 CORE_KINDS = {

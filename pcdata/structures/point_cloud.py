@@ -149,7 +149,9 @@ class PointCloud:
                 raise DTypeError(f"PointCloud: extra['viewpoint'] is a position, not {self.kinds[name].value}")
             if value.shape[:1] != (num_points,):
                 raise ShapeError(f"PointCloud: extra[{name!r}] has {tuple(value.shape)[:1]} rows, not {num_points}")
-            if self.kinds[name] is not Kind.INVARIANT and (
+            if self.kinds[name] is Kind.MINIMUM and (value.is_floating_point() or value.is_complex()):
+                raise DTypeError(f"PointCloud: extra[{name!r}] is a minimum: it must hold integers, not {value.dtype}")
+            if self.kinds[name] in (Kind.POSITION, Kind.DIRECTION) and (
                 value.shape != (num_points, 3) or not value.is_floating_point()
             ):
                 raise ShapeError(f"PointCloud: extra[{name!r}] is a {self.kinds[name].value}: it must be float (N, 3)")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import torch
 from torch import Generator, Tensor
 
 from pcdata.errors import ConfigError, ShapeError, near_matches
+from pcdata.functional.sensor_noise import draw_sensor_noise, err_in_disparity, facing_depth, sensor_reading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,46 +59,36 @@ class SensorNoise:
     ) -> Tensor:  # (V, H, W) float32 metres, 0 = no reading
         """Return the depth image that the sensor would report.
 
-        Every field uses draws of its own, so changing one leaves the pattern of the others as it was.
-
         Raises:
             ShapeError: not one generator and focal length per view.
         """
         if not len(depth) == len(focal) == len(generators):
             raise ShapeError(f"SensorNoise: {len(depth)} views, {len(focal)} focals, {len(generators)} generators")
-        size = depth.shape[1:]
-        wobble = torch.stack([torch.randn(size, generator=one) for one in generators]).to(depth.device)
-        chance = torch.stack([torch.rand((4, *size), generator=one) for one in generators], dim=1).to(depth.device)
-        across, edge = facing_depth(depth.double(), self.edge_jump)
-
-        seen = depth.double()
-        flying = edge & (chance[0] < self.flying_pixels) & (across > 0)
-        seen = torch.where(flying, seen + chance[1] * (across - seen), seen)
+        truth = depth.double()
+        across = facing_depth(truth)
         focal_baseline = focal.double()[:, None, None] * self.baseline
-        disparity = _quantized(focal_baseline / seen + self.disparity_sigma * wobble, self.disparity_step)
-        reading = _quantized(focal_baseline / disparity, self.depth_step)
+        reading = sensor_reading(
+            truth,
+            draw_sensor_noise((depth.shape[1], depth.shape[2]), generators, depth.device),
+            err=partial(
+                err_in_disparity,
+                focal_baseline=focal_baseline,
+                sigma=self.disparity_sigma,
+                step=self.disparity_step,
+            ),
+            edge=self.edges(truth, across),
+            across=across,
+            flying_pixels=self.flying_pixels,
+            edge_dropout=self.edge_dropout,
+            dropout=self.dropout,
+            depth_step=self.depth_step,
+        )
+        outside = (reading < self.min_range) | (reading > self.max_range)
+        return torch.where(outside, 0.0, reading).float()
 
-        lost = (edge & (chance[2] < self.edge_dropout)) | (chance[3] < self.dropout)
-        outside = (reading < self.min_range) | (reading > self.max_range) | (disparity <= 0)
-        return torch.where(lost | outside | (depth <= 0), 0.0, reading).float()
-
-
-def facing_depth(depth: Tensor, edge_jump: float) -> tuple[Tensor, Tensor]:
-    """Find depth discontinuities: both sides of every jump between 4-neighbours.
-
-    Args:
-        depth: (V, H, W) metres, 0 = nothing.
-        edge_jump: the smallest jump, as a part of the nearer depth.
-
-    Returns:
-        (V, H, W) depth of the neighbour across the largest jump, and (V, H, W) bool, True = at an edge.
-    """
-    padded = torch.nn.functional.pad(depth[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    sides = [padded[:, :-2, 1:-1], padded[:, 2:, 1:-1], padded[:, 1:-1, :-2], padded[:, 1:-1, 2:]]
-    neighbors = torch.stack(sides)
-    jump, which = (neighbors - depth).abs().max(0)
-    across = neighbors.gather(0, which[None])[0]
-    return across, jump > edge_jump * torch.minimum(depth, across)
+    def edges(self, depth: Tensor, across: Tensor) -> Tensor:
+        """Find both sides of every jump: (V, H, W) bool from depths and those of the neighbours that differ most."""
+        return (across - depth).abs() > self.edge_jump * torch.minimum(depth, across)
 
 
 def noise_named(noise: SensorNoise | str | None) -> SensorNoise | None:
@@ -113,7 +105,3 @@ def noise_named(noise: SensorNoise | str | None) -> SensorNoise | None:
             f"noise={noise!r}: use a SensorNoise or one of {sorted(presets)}{near_matches(str(noise), presets)}"
         )
     return presets[noise]
-
-
-def _quantized(values: Tensor, step: float) -> Tensor:
-    return torch.round(values / step) * step if step > 0 else values

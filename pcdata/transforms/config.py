@@ -15,7 +15,8 @@ import yaml
 from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
-from pcdata.transforms.yaml_nodes import YamlDocument, node_at, yaml_text
+from pcdata.transforms.sensor_words import is_sensor_word, sensor_hint, sensor_value
+from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
 
 def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:
@@ -105,7 +106,8 @@ def _build(
         if str(path[0]) in entries and str(path[0]) not in fields:
             continue  # not missing: it could not be read, and that was said
         place = ".".join(map(str, (cls.__name__, *path)))
-        document.fault(_place(cls, entries, fields_node, name_node, path), f"{place}: {message}")
+        hint = sensor_hint(fields.get(str(path[0])))
+        document.fault(_place(cls, entries, fields_node, name_node, path), f"{place}: {message}{hint}")
     if len(document.faults) > before:
         return None
     try:
@@ -122,7 +124,7 @@ def _field_value(document: YamlDocument, cls: type[Transform], key: str, node: y
         return _step_from_node(document, node)
     if declared == Sequence[Transform]:
         return steps_from_node(document, node, f"{cls.__name__}.{key}")
-    return document.plain(node)
+    return sensor_value(document, node, cls, key) if is_sensor_word(node, declared) else document.plain(node)
 
 
 def _place(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -13,20 +13,22 @@ from pcdata.functional.depth import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Metres
+from pcdata.transforms.fields import ConfidenceName, FromSensor, Metres, confidence_named
 
 
 class MaskDepth(Transform):
-    """Set depth to "no reading" outside a range, outside the frame's mask, or on unwanted labels."""
+    """Set depth to "no reading" outside a range, outside the frame's mask, on unwanted labels or below a confidence."""
 
     takes = DepthFrame
     gives = DepthFrame
 
-    near: Metres | None = None  # readings closer than this are dropped
-    far: Metres | None = None  # readings beyond this are dropped
+    # Readings closer than near or beyond far are dropped.
+    near: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[0])] = None
+    far: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[1])] = None
     use_mask: bool = True  # drop pixels outside frame.mask where the capture has one
     require_mask: bool = False  # refuse a capture without a mask
     drop_labels: Sequence[int] = ()  # drop pixels with these labels
+    min_confidence: ConfidenceName | None = None  # drop pixels that are less to be trusted
 
     def check_fields(self) -> None:
         """Require near < far."""
@@ -38,16 +40,24 @@ class MaskDepth(Transform):
         return data.masked(near=self.near, far=self.far, mask=self.mask_of(data))
 
     def mask_of(self, data: DepthFrame) -> Tensor | None:
-        """Return the (V, H, W) bool mask that the capture's mask and labels make, or None without any."""
+        """Return the (V, H, W) bool mask that the capture's mask, labels and confidence make; None without any."""
         if data.mask is None and self.require_mask:
             raise CaptureError(f"MaskDepth: capture {data.sample_id!r} has no mask; add one or set require_mask: false")
         mask = data.mask if self.use_mask else None
-        if not self.drop_labels:
-            return mask
-        if data.labels is None:
-            raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
-        wanted = ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
-        return wanted if mask is None else wanted & mask
+        if self.drop_labels:
+            if data.labels is None:
+                raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
+            unwanted = torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+            mask = ~unwanted if mask is None else mask & ~unwanted
+        if self.min_confidence is not None:
+            if data.confidence is None:
+                raise CaptureError(
+                    f"MaskDepth: min_confidence is set but the capture {data.sample_id!r} has no confidence; put "
+                    "MarkUnreliableDepth or CompleteDepth before it"
+                )
+            trusted = data.confidence >= confidence_named(self.min_confidence)
+            mask = trusted if mask is None else mask & trusted
+        return mask
 
 
 class Deproject(Transform):
@@ -100,7 +110,7 @@ class Deproject(Transform):
             labels=made.rows.get("labels"),
             source_index=made.source_index,
             extra=extra,
-            kinds=dict.fromkeys(extra, Kind.INVARIANT),
+            kinds=dict.fromkeys(extra, Kind.MINIMUM),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,

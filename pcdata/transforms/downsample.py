@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,22 +17,26 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_minimum,
 )
 from pcdata.rng import Streams, seeded
+from pcdata.sensors import SensorProfile
 from pcdata.structures import Kind, PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
-from pcdata.transforms.fields import Count, Fraction, IfShort, Metres
+from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres
 
 
 class VoxelDownsample(Transform):
     """Average the points of every occupied voxel (Open3D's grid), every field by its kind.
 
     Positions, colours and other floats are averaged, directions averaged and renormalised, labels and other integers
-    decided by vote (the lowest wins a tie); ``source_index`` is that of the first point in the voxel. Give the voxel
-    size, or the count to reach: then every cloud gets the largest size that leaves at least so many points.
+    decided by vote (the lowest wins a tie); confidence is their lowest, as an average is no better than its parts;
+    ``source_index`` is that of the first point in the voxel. Give the voxel size, or the count to reach: then every
+    cloud gets the largest size that leaves at least so many points.
     """
 
-    voxel_size: Metres | None = None  # edge length, in the cloud's unit
+    # Edge length, in the cloud's unit.
+    voxel_size: Annotated[Metres | None, FromSensor(SensorProfile.voxel_size)] = None
     num_points: Count | None = None  # wanted count instead of a size
 
     def check_fields(self) -> None:
@@ -163,7 +168,8 @@ def _reduce(values: Tensor, kind: Kind, inverse: Tensor, count: int) -> Tensor:
     if values.is_floating_point():
         reduced = voxel_mean(columns, inverse, count)
     else:
-        votes = [voxel_majority(column.long(), inverse, count) for column in columns.unbind(1)]
+        decide = voxel_minimum if kind is Kind.MINIMUM else voxel_majority
+        votes = [decide(column.long(), inverse, count) for column in columns.unbind(1)]
         reduced = torch.stack(votes, dim=1).to(values.dtype)
     return reduced.reshape(count, *values.shape[1:])
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Interval, MinLen
+
+from pcdata.sensors import SensorProfile
+from pcdata.structures import Confidence
 
 Metres = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
@@ -18,3 +23,19 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]  # row-major, acts on column vectors
 
 # What a sampler does with a cloud that has fewer points than asked.
 IfShort = Literal["error", "repeat", "tile", "zeros", "keep"]
+
+
+# The levels that a minimum can ask for, by the names of Confidence.
+ConfidenceName = Literal["hallucinated", "completed", "reliable"]
+
+
+def confidence_named(name: ConfidenceName) -> Confidence:
+    """Return the level of this name."""
+    return Confidence[name.upper()]
+
+
+@dataclass(frozen=True)
+class FromSensor:
+    """Marks, inside ``Annotated``, a field for which a configuration may say ``sensor`` instead of a value."""
+
+    figure: Callable[[SensorProfile, float], float | str]  # of the sensor's profile and the reference depth in metres

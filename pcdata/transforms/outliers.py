@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
+from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import Count, Metres, Positive
+from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
 
 
 class RemoveStatisticalOutliers(SelectTransform):
@@ -35,7 +38,7 @@ class RemoveRadiusOutliers(SelectTransform):
     runs_statistics = True
 
     min_neighbors: Count = 5
-    radius: Metres = 0.01
+    radius: Annotated[Metres, FromSensor(SensorProfile.outlier_radius)] = 0.01
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""

@@ -14,7 +14,8 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform
 from pcdata.transforms.compose import Compose, order_checked_before
 from pcdata.transforms.config import read_config, steps_from_node
-from pcdata.transforms.yaml_nodes import YamlDocument, yaml_text
+from pcdata.transforms.sensor_words import SENSOR, sensor_from_node
+from pcdata.yaml_nodes import YamlDocument, yaml_text
 
 SECTIONS = ("depth", "cloud", "augment")
 
@@ -108,7 +109,9 @@ class Pipeline(Transform, abstract=True):
 
     @classmethod
     def from_yaml(cls, text: str, *, name: str = "<yaml>") -> Pipeline:
-        """Build from YAML with the sections ``depth``, ``cloud`` and ``augment``.
+        """Build from YAML with the sections ``depth``, ``cloud`` and ``augment``, and perhaps the name of a ``sensor``.
+
+        Where a step says ``sensor`` for a value, the value is computed here: the pipeline holds the number.
 
         Raises:
             ConfigError: every fault, as ``name:line:column: what``.
@@ -116,7 +119,7 @@ class Pipeline(Transform, abstract=True):
         document = YamlDocument(text, name)
         entries = document.mapping(document.root, "a pipeline")
         for section, (key, _) in entries.items():
-            if section not in SECTIONS:
+            if section not in (*SECTIONS, SENSOR):
                 document.fault(key, f"unknown section {section!r}; a pipeline has {', '.join(SECTIONS)}")
         return pipeline_from_document(document, entries)
 
@@ -135,6 +138,8 @@ class Pipeline(Transform, abstract=True):
 
 def pipeline_from_document(document: YamlDocument, entries: Mapping[str, tuple[yaml.Node, yaml.Node]]) -> Pipeline:
     """Build the pipeline sections of a parsed file and raise all faults noted so far."""
+    if SENSOR in entries:
+        document.sensor = sensor_from_node(document, entries[SENSOR][1])
     steps = {
         section: steps_from_node(document, entries[section][1], f"section {section}")
         for section in SECTIONS

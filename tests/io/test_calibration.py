@@ -1,166 +1,267 @@
+"""The calibration file: what is written comes back, what is wrong is named with its place, frames chain."""
+
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from pcdata.errors import CaptureError, PoseError, UnitError
-from pcdata.io import (
-    Calibration,
-    read_calibration,
-    read_intrinsics,
-    read_pose,
-    write_calibration,
-    write_pose,
-)
+from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError, PoseError
+from pcdata.functional import rigid
+from pcdata.io import Calibration, Evidence, open_source, write_depth
 from pcdata.structures import Camera
 
-GOOD: dict[str, Any] = {"width": 640, "height": 480, "fx": 585.5, "fy": 584.5, "cx": 320.25, "cy": 240.75}
+GOOD = """\
+format: pcdata-calibration
+version: 1
+unit: metre
+cameras:
+  wrist: {model: opencv, width: 640, height: 480, fx: 600.5, fy: 601, cx: 320, cy: 240.25, distortion: [0.1, 0, 0, 0]}
+transforms:
+  gripper_from_wrist:
+    translation: [0.1, 0.2, 0.3]
+    quaternion_xyzw: [0, 0, 0, 1]
+    evidence: {method: by hand, num_observations: 12, residuals: {translation_rms_m: 1e-3}, date: 2026-01-31}
+"""
 
 
-def write(path: Path, content: Any) -> Path:
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return path
+def pose(seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    quaternion = torch.randn(4, dtype=torch.float64, generator=generator)
+    translation = torch.randn(3, dtype=torch.float64, generator=generator)
+    return rigid.from_rotation_translation(rigid.rotation_from_quaternion(quaternion), translation)
 
 
-def test_every_number_of_a_calibration_arrives_where_it_belongs(tmp_path: Path) -> None:
-    extra = {"distortion": [0.1, -0.2, 0.01, 0.02, 0.3], "metres_per_unit": 0.001, "frame_id": "base", "notes": "x"}
-    calibration = read_calibration(write(tmp_path / "c.json", GOOD | extra))
-    assert calibration.camera.size == (480, 640)
-    assert calibration.camera.intrinsics[0].tolist() == [[585.5, 0, 320.25], [0, 584.5, 240.75], [0, 0, 1]]
-    assert calibration.camera.distortion is not None
-    assert calibration.camera.distortion[0].tolist() == extra["distortion"]
-    assert (calibration.metres_per_unit, calibration.frame_id) == (0.001, "base")
+def camera(**changes: object) -> Camera:
+    values = {"fx": 1000 / 3, "fy": 601.1, "cx": 3.1, "cy": 2.2, "size": (6, 8), "distortion": [0.1, 1 / 3, 1e-17, 0.0]}
+    return Camera.pinhole(**(values | changes))  # type: ignore[arg-type]
 
 
-def test_what_a_calibration_does_not_say_is_none(tmp_path: Path) -> None:
-    calibration = read_calibration(write(tmp_path / "c.json", GOOD))
-    assert (calibration.camera.distortion, calibration.metres_per_unit, calibration.frame_id) == (None, None, None)
+def cell() -> Calibration:
+    return Calibration(
+        cameras={"left": camera(), "right": camera(distortion=None)},
+        transforms={"base_from_left": pose(1), "right_from_left": pose(2), "base_from_table": pose(3)},
+        evidence={
+            "left": Evidence(method="chessboard 9x6: squares of 0.025 m", num_observations=20, date="2026-01-31"),
+            "base_from_left": Evidence(method="hand-eye", residuals={"translation_rms_m": 1 / 3000}, notes="cold"),
+        },
+    )
 
 
-@pytest.mark.parametrize("distortion", [None, [0.1, 1 / 3, 0.0, 1e-17]])
-def test_a_written_calibration_reads_back_exactly(tmp_path: Path, distortion: list[float] | None) -> None:
-    camera = Camera.pinhole(fx=1 / 3 * 1000, fy=601.1, cx=1.1, cy=2.2, size=(4, 6), distortion=distortion)
-    write_calibration(tmp_path / "c.json", Calibration(camera=camera, metres_per_unit=0.00025, frame_id="table"))
-    back = read_calibration(tmp_path / "c.json")
-    assert back.camera.to_dict() == camera.to_dict()
-    assert (back.metres_per_unit, back.frame_id) == (0.00025, "table")
+# -- file ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (
-            {k: v for k, v in GOOD.items() if k != "fx"} | {"Fx": 1},
-            "'fx' is missing, 'Fx' is not known; did you mean 'fx'",
-        ),
-        (GOOD | {"distorsion": [0, 0, 0, 0]}, "'distorsion' is not known; did you mean 'distortion'"),
-        (GOOD | {"depth_scale": 1000}, "three incompatible meanings"),
-        (GOOD | {"fx": -585}, "focal lengths must be positive"),
-        (GOOD | {"fx": 0}, "focal lengths must be positive"),
-        (GOOD | {"fx": "585"}, "'fx' must be a number"),
-        (GOOD | {"fx": True}, "'fx' must be a number"),
-        (GOOD | {"fx": 10**400}, "'fx' must be a finite number"),
-        (GOOD | {"cx": 1000}, r"principal point .* outside the 640x480 image.*Camera\.resized"),
-        (GOOD | {"width": 640.5}, "'width' must be a whole number"),
-        (GOOD | {"height": 0}, "'height' must be a whole number"),
-        (GOOD | {"distortion": [1, 2, 3]}, "'distortion' must be a list of 4, 5, 8, 12"),
-        (GOOD | {"distortion": [1, 2, 3, None]}, "'distortion' must be a number"),
-        (GOOD | {"frame_id": ""}, "'frame_id' must be a name"),
-        (json.dumps(GOOD).replace("585.5", "NaN"), "NaN is not a number a camera can have"),
-        (json.dumps(GOOD).replace("585.5", "Infinity"), "Infinity is not"),
-        ('{"fx": 1, "fx": 2}', "repeated"),
-        ("[1, 2]", "must be a JSON object"),
-        ("{", "not valid JSON"),
-        ("[" * 100_000, "not valid JSON"),
-        ("", "is empty"),
-        ("x" * (1 << 21), "more than the limit"),
-    ],
-)
-def test_a_wrong_calibration_is_refused_with_the_reason_and_the_file(
-    tmp_path: Path, content: Any, message: str
-) -> None:
-    with pytest.raises(CaptureError, match=message) as caught:
-        read_calibration(write(tmp_path / "c.json", content))
-    assert str(tmp_path / "c.json") in str(caught.value)
+def test_what_is_saved_is_loaded_bit_for_bit(tmp_path: Path) -> None:
+    cell().save(tmp_path / "cell.yaml")
+    back = Calibration.load(tmp_path / "cell.yaml")
+    assert {name: one.to_dict() for name, one in back.cameras.items()} == {
+        name: one.to_dict() for name, one in cell().cameras.items()
+    }
+    assert back.transforms.keys() == cell().transforms.keys()
+    assert all(torch.equal(back.transforms[name], matrix) for name, matrix in cell().transforms.items())
+    assert back.evidence == cell().evidence
 
 
-def test_a_divisor_is_refused_as_metres_per_unit(tmp_path: Path) -> None:
-    with pytest.raises(UnitError, match="at most 1, got 1000"):
-        read_calibration(write(tmp_path / "c.json", GOOD | {"metres_per_unit": 1000}))
+def test_equal_calibrations_are_equal_bytes_and_leave_no_other_file(tmp_path: Path) -> None:
+    cell().save(tmp_path / "a.yaml")
+    Calibration.load(tmp_path / "a.yaml").save(tmp_path / "b.yaml")
+    assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.yaml", "b.yaml"]
 
 
-def test_binary_files_are_refused_as_calibration(tmp_path: Path) -> None:
-    (tmp_path / "c.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(CaptureError, match="UTF-8"):
-        read_calibration(tmp_path / "c.json")
+def test_a_file_written_by_hand_is_read_as_it_says(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text(GOOD)
+    found = Calibration.load(tmp_path / "c.yaml")
+    wrist = found.camera()
+    assert wrist.size == (480, 640)
+    assert wrist.intrinsics[0].tolist() == [[600.5, 0, 320], [0, 601, 240.25], [0, 0, 1]]
+    assert wrist.distortion is not None
+    assert wrist.distortion.tolist() == [[0.1, 0, 0, 0]]
+    assert found.transform("gripper", "wrist")[:3].tolist() == [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3]]
+    assert found.evidence["gripper_from_wrist"] == Evidence(
+        method="by hand", num_observations=12, residuals={"translation_rms_m": 0.001}, date="2026-01-31"
+    )
 
 
-def test_intrinsics_text_gives_the_matrix_and_takes_the_size(tmp_path: Path) -> None:
-    camera = read_intrinsics(write(tmp_path / "k.txt", "585 0 320\n0 584 240\n0 0 1\n"), size=(480, 640))
-    assert camera.intrinsics[0].tolist() == [[585, 0, 320], [0, 584, 240], [0, 0, 1]]
+def test_a_quaternion_and_a_rotation_vector_say_the_same_rotation(tmp_path: Path) -> None:
+    half = 2**-0.5
+    texts = (f"quaternion_xyzw: [0, 0, {half}, {half}]", "rotation_vector: [0, 0, 1.5707963267948966]")
+    for number, text in enumerate(texts):
+        (tmp_path / f"{number}.yaml").write_text(GOOD.replace("quaternion_xyzw: [0, 0, 0, 1]", text))
+    first, second = (Calibration.load(tmp_path / f"{n}.yaml").transforms["gripper_from_wrist"] for n in (0, 1))
+    torch.testing.assert_close(first, second, atol=1e-12, rtol=0)
+    torch.testing.assert_close(first[:3, 0], torch.tensor([0.0, 1, 0], dtype=torch.float64), atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("old", "new", "message"),
     [
-        ("585 0 320 0 585 240 0 0", "nine numbers, got 8"),
-        ("585 0 0 0 585 0 320 240 1", "transposed"),
-        ("585 0 320 0 x 240 0 0 1", "numbers only"),
-        ("nan 0 320 0 585 240 0 0 1", "NaN"),
-        ("585 0 1320 0 585 240 0 0 1", "outside"),
+        ("cameras:", "camera:", r"4:1: a calibration: no such key 'camera'; did you mean 'cameras'"),
+        ("pcdata-calibration", "kalibr", r"1:9: format must be 'pcdata-calibration', got 'kalibr'"),
+        ("version: 1", "version: 2", r"2:10: version must be 1, got 2; a file of another version"),
+        ("unit: metre\n", "", r"1:1: a calibration: 'unit' is missing"),
+        ("unit: metre", "unit: millimetre", r"3:7: unit must be 'metre', got 'millimetre'; convert"),
+        ("fx: 600.5, ", "", r"5:10: camera 'wrist': 'fx' is missing"),
+        ("fx: 600.5", "fx: -600.5", r"5:3: camera 'wrist': .*focal lengths must be positive"),
+        ("fx: 600.5", "fx: .nan", r"5:55: camera 'wrist': fx must be a finite number, got nan"),
+        ("fx: 600.5", "Fx: 600.5", r"no such key 'Fx'; did you mean 'fx'"),
+        ("width: 640", "width: 640.5", r"width must be a whole number from 1 to 65536, got 640.5"),
+        ("cx: 320", "cx: 900", r"principal point .* outside the 640x480 image"),
+        ("[0.1, 0, 0, 0]", "[0.1, 0, 0]", r"distortion must be a list of 4 or 5 or 8 or 12 numbers, got 3"),
+        ("model: opencv", "model: fisheye", r"5:18: camera 'wrist': model must be pinhole or opencv, got 'fisheye'"),
+        ("model: opencv", "model: pinhole", r"model opencv has distortion .*, model pinhole has none"),
+        ("gripper_from_wrist", "gripper_to_wrist", r"7:3: a transform is named to_from, .* got 'gripper_to_wrist'"),
+        ("gripper_from_wrist", "wrist_from_wrist", r"7:3: a transform is named to_from"),
+        ("[0, 0, 0, 1]", "[0, 0, 0, 0.9]", r"9:22: .*quaternion_xyzw must have length 1, has 0.9"),
+        ("[0, 0, 0, 1]", "[0, 0, 1]", r"quaternion_xyzw must be a list of 4 numbers, got 3"),
+        ("quaternion_xyzw: [0, 0, 0, 1]", "rotation_vector: [0, 0, 90]", r"in radians; is this in degrees"),
+        ("[0.1, 0.2, 0.3]", "[100, 200, 300]", r"8:18: gripper_from_wrist: .* 374.166 m long; is it in millimetres"),
+        ("    translation: [0.1, 0.2, 0.3]\n", "", r"give matrix alone, or translation with .*; got quaternion_xyzw"),
+        ("method: by hand, ", "", r"evidence: 'method' is missing"),
+        ("num_observations: 12", "num_observations: many", r"num_observations must be a whole number"),
+        ("residuals", "residual", r"no such key 'residual'; did you mean 'residuals'"),
+        ("transforms:", "  wrist: {}\ntransforms:", r"6:3: cameras: 'wrist' is given twice"),
+        ("by hand", "*alias", r"aliases .* are not allowed"),
+        ("by hand", "!<tag:yaml.org,2002:python/name:os.system> ''", r"evidence: method must be words"),
+        ("fx: 600.5", "fx: !<tag:yaml.org,2002:python/name:os.system> ''", r"cannot read this value"),
     ],
 )
-def test_wrong_intrinsics_text_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(CaptureError, match=message):
-        read_intrinsics(write(tmp_path / "k.txt", text), size=(480, 640))
+def test_a_fault_is_named_with_its_place(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in GOOD
+    (tmp_path / "c.yaml").write_text(GOOD.replace(old, new))
+    with pytest.raises(CalibrationError, match=message):
+        Calibration.load(tmp_path / "c.yaml")
 
 
-def pose_matrix() -> torch.Tensor:
-    rotation, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotation * torch.linalg.det(rotation).sign()
-    pose[:3, 3] = torch.tensor([0.1, -2.0, 1 / 3])
-    return pose
-
-
-def test_a_written_pose_reads_back_exactly(tmp_path: Path) -> None:
-    write_pose(tmp_path / "p.txt", pose_matrix())
-    assert torch.equal(read_pose(tmp_path / "p.txt"), pose_matrix())
-    np.save(tmp_path / "p.npy", pose_matrix().numpy())
-    assert torch.equal(read_pose(tmp_path / "p.npy"), pose_matrix())
-
-
-def rows(matrix: torch.Tensor) -> str:
-    return "\n".join(" ".join(map(str, row)) for row in matrix.tolist())
+def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text(GOOD.replace("fx:", "Fx:").replace("0.3]", "x]").replace("unit: metre\n", ""))
+    with pytest.raises(CalibrationError) as caught:
+        Calibration.load(tmp_path / "c.yaml")
+    assert str(caught.value).count("c.yaml:") == 4  # unit missing; Fx unknown; fx missing; x no number
 
 
 @pytest.mark.parametrize(
-    ("pose", "message"),
+    ("rows", "message"),
     [
-        (pose_matrix() * torch.tensor([[2.0], [2.0], [2.0], [1.0]]), "not rigid"),
-        (pose_matrix() * torch.tensor([[-1.0], [1.0], [1.0], [1.0]]), "mirror"),
-        (pose_matrix().T, "rigid|last row"),
-        (torch.full((4, 4), -torch.inf, dtype=torch.float64), "tracking lost"),
-        (torch.full((4, 4), torch.nan, dtype=torch.float64), "tracking lost"),
+        ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1.01, 0], [0, 0, 0, 1]]", "not rigid"),
+        ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]", "mirror"),
+        ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]", "transposed"),
+        ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "four rows"),
     ],
 )
-def test_a_pose_that_is_not_rigid_is_refused_with_its_file(tmp_path: Path, pose: torch.Tensor, message: str) -> None:
-    with pytest.raises(PoseError, match=message) as caught:
-        read_pose(write(tmp_path / "p.txt", rows(pose)))
-    assert "p.txt" in str(caught.value)
+def test_a_matrix_that_is_no_pose_is_refused(tmp_path: Path, rows: str, message: str) -> None:
+    text = "format: pcdata-calibration\nversion: 1\nunit: metre\ntransforms:\n  a_from_b: {matrix: " + rows + "}\n"
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match=rf"c\.yaml:5:22: a_from_b.*{message}"):
+        Calibration.load(tmp_path / "c.yaml")
 
 
-def test_a_pose_of_other_shape_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="got 12; the last row 0 0 0 1 is missing"):
-        read_pose(write(tmp_path / "p.txt", "1 0 0 0 0 1 0 0 0 0 1 0"))
-    np.save(tmp_path / "p.npy", np.eye(3))
-    with pytest.raises(CaptureError, match=r"\(4, 4\)"):
-        read_pose(tmp_path / "p.npy")
-    np.save(tmp_path / "p.npy", np.array([{}], dtype=object), allow_pickle=True)
-    with pytest.raises(CaptureError, match=r"not a readable \.npy"):
-        read_pose(tmp_path / "p.npy")
+def test_a_file_that_is_not_there_is_a_capture_error(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no such file"):
+        Calibration.load(tmp_path / "none.yaml")
+
+
+# -- frames --------------------------------------------------------------------------------------------------------
+
+
+def test_transforms_chain_and_invert_through_the_frames_between() -> None:
+    found = cell().transform("table", "right")
+    expected = torch.linalg.inv(pose(3)) @ pose(1) @ torch.linalg.inv(pose(2))
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        cell().transform("right", "table") @ found, torch.eye(4, dtype=torch.float64), atol=1e-12, rtol=0
+    )
+
+
+def test_a_frame_seen_from_itself_is_the_identity() -> None:
+    assert torch.equal(cell().transform("left", "left"), torch.eye(4, dtype=torch.float64))
+
+
+def test_unknown_and_unconnected_frames_are_refused() -> None:
+    with pytest.raises(FrameError, match="no frame 'bas'; did you mean 'base'"):
+        cell().transform("bas", "left")
+    apart = Calibration(cameras={"left": camera()}, transforms={"base_from_table": pose(1)})
+    with pytest.raises(FrameError, match=r"nothing joins 'base' and 'left'; .* no other frame"):
+        apart.transform("base", "left")
+
+
+@pytest.mark.parametrize("name", ["base_from_right", "left_from_base", "right_from_table"])
+def test_a_second_way_between_frames_is_refused(name: str) -> None:
+    with pytest.raises(CalibrationError, match=f"{name}: .* two ways would give two answers"):
+        Calibration(transforms={**cell().transforms, name: pose(9)})
+
+
+def test_a_loop_in_a_file_is_named_with_its_place(tmp_path: Path) -> None:
+    again = "  wrist_from_gripper: {translation: [0, 0, 0], rotation_vector: [0, 0, 0]}\n"
+    (tmp_path / "c.yaml").write_text(GOOD + again)
+    with pytest.raises(CalibrationError, match=r"c\.yaml:11:3: wrist_from_gripper: .* two ways"):
+        Calibration.load(tmp_path / "c.yaml")
+
+
+def test_replacing_a_transform_drops_the_evidence_of_the_old_one() -> None:
+    changed = cell().with_transform("left_from_base", pose(7), Evidence(method="tape"))
+    assert torch.equal(changed.transforms["left_from_base"], pose(7))
+    assert "base_from_left" not in changed.transforms
+    assert set(changed.evidence) == {"left", "left_from_base"}
+    assert set(cell().with_camera("left", camera()).evidence) == {"base_from_left"}
+
+
+def test_what_is_no_calibration_is_refused() -> None:
+    with pytest.raises(PoseError, match="not rigid"):
+        Calibration(transforms={"a_from_b": 2 * torch.eye(4, dtype=torch.float64)})
+    far = torch.eye(4, dtype=torch.float64)
+    far[0, 3] = 500
+    with pytest.raises(PoseError, match="in millimetres"):
+        Calibration(transforms={"a_from_b": far})
+    with pytest.raises(CalibrationError, match="evidence for 'x'"):
+        Calibration(evidence={"x": Evidence(method="none")})
+    with pytest.raises(CalibrationError, match="no camera 'lef'; did you mean 'left'"):
+        cell().camera("lef")
+    with pytest.raises(CalibrationError, match="say which camera; it has left, right"):
+        cell().camera()
+
+
+# -- captures ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    root = tmp_path / "capture"
+    (root / "depth").mkdir(parents=True)
+    write_depth(root / "depth" / "0.png", torch.full((6, 8), 0.5), metres_per_unit=0.001)
+    stated = {"width": 8, "height": 6, "fx": 10.0, "fy": 10.0, "cx": 3.5, "cy": 2.5, "metres_per_unit": 0.001}
+    (root / "intrinsics.json").write_text(json.dumps(stated))
+    return root
+
+
+def test_a_calibration_file_replaces_the_camera_of_a_capture_and_gives_its_pose(capture: Path) -> None:
+    cell().save(capture.parent / "cell.yaml")
+    source = open_source(capture, calibration=capture.parent / "cell.yaml", camera="right", frame_id="table")
+    frame = source.load("0")
+    assert torch.equal(frame.camera.intrinsics, camera().intrinsics)
+    assert frame.world_from_camera is not None
+    assert torch.equal(frame.world_from_camera[0], cell().transform("table", "right"))
+    assert frame.frame_id == "table"
+    assert (frame.provenance["calibration"], frame.provenance["camera"]) == ("cell.yaml", "right")
+
+
+def test_poses_of_the_capture_stay_and_a_frame_not_asked_for_gives_none(capture: Path) -> None:
+    assert open_source(capture, calibration=cell(), camera="left").load("0").world_from_camera is None
+    (capture / "poses").mkdir()
+    (capture / "poses" / "0.txt").write_text("1 0 0 7  0 1 0 0  0 0 1 0  0 0 0 1")
+    frame = open_source(capture, calibration=cell(), camera="left", frame_id="base").load("0")
+    assert frame.world_from_camera is not None
+    assert frame.world_from_camera[0, 0, 3] == 7
+    assert frame.camera.intrinsics[0, 1, 1] == 601.1
+
+
+def test_a_calibration_that_does_not_fit_the_capture_is_refused(capture: Path) -> None:
+    with pytest.raises(CaptureError, match="is 8x6 but camera 'c' of the calibration is 10x10"):
+        open_source(capture, calibration=Calibration(cameras={"c": camera(size=(10, 10))}))
+    with pytest.raises(FrameError, match="no frame 'bass'; did you mean 'base'"):
+        open_source(capture, calibration=cell(), camera="left", frame_id="bass")
+    with pytest.raises(ConfigError, match="camera='left' names one of a calibration; give calibration too"):
+        open_source(capture, camera="left")

@@ -78,6 +78,7 @@ GOOD = {"points": torch.zeros(N, 3), "ptr": torch.tensor([0, 1, N]), "frame_id":
         ({"extra": {"a b": torch.zeros(N)}, "kinds": {"a b": "invariant"}}, DTypeError, "cannot name"),
         ({"extra": {"axis": torch.zeros(N)}, "kinds": {"axis": "direction"}}, ShapeError, r"must be float \(N, 3\)"),
         ({"extra": {"viewpoint": torch.zeros(N, 3)}, "kinds": {"viewpoint": "invariant"}}, DTypeError, "is a position"),
+        ({"extra": {"mass": torch.zeros(N)}, "kinds": {"mass": "minimum"}}, DTypeError, "must hold integers"),
         (
             {"extra": {"mass": torch.zeros(N, device="meta")}, "kinds": {"mass": "invariant"}},
             DeviceError,
@@ -272,7 +273,8 @@ def test_padding_is_marked_and_real_rows_are_kept(counts, more):
         spread = getattr(padded, name) if hasattr(padded, name) else padded.extra[name]
         assert torch.equal(spread[padded.mask], value)
         filler = spread[~padded.mask]
-        assert bool((filler == (0 if value.is_floating_point() else -1)).all())
+        whole = value.dtype in (torch.int16, torch.int32, torch.int64)
+        assert bool((filler == (-1 if whole else 0)).all())
     for b, single in enumerate(cloud.unbatch()):
         assert torch.equal(padded.points[b, : counts[b]], single.points)
 

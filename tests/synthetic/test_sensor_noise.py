@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError
+from pcdata.functional.sensor_noise import facing_depth
 from pcdata.rng import seeded
 from pcdata.structures import Camera
 from pcdata.synthetic import SensorNoise, Tabletop, look_at, tabletop
-from pcdata.synthetic.noise import facing_depth
 
 OFF = {
     "disparity_sigma": 0.0, "disparity_step": 0.0, "depth_step": 0.0, "min_range": 0.0, "max_range": math.inf,
@@ -106,14 +106,15 @@ def test_an_edge_is_both_sides_of_a_jump_and_the_rim_of_nothing() -> None:
     depth = torch.ones(1, 3, 6).double()
     depth[..., 2:] = 1.5
     depth[..., 5:] = 0.0
-    across, edge = facing_depth(depth, 0.02)
+    across = facing_depth(depth)
+    edge = SensorNoise(edge_jump=0.02).edges(depth, across)
     assert edge[0, 1].tolist() == [False, True, True, False, True, True]
     assert across[0, 1, [1, 2, 4]].tolist() == [1.5, 1.0, 0.0]
 
 
 def test_a_slanted_plane_has_no_edges() -> None:
     scene = tabletop(0, 0)
-    _, edge = facing_depth(scene.truth.depth, SensorNoise().edge_jump)
+    edge = SensorNoise().edges(scene.truth.depth, facing_depth(scene.truth.depth))
     top = (scene.truth.labels == 0)[:, 1:-1, 1:-1]
     inner = top & (scene.truth.labels[:, 2:, 1:-1] == 0) & (scene.truth.labels[:, :-2, 1:-1] == 0)
     inner &= (scene.truth.labels[:, 1:-1, 2:] == 0) & (scene.truth.labels[:, 1:-1, :-2] == 0)

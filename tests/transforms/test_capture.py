@@ -21,7 +21,7 @@ MASK = torch.arange(80).expand(3, 60, 80) % 7 != 3
 FULL = dataclasses.replace(
     SCENE,
     mask=MASK,
-    confidence=(torch.arange(3 * 60 * 80).reshape(3, 60, 80) % 251).to(torch.uint8),
+    confidence=(torch.arange(3 * 60 * 80).reshape(3, 60, 80) % 4).to(torch.uint8),
     sample_id="scene",
     provenance={"history": [{"step": "Earlier"}], "sensor": "made up"},
 )
@@ -33,6 +33,7 @@ CHAINS: dict[str, list[Any]] = {
     "crop": [Deproject(), IN_CAMERA],
     "mask, crop": [MaskDepth(near=0.3, far=1.2), Deproject(), IN_CAMERA],
     "mask, move, crop": [MaskDepth(far=1.4, drop_labels=[0]), Deproject(), ToFrame(frame="base"), IN_BASE],
+    "trusted only": [MaskDepth(min_confidence="reliable"), Deproject(), IN_CAMERA],
     "moved by a matrix": [
         MaskDepth(use_mask=False),
         Deproject(),
@@ -48,7 +49,7 @@ def frames() -> dict[str, DepthFrame]:
     camera = Camera(intrinsics=SCENE.camera.intrinsics, size=SCENE.size, distortion=lens)
     return {
         "full": FULL,
-        "bare": dataclasses.replace(SCENE, colors=None, labels=SCENE.labels, confidence=None),
+        "bare": dataclasses.replace(SCENE, colors=None, confidence=FULL.confidence),
         "one view": FULL.view(1),
         "lens": dataclasses.replace(FULL, camera=camera),
     }

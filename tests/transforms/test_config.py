@@ -133,8 +133,8 @@ def test_every_name_comes_back_as_it_was(name):
         ("- Center: {}\n---\n- Center", "p.yaml:2:1: not valid YAML: but found another document"),
         ("- Deproject\n- Deproject", "p.yaml: Compose: step 2, Deproject, takes a DepthFrame"),
         ("- \x00", "p.yaml: not valid YAML: unacceptable character"),
-        ("[" * 700, "p.yaml: not a configuration: nested too deeply"),
-        ("#" * 1_000_001, "p.yaml: 1000001 characters are no configuration"),
+        ("[" * 700, "p.yaml: cannot be read: nested too deeply"),
+        ("#" * 1_000_001, "p.yaml: 1000001 characters are no file of this kind"),
     ],
     ids=lambda value: value[:40] if len(value) < 400 else "long",
 )

@@ -63,7 +63,7 @@ def test_every_registered_transform_has_an_example():
 def test_it_does_something_on_its_example(example):
     data = example.make(COUNTS)
     results = [run(example, data, seed) for seed in range(5)]
-    watched = ("depth", "points", "colors", "normals", "labels", "meta")
+    watched = ("depth", "confidence", "points", "colors", "normals", "labels", "meta")
     seen = [{name: value for name, value in tree(result).items() if name in watched} for result in results]
     before = {name: value for name, value in tree(data).items() if name in watched}
     assert any(differences(before, after) for after in seen)
@@ -114,9 +114,11 @@ def test_a_random_step_refuses_what_is_no_generator(example):
 
 @each_random
 def test_a_random_step_refuses_too_many_or_too_few_generators(example):
+    data = example.make(COUNTS)
+    streams = 3 if isinstance(data, PointCloud) else 1  # a capture is one sample, however many views it has
     for count in (2, 4):
-        with pytest.raises(PcdataError, match=f"{count} generators were given for 3 clouds"):
-            example.transform(example.make(COUNTS), generator=[seeded(b) for b in range(count)])
+        with pytest.raises(PcdataError, match=f"{count} generators were given for {streams} clouds"):
+            example.transform(data, generator=[seeded(b) for b in range(count)])
 
 
 @each_fixed
@@ -264,11 +266,23 @@ def changed_values(value: Any) -> list[Any]:
     if isinstance(value, (int, float)):
         return [value + 1, value / 2, value * 0.9, 0.3]
     if isinstance(value, str):
-        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep"]
+        return [
+            f"{value}x",
+            "camera",
+            "all",
+            "above",
+            "none",
+            "centroid",
+            "keep",
+            "kinect_v1",
+            "hallucinated",
+            "nearest",
+            "mean",
+        ]
     if isinstance(value, T.Transform):
         return [T.Center()]
     if value is None:
-        return [0.7, 3, "base", (0.0, 0.0, 1.0)]
+        return [0.7, 3, "base", (0.0, 0.0, 1.0), "reliable"]
     items = list(value)
     if not items or isinstance(items[0], T.Transform):
         return [[*items, 1], [*items, T.Center()]]

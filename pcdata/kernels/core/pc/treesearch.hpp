@@ -89,6 +89,7 @@ class TreeSearch {
                                             Floats(leaf.z[i]) - queries.z);
       if (nearest.wants(squared)) nearest.offer(squared, Ids::same(leaf.row[i]));
     }
+    nearest.settle();
   }
 
   template <class Nearest>

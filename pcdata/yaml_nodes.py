@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
 
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, PcdataError
+from pcdata.sensors import SensorProfile
 
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
 
@@ -43,25 +45,37 @@ def yaml_text(data: Any) -> str:
         raise ConfigError(f"a configuration holds plain data only: {error}") from error
 
 
+@dataclass(frozen=True)
+class SensorChoice:
+    """The sensor that a configuration names, and the depth at which its defaults are taken."""
+
+    profile: SensorProfile
+    depth: float  # metres
+
+
 class YamlDocument:
     """One parsed file and the faults found in it so far; all are reported at once."""
 
-    def __init__(self, text: str, name: str) -> None:
+    sensor: SensorChoice | None = None  # what the word "sensor" stands for, where the file names one
+
+    def __init__(self, text: str, name: str, *, error: type[PcdataError] = ConfigError) -> None:
+        """Parse the text; ``name`` stands before every place, ``error`` is what a fault raises."""
         self.name = name
+        self.error = error
         self.faults: list[tuple[yaml.Mark | None, str]] = []
         if len(text) > _MAX_CHARACTERS:
-            raise ConfigError(f"{name}: {len(text)} characters are no configuration; the limit is {_MAX_CHARACTERS}")
+            raise error(f"{name}: {len(text)} characters are no file of this kind; the limit is {_MAX_CHARACTERS}")
         try:
             # Aliases let a small file expand without bound, and no configuration needs them.
             alias = next((token for token in yaml.scan(text, _Loader) if isinstance(token, yaml.AliasToken)), None)
             self.root: yaml.Node | None = None if alias else yaml.compose(text, _Loader)
-        except yaml.MarkedYAMLError as error:
-            self.fault_at(error.problem_mark, f"not valid YAML: {error.problem}")
+        except yaml.MarkedYAMLError as fault:
+            self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem}")
             self.raise_faults()
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{name}: not valid YAML: {error}") from error
-        except RecursionError as error:
-            raise ConfigError(f"{name}: not a configuration: nested too deeply") from error
+        except yaml.YAMLError as fault:
+            raise error(f"{name}: not valid YAML: {fault}") from fault
+        except RecursionError as fault:
+            raise error(f"{name}: cannot be read: nested too deeply") from fault
         if alias is not None:
             self.fault_at(alias.start_mark, "YAML aliases (*name) are not allowed; write the value out")
             self.raise_faults()
@@ -75,11 +89,11 @@ class YamlDocument:
         self.faults.append((mark, message))
 
     def raise_faults(self) -> None:
-        """Raise one ConfigError with every fault in file order, if there are any."""
+        """Raise one error with every fault in file order, if there are any."""
         if not self.faults:
             return
         ordered = sorted(self.faults, key=lambda fault: (fault[0].line, fault[0].column) if fault[0] else (-1, -1))
-        raise ConfigError("\n".join(f"{self._place(mark)}: {message}" for mark, message in ordered))
+        raise self.error("\n".join(f"{self._place(mark)}: {message}" for mark, message in ordered))
 
     def _place(self, mark: yaml.Mark | None) -> str:
         return f"{self.name}:{mark.line + 1}:{mark.column + 1}" if mark else self.name

@@ -1,0 +1,40 @@
+"""Finding and checking a calibration: depth quality on a plane, intrinsics from boards, camera to robot."""
+
+from pcdata.calibration.board_images import read_board_images
+from pcdata.calibration.board_pose import locate_board
+from pcdata.calibration.boards import Board, BoardView, Charuco, Chessboard, parse_board
+from pcdata.calibration.findings import Finding
+from pcdata.calibration.hand_eye import HandEyeLimits, HandEyeResult, calibrate_hand_eye
+from pcdata.calibration.intrinsics import IntrinsicsLimits, IntrinsicsResult, calibrate_intrinsics, find_board
+from pcdata.calibration.plane_check import PlaneCheck, PlaneLimits, check_plane
+from pcdata.calibration.refine import CameraRefinement, Refinement, refine_extrinsics
+from pcdata.calibration.robot_poses import RobotPoses, read_robot_poses
+from pcdata.io.calibration import Calibration, Evidence
+
+__all__ = [
+    "Board",
+    "BoardView",
+    "Calibration",
+    "CameraRefinement",
+    "Charuco",
+    "Chessboard",
+    "Evidence",
+    "Finding",
+    "HandEyeLimits",
+    "HandEyeResult",
+    "IntrinsicsLimits",
+    "IntrinsicsResult",
+    "PlaneCheck",
+    "PlaneLimits",
+    "Refinement",
+    "RobotPoses",
+    "calibrate_hand_eye",
+    "calibrate_intrinsics",
+    "check_plane",
+    "find_board",
+    "locate_board",
+    "parse_board",
+    "read_board_images",
+    "read_robot_poses",
+    "refine_extrinsics",
+]

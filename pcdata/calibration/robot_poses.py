@@ -1,0 +1,172 @@
+"""Robot and target poses of a hand-eye calibration, and the files that hold them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+import torch
+import yaml
+from torch import Tensor
+
+from pcdata.errors import CalibrationError, ShapeError, near_matches
+from pcdata.functional import rigid
+from pcdata.io.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
+from pcdata.io.files import read_text
+from pcdata.io.pose_nodes import POSE_KEYS, known_entries, matrix_from_node, pose_from_entries
+from pcdata.yaml_nodes import YamlDocument
+
+ROBOT, TARGET, IMAGE = "base_from_gripper", "camera_from_target", "image"
+_PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_UNIT_QUATERNION = 1e-3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RobotPoses:
+    """N moments in which the robot stood still and the camera saw the target; metres."""
+
+    names: tuple[str, ...]
+    base_from_gripper: Tensor  # (N, 4, 4) float64
+    camera_from_target: Tensor  # (N, 4, 4) float64
+
+    def __post_init__(self) -> None:
+        for name in (ROBOT, TARGET):
+            poses = getattr(self, name)
+            if poses.shape != (len(self.names), 4, 4) or poses.dtype != torch.float64:
+                raise ShapeError(
+                    f"RobotPoses: {name} must be ({len(self.names)}, 4, 4) float64, one per name, got {poses.dtype} "
+                    f"{tuple(poses.shape)}"
+                )
+            rigid.check_rigid(f"RobotPoses: {name}", poses, tolerance=RIGID_TOLERANCE)
+        if len(set(self.names)) != len(self.names):
+            raise CalibrationError(f"RobotPoses: names must be unique, got {', '.join(self.names)}")
+
+
+def read_robot_poses(
+    path: str | os.PathLike[str],
+    *,
+    locate: Callable[[Path], Tensor] | None = None,
+) -> RobotPoses:
+    """Read a YAML, JSON or CSV file of poses; ``docs/calibration.md`` describes them.
+
+    Args:
+        path: the file; its suffix says which kind it is.
+        locate: returns ``camera_from_target`` of an image, for entries that name an ``image`` in its place.
+
+    Raises:
+        CaptureError: the file is missing or not text.
+        CalibrationError: every fault in it, with its place.
+    """
+    file = Path(path)
+    text = read_text("read_robot_poses", file)
+    if file.suffix.lower() == ".csv":
+        return _from_csv(text, str(path))
+    if file.suffix.lower() == ".json":
+        text = text.replace("\t", " ")  # JSON is YAML but for tabs, which it has between values only
+    elif file.suffix.lower() not in (".yaml", ".yml"):
+        raise CalibrationError(f"{path}: poses are read from .yaml, .json and .csv, not {file.suffix or 'such a file'}")
+    return _from_yaml(text, str(path), file.parent, locate)
+
+
+def _from_yaml(text: str, name: str, folder: Path, locate: Callable[[Path], Tensor] | None) -> RobotPoses:
+    document = YamlDocument(text, name, error=CalibrationError)
+    top = known_entries(document, document.root, "a file of poses", required=("unit", "poses"))
+    if "unit" in top and (unit := document.plain(top["unit"][1])) != "metre":
+        document.fault(top["unit"][1], f"unit must be 'metre', got {unit!r}; convert every translation to metres")
+    names, robot, target = [], [], []
+    for index, node in enumerate(document.sequence(top["poses"][1], "poses") if "poses" in top else []):
+        entries = known_entries(document, node, f"pose {index}", required=(ROBOT,), optional=("name", TARGET, IMAGE))
+        names.append(str(document.plain(entries["name"][1])) if "name" in entries else str(index))
+        if ROBOT in entries:
+            robot.append(_read_pose(document, entries[ROBOT][1], f"pose {index}: {ROBOT}"))
+        if (TARGET in entries) == (IMAGE in entries):
+            document.fault(node, f"pose {index}: give either {TARGET} or {IMAGE}")
+        elif TARGET in entries:
+            target.append(_read_pose(document, entries[TARGET][1], f"pose {index}: {TARGET}"))
+        elif locate is None:
+            document.fault(entries[IMAGE][0], f"pose {index}: an {IMAGE} needs a board and a calibrated camera with it")
+        else:
+            target.append(locate(folder / str(document.plain(entries[IMAGE][1]))))
+    document.raise_faults()
+    return _joined(name, names, cast("list[Tensor]", robot), cast("list[Tensor]", target))
+
+
+def _read_pose(document: YamlDocument, node: yaml.Node, what: str) -> Tensor | None:
+    """Read four rows of four numbers, or a mapping as in a calibration file."""
+    if not isinstance(node, yaml.SequenceNode):
+        entries = known_entries(document, node, what, optional=POSE_KEYS)
+        return pose_from_entries(document, node, entries, what, partial(_check_pose, what))
+    pose = matrix_from_node(document, node, what)
+    if pose is not None:
+        try:
+            _check_pose(what, pose)
+        except ValueError as error:
+            document.fault(node, str(error))
+    return pose
+
+
+def _check_pose(what: str, pose: Tensor) -> None:
+    rigid.check_rigid(what, pose, tolerance=RIGID_TOLERANCE)
+    length = float(pose[:3, 3].norm())
+    if length > LARGEST_TRANSLATION:
+        raise CalibrationError(f"{what}: the translation is {length:g} m long; is it in millimetres? Write metres")
+
+
+def _from_csv(text: str, name: str) -> RobotPoses:
+    """Read a header and one line per pose: positions in metres and quaternions in x y z w order."""
+    lines = list(csv.reader(io.StringIO(text)))
+    header = [column.strip() for column in lines[0]] if lines else []
+    wanted = [f"{pose}.{part}" for pose in (ROBOT, TARGET) for part in _PARTS]
+    faults = [f"{name}:1: column {column!r} is missing" for column in wanted if column not in header]
+    known = ["name", *wanted]
+    faults += [f"{name}:1: no such column {c!r}{near_matches(c, known)}" for c in header if c not in known]
+    faults += [f"{name}:1: column {c!r} is given twice" for c in sorted(set(header)) if header.count(c) > 1]
+    if faults:
+        raise CalibrationError("\n".join(faults))
+    names: list[str] = []
+    robot: list[Tensor] = []
+    target: list[Tensor] = []
+    for number, line in enumerate(lines[1:], start=2):
+        if not any(cell.strip() for cell in line):
+            continue
+        if len(line) != len(header):
+            faults.append(f"{name}:{number}: {len(line)} values for {len(header)} columns")
+            continue
+        row = dict(zip(header, (cell.strip() for cell in line)))
+        names.append(row.get("name") or str(len(names)))
+        for poses, pose in ((robot, ROBOT), (target, TARGET)):
+            try:
+                poses.append(_pose_of_row(f"{name}:{number}: {pose}", [row[f"{pose}.{part}"] for part in _PARTS]))
+            except ValueError as error:
+                faults.append(str(error))
+    if faults:
+        raise CalibrationError("\n".join(faults))
+    return _joined(name, names, robot, target)
+
+
+def _pose_of_row(what: str, cells: Sequence[str]) -> Tensor:
+    try:
+        values = torch.tensor([float(cell) for cell in cells], dtype=torch.float64)
+    except ValueError as error:
+        raise CalibrationError(f"{what}: must be seven numbers: {error}") from error
+    length = float(values[3:].norm())
+    if not abs(length - 1) <= _UNIT_QUATERNION:
+        raise CalibrationError(f"{what}: the quaternion must have length 1, has {length:.6g}")
+    pose = rigid.from_rotation_translation(rigid.rotation_from_quaternion(values[3:]), values[:3])
+    _check_pose(what, pose)
+    return pose
+
+
+def _joined(name: str, names: list[str], robot: list[Tensor], target: list[Tensor]) -> RobotPoses:
+    if not names:
+        raise CalibrationError(f"{name}: holds no pose")
+    if len(set(names)) != len(names):
+        twice = sorted({one for one in names if names.count(one) > 1})
+        raise CalibrationError(f"{name}: every pose needs a name of its own; {', '.join(twice)} comes more than once")
+    return RobotPoses(names=tuple(names), base_from_gripper=torch.stack(robot), camera_from_target=torch.stack(target))

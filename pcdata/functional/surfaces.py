@@ -1,0 +1,229 @@
+"""What one view saw, as smoothed surface samples, and how the samples of another view compare with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.depth import project_points
+from pcdata.functional.depth_planes import MIN_COSINE, DepthPlanes, fit_depth_planes
+from pcdata.functional.neighbors import ball_query, knn
+
+_FLOOR_SIGMA = 5e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_FLOOR_NORMAL_SIGMA = 0.005  # radians, 0.3 degrees; likewise for normals
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Surface samples in the frame of their own view."""
+
+    points: Tensor  # (N, 3) float64
+    normals: Tensor  # (N, 3) float64 unit
+    sigma: Tensor  # (N,) float64 metres along the normal
+    normal_sigma: Tensor  # (N,) float64 radians, of the normal along each tangent
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Samples of another view that have a partner on this one; all in this view's frame."""
+
+    row: Tensor  # (M,) int64 rows of the samples asked for
+    offset: Tensor  # (M, 3) float64 metres, sample - its partner on this surface
+    normals: Tensor  # (M, 3) float64 unit, of this surface
+    sigma: Tensor  # (M,) float64 metres, of this surface along its normal
+    normal_sigma: Tensor  # (M,) float64 radians, of these normals along each tangent
+    num_visible: int  # samples that this view could see: inside its image, in front of nothing that hides them
+
+
+class Surface(Protocol):
+    """One view of the scene."""
+
+    @property
+    def samples(self) -> Samples:
+        """Samples spread over the surface."""
+        ...
+
+    @property
+    def knows_visibility(self) -> bool:
+        """Whether the view can tell a sample that it could not see from one that it sees elsewhere."""
+        ...
+
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
+        """Compare samples (N, 3), given in this view's frame, with this surface."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSurface:
+    """A depth image: partners are found by projection, and what this camera could not see is left out."""
+
+    planes: DepthPlanes
+    intrinsics: Tensor  # (3, 3) float64
+    distortion: Tensor | None
+    size: tuple[int, int]
+    samples: Samples
+    knows_visibility: bool = True
+
+    @classmethod
+    def from_depth(
+        cls,
+        depth: Tensor,  # (H, W) float32 metres, 0 = no reading
+        intrinsics: Tensor,  # (3, 3) pixels
+        distortion: Tensor | None = None,  # (D,)
+        *,
+        max_samples: int,
+    ) -> DepthSurface:
+        """Fit planes to the windows of a depth image, and sample them where they are worth most.
+
+        Every direction that surfaces face gets an equal share, so the table does not outvote the sides of the objects.
+        """
+        planes = fit_depth_planes(depth, intrinsics, distortion)
+        rows = (planes.depth > 0).flatten().nonzero().squeeze(1)
+        chosen = evenly_by_direction(planes.normals.reshape(-1, 3)[rows], max_samples, planes.is_flat.flatten()[rows])
+        rows = rows[chosen]
+        samples = Samples(
+            planes.points.reshape(-1, 3)[rows],
+            planes.normals.reshape(-1, 3)[rows],
+            planes.sigma.flatten()[rows].clamp(min=_FLOOR_SIGMA),
+            planes.normal_sigma.flatten()[rows].clamp(min=_FLOOR_NORMAL_SIGMA),
+        )
+        return cls(planes, intrinsics.double(), distortion, (depth.shape[0], depth.shape[1]), samples)
+
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
+        """Project samples into the image and measure them against the plane of the window they fall into."""
+        planes = self.planes
+        pixels, z = project_points(
+            points,
+            intrinsics=self.intrinsics[None],
+            distortion=None if self.distortion is None else self.distortion[None],
+        )
+        cell = ((pixels - planes.first) / planes.stride).round()
+        height, width = planes.depth.shape
+        inside = ((cell >= 0) & (cell < cell.new_tensor([width, height]))).all(1)
+        # The far side of an object is turned away, however thin the object is.
+        faces = -(points * normals).sum(1) > MIN_COSINE * points.norm(dim=1)
+        rows = (inside & faces).nonzero().squeeze(1)
+        column, line = cell[rows].long().unbind(1)
+        index = line * width + column
+        seen = planes.depth.flatten()[index]
+        rows, index, seen = rows[seen > 0], index[seen > 0], seen[seen > 0]
+        # Behind the surface by more than a calibration could be wrong: hidden by something nearer.
+        visible = z[rows] - seen < 2 * max_distance
+        rows, index, seen = rows[visible], index[visible], seen[visible]
+        plane = planes.coefficients.reshape(-1, 3)[index]
+        normal = planes.normals.reshape(-1, 3)[index]
+        reached = (plane * points[rows]).sum(1, keepdim=True)  # 1 on the plane, along the sample's own ray
+        residual = (1 - reached[:, 0]) / plane.norm(dim=1)
+        offset = normal * residual[:, None]
+        near = (reached[:, 0] > 0) & (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
+        near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
+        index = index[near]
+        return Matches(
+            rows[near],
+            offset[near],
+            normal[near],
+            planes.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA),
+            planes.normal_sigma.flatten()[index].clamp(min=_FLOOR_NORMAL_SIGMA),
+            len(rows),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CloudSurface:
+    """A bare cloud: partners are nearest neighbours, and visibility is unknown."""
+
+    patches: Samples  # the targets, denser than the samples
+    samples: Samples
+    knows_visibility: bool = False
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Tensor,  # (N, 3) float32 metres
+        viewpoint: Tensor | None = None,  # (N, 3) or (3,): the normals face it
+        *,
+        max_samples: int,
+        radius: float = 0.012,
+        max_neighbors: int = 100,
+    ) -> CloudSurface:
+        """Average the neighbourhoods of evenly spaced rows; four times as many patches as samples are kept."""
+        rows = evenly(torch.arange(len(points), device=points.device), 4 * max_samples)
+        index, _, count = ball_query(points, radius=radius, max_neighbors=max_neighbors, queries=points[rows])
+        enough = count >= 8
+        rows, index, count = rows[enough], index[enough], count[enough]
+        center = points[rows].double()
+        found = index < len(points)
+        offset = points.double()[torch.where(found, index, rows[:, None])] - center[:, None]
+        number = count.double()[:, None]
+        mean = offset.sum(1) / number
+        offset = torch.where(found[..., None], offset - mean[:, None], 0.0)
+        values, vectors = torch.linalg.eigh(offset.mT @ offset / number[..., None])
+        normals = vectors[..., 0]
+        if viewpoint is not None:
+            toward = viewpoint.double().expand(len(points), 3)[rows] - center
+            normals = torch.where((normals * toward).sum(1, keepdim=True) < 0, -normals, normals)
+        roughness = values[:, 0].clamp(min=0).sqrt()
+        flat = roughness <= torch.maximum(2 * roughness.median(), roughness.new_tensor(3e-4)) if len(rows) else enough
+        sigma = roughness / number[:, 0].sqrt()
+        reach = values[:, 1].clamp(min=1e-12).sqrt()  # standard deviation along the narrower tangent
+        patches = Samples(
+            (center + mean)[flat],
+            normals[flat],
+            sigma[flat].clamp(min=_FLOOR_SIGMA),
+            (sigma / reach)[flat].clamp(min=_FLOOR_NORMAL_SIGMA),
+        )
+        kept = evenly(torch.arange(len(patches.points), device=points.device), max_samples)
+        picked = (patches.points, patches.normals, patches.sigma, patches.normal_sigma)
+        return cls(patches, Samples(*(values[kept] for values in picked)))
+
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
+        """Measure samples against the plane of the nearest patch; the side that a normal points to is ignored."""
+        index, distance = knn(self.patches.points.float(), k=1, queries=points.float())
+        rows = (distance[:, 0] < max_distance).nonzero().squeeze(1)
+        index = index[rows, 0]
+        normal = self.patches.normals[index]
+        cosine = (normal * normals[rows]).sum(1)
+        alike = cosine.abs() > torch.cos(torch.tensor(max_angle)).item()
+        rows, index = rows[alike], index[alike]
+        normal = torch.where(cosine[alike, None] < 0, -normal[alike], normal[alike])
+        patches = self.patches
+        offset = points[rows] - patches.points[index]
+        return Matches(rows, offset, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
+
+
+def evenly(rows: Tensor, count: int) -> Tensor:
+    """Return at most ``count`` of the rows at equal steps, the first included."""
+    if len(rows) <= count:
+        return rows
+    return rows[torch.arange(count, device=rows.device) * len(rows) // count]
+
+
+def evenly_by_direction(
+    normals: Tensor,  # (N, 3) unit
+    count: int,
+    preferred: Tensor,  # (N,) bool
+) -> Tensor:  # (M,) int64 ascending rows, M <= count
+    """Choose at most ``count`` rows so that the directions share them equally, evenly spaced within each.
+
+    A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0. Where the preferred rows
+    of a direction fill its share, it takes only those.
+
+    Source: normal-space sampling, Rusinkiewicz & Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
+    """
+    signs = torch.where(normals.abs() < 0.4, 0.0, normals.sign()).long() + 1
+    box = (signs * signs.new_tensor([9, 3, 1])).sum(1)
+    sizes = torch.bincount(box, minlength=27)
+    # The largest equal share: boxes with fewer rows leave theirs to the others.
+    share, left, waiting = 0, count, int((sizes > 0).sum())
+    for size in sorted(size for size in sizes.tolist() if size):
+        share = max(share, left // waiting)
+        left, waiting = left - min(size, share), waiting - 1
+    chosen = [normals.new_empty(0, dtype=torch.int64)]
+    for one in sizes.nonzero().squeeze(1).tolist():
+        rows = (box == one).nonzero().squeeze(1)
+        better = rows[preferred[rows]]
+        chosen.append(evenly(better if len(better) >= share else rows, share))
+    return torch.cat(chosen).sort().values

@@ -1,0 +1,89 @@
+"""Which of several views is out of place, told from how each pair of them fits together."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.functional import rigid
+from pcdata.functional.small_motions import twist_from_motion
+from pcdata.functional.view_alignment import ViewAlignment
+
+# What is unknown about a direction that the surfaces do not determine, in metres and radians: far beyond any limit.
+_UNKNOWN = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """The views that agree, those that do not, and where each lies relative to one of those that agree."""
+
+    wrong: tuple[int, ...]  # views whose removal makes the rest agree
+    candidates: tuple[int, ...]  # where that is ambiguous: one or more of these is wrong; else empty
+    reference: int  # of the views that agree, the one that the others are best measured against
+    twists: Tensor  # (V, 6) float64 about the alignment's pivot: what would bring each view onto the reference
+    covariance: Tensor  # (V, 6, 6) float64; enormous along directions that nothing determines
+
+
+def find_consensus(
+    alignment: ViewAlignment, *, max_shift: float, max_angle: float, reference: int | None = None
+) -> Consensus:
+    """Find the fewest views whose removal leaves a majority in which every two agree within the limits.
+
+    Of equally few, those that leave the closest agreement are named, if they do so at least twice as well as any
+    other choice; otherwise all that would do are candidates. Two views can never be told apart.
+
+    Args:
+        alignment: the joint fit of all views.
+        max_shift: metres, between two views at the pivot.
+        max_angle: radians, between two views.
+        reference: the view to measure against; None = of those that agree, the one that makes the rest most certain.
+    """
+    num_views = len(alignment.twists)
+    apart = _apart(alignment.twists, max_shift, max_angle)
+    wrong, candidates = _named(apart)
+    agreeing = [view for view in range(num_views) if view not in wrong]
+    covariance = alignment.covariance + _UNKNOWN**2 * alignment.unobservable.T @ alignment.unobservable
+    blocks = covariance.reshape(num_views, 6, num_views, 6).permute(0, 2, 1, 3)
+
+    def relative(reference: int) -> Tensor:
+        own, other = blocks[range(num_views), range(num_views)], blocks[reference, reference]
+        return own + other - blocks[:, reference] - blocks[reference]
+
+    if reference is None:
+        reference = min(agreeing, key=lambda view: float(relative(view).diagonal(dim1=1, dim2=2).sum()))
+    return Consensus(
+        wrong=wrong,
+        candidates=candidates,
+        reference=reference,
+        twists=twist_from_motion(rigid.invert_rigid(alignment.motions[reference]) @ alignment.motions, alignment.pivot),
+        covariance=relative(reference),
+    )
+
+
+def _apart(twists: Tensor, max_shift: float, max_angle: float) -> Tensor:  # (V, V), 1 = just within the limits
+    difference = twists[:, None] - twists[None]
+    return torch.maximum(difference[..., 3:].norm(dim=-1) / max_shift, difference[..., :3].norm(dim=-1) / max_angle)
+
+
+def _named(apart: Tensor) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return (wrong, candidates)."""
+    views = range(len(apart))
+    for size in range((len(apart) - 1) // 2 + 1):  # a majority has to stay
+        left = {
+            removed: float(apart[_rest(apart, removed)][:, _rest(apart, removed)].max())
+            for removed in itertools.combinations(views, size)
+        }
+        fitting = sorted((removed for removed in left if left[removed] <= 1), key=left.__getitem__)
+        if not fitting:
+            continue
+        if len(fitting) == 1 or left[fitting[0]] < left[fitting[1]] / 2:
+            return fitting[0], ()
+        return (), tuple(sorted({view for removed in fitting for view in removed}))
+    return (), tuple(views)
+
+
+def _rest(apart: Tensor, removed: tuple[int, ...]) -> list[int]:
+    return [view for view in range(len(apart)) if view not in removed]

@@ -1,0 +1,90 @@
+"""The word ``sensor`` in a configuration: a field takes its value from the profile of the sensor that was used.
+
+``sensor: realsense_d435`` at the top names it, ``sensor: {name: realsense_d435, depth: 0.6}`` also says the depth in
+metres at which the defaults are taken (otherwise the profile's reference depth). A step's field marked
+:class:`FromSensor` may then say ``sensor``. The word is replaced while the file is read: steps, fingerprints and
+histories hold the number.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, get_args, get_origin
+
+import yaml
+
+from pcdata.errors import ConfigError
+from pcdata.sensors import sensor_profile
+from pcdata.transforms.base import REGISTRY, Transform, field_types
+from pcdata.transforms.fields import FromSensor
+from pcdata.yaml_nodes import SensorChoice, YamlDocument
+
+SENSOR = "sensor"
+_DIGITS = 3  # significant: no figure of a profile is known better, and libm's last digits differ between machines
+
+
+def sensor_from_node(document: YamlDocument, node: yaml.Node) -> SensorChoice | None:
+    """Read which sensor a file names; faults are noted."""
+    if isinstance(node, yaml.MappingNode):
+        entries = document.mapping(node, SENSOR)
+        for key, (place, _) in entries.items():
+            if key not in ("name", "depth"):
+                document.fault(place, f"sensor.{key}: no such setting; known: name, depth")
+        if "name" not in entries:
+            document.fault(node, "sensor.name: Field required")
+            return None
+        name_node, depth_node = entries["name"][1], entries["depth"][1] if "depth" in entries else None
+    else:
+        name_node, depth_node = node, None
+    name = document.plain(name_node)
+    if not isinstance(name, str):
+        document.fault(name_node, f"sensor must be a name that `pcdata profiles` lists (got {name!r})")
+        return None
+    try:
+        profile = sensor_profile(name)
+    except ConfigError as error:
+        document.fault(name_node, str(error))
+        return None
+    if depth_node is None:
+        return SensorChoice(profile, profile.reference_depth)
+    depth = document.plain(depth_node)
+    if isinstance(depth, bool) or not isinstance(depth, (int, float)) or not 0 < depth < math.inf:
+        document.fault(depth_node, f"sensor.depth: must be a positive number of metres (got {depth!r})")
+        return None
+    return SensorChoice(profile, float(depth))
+
+
+def is_sensor_word(node: yaml.Node, declared: Any) -> bool:
+    """Say whether a field's value is the word ``sensor`` and the field may say so."""
+    return isinstance(node, yaml.ScalarNode) and node.value == SENSOR and _mark(declared) is not None
+
+
+def sensor_value(document: YamlDocument, node: yaml.Node, cls: type[Transform], key: str) -> float | str | None:
+    """Return what the word ``sensor`` stands for in this field; faults are noted."""
+    mark = _mark(_types(cls)[key])
+    assert mark is not None  # is_sensor_word
+    if document.sensor is None:
+        document.fault(
+            node, f"{cls.__name__}.{key}: no sensor is known; name one in the section {SENSOR!r}, or give a value"
+        )
+        return None
+    value = mark.figure(document.sensor.profile, document.sensor.depth)
+    return value if isinstance(value, str) else float(f"{value:.{_DIGITS}g}")
+
+
+def sensor_hint(value: Any) -> str:
+    """Return what to add to the fault of a value: which fields may say ``sensor``, where this one does and may not."""
+    if value != SENSOR:
+        return ""
+    marked = [f"{name}.{key}" for name, cls in REGISTRY.items() for key, kind in _types(cls).items() if _mark(kind)]
+    return f"; no sensor profile gives this field, only {', '.join(sorted(marked))}"
+
+
+def _mark(declared: Any) -> FromSensor | None:
+    if get_origin(declared) is not Annotated:
+        return None
+    return next((entry for entry in get_args(declared)[1:] if isinstance(entry, FromSensor)), None)
+
+
+def _types(cls: type[Transform]) -> dict[str, Any]:
+    return field_types(cls)  # type: ignore[arg-type]

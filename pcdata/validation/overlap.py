@@ -1,0 +1,203 @@
+"""Do the cameras agree? The gap between their surfaces, how far each is out of place, and which one is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import ConfigError, ShapeError
+from pcdata.functional.small_motions import motion_from_twist
+from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
+from pcdata.functional.view_consensus import Consensus, find_consensus
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
+from pcdata.validation.surfaces import surfaces_of
+
+_MIN_MATCHES = 100  # samples; a smaller overlap says nothing about six unknowns
+_MAX_SAMPLES = 4000  # per view and capture: what two cores align well within a second
+_MIN_MEETING = 0.3  # of the samples that the other camera could see, the share that it sees within reach
+
+
+def verify_overlap(
+    *captures: DepthFrame | PointCloud,
+    names: Sequence[str] | None = None,
+    limits: OverlapLimits | None = None,
+    max_samples: int = _MAX_SAMPLES,
+) -> OverlapResult:
+    """Say whether the cameras of a rig see one and the same surface, and which of them does not.
+
+    Every view is sampled at small fitted planes, evenly over the directions they face. Each pair gives the distances
+    from the samples of the one to the planes of the other; where depth images are at hand only where the other camera
+    could see them. Since a camera that slid along the table leaves those distances small, all views are also aligned
+    together by ICP, and what that moves is each camera's error, with its uncertainty from the covariance of the fit.
+
+    Args:
+        captures: one capture or several of the same, unmoved cameras: frames of V >= 2 views with poses, or clouds
+            with one cloud per view in a common frame. More captures add evidence.
+        names: one per camera; None = "camera 0", "camera 1", ...
+        limits: what passes and what fails; None = the defaults.
+        max_samples: per view and capture.
+
+    Raises:
+        ShapeError: fewer than two views, or captures with different numbers of them.
+        FrameError: the views are not in a common frame, or their poses are unknown or differ between the captures.
+        UnitError: a cloud is not in metres.
+        ConfigError: not one name per camera.
+    """
+    where = "verify_overlap"
+    limits = OverlapLimits() if limits is None else limits
+    surfaces, poses = zip(*(surfaces_of(where, capture, max_samples=max_samples) for capture in captures))
+    num_views = len(poses[0])
+    for position, pose in enumerate(poses):
+        if pose.shape != poses[0].shape or not torch.allclose(pose, poses[0], rtol=0, atol=1e-9):
+            raise ShapeError(f"{where}: capture {position} has other cameras or poses than capture 0; give one rig")
+    names = tuple(f"camera {view}" for view in range(num_views)) if names is None else tuple(names)
+    if len(names) != num_views or len(set(names)) != num_views:
+        raise ConfigError(f"{where}: give one name per camera, all different: {num_views} cameras, got {names}")
+    alignment = align_views(surfaces, poses[0])
+    return judge_alignment(alignment, names, limits)
+
+
+def judge_alignment(
+    alignment: ViewAlignment, names: Sequence[str], limits: OverlapLimits, *, reference: int | None = None
+) -> OverlapResult:
+    """Turn a joint fit of the views into numbers per pair and per camera, a verdict and advice.
+
+    Args:
+        alignment: the joint fit.
+        names: one per view.
+        limits: what passes and what fails.
+        reference: the view that the others are compared with; None = the best known of those that agree.
+    """
+    consensus = find_consensus(
+        alignment,
+        max_shift=limits.shift[0],
+        max_angle=math.radians(limits.rotation_degrees[0]),
+        reference=reference,
+    )
+    pairs = tuple(
+        _pair(one, _opposite(alignment.before, one), names, limits)
+        for one in alignment.before
+        if one.source < one.target
+    )
+    suspects = consensus.wrong or consensus.candidates
+    cameras = tuple(
+        _camera(view, alignment, consensus, names, limits, is_suspect=view in suspects) for view in range(len(names))
+    )
+    return OverlapResult(
+        pairs=pairs,
+        cameras=cameras,
+        wrong=tuple(names[view] for view in consensus.wrong),
+        candidates=tuple(names[view] for view in consensus.candidates),
+        reference=names[consensus.reference],
+        limits=limits,
+    )
+
+
+def _pair(fit: PairFit, back: PairFit, names: Sequence[str], limits: OverlapLimits) -> PairOverlap:
+    residual = torch.cat([fit.residual, -back.residual])
+    size = residual.abs()
+    visible = fit.num_visible + back.num_visible
+    enough = len(residual) >= _MIN_MATCHES
+    values = size.double().quantile(size.new_tensor([0.5, 0.9])).tolist() if enough else [math.nan, math.nan]
+    meets = len(residual) / visible if visible else 0.0
+    apart = visible >= _MIN_MATCHES and meets < _MIN_MEETING and fit.knows_visibility
+    if apart:
+        verdict = "fail"
+    elif not enough:
+        verdict = "not measurable"
+    else:
+        verdict = limits.verdict(values[0], limits.residual)
+    return PairOverlap(
+        first=names[fit.source],
+        second=names[fit.target],
+        overlap=len(residual) / max(fit.num_samples + back.num_samples, 1),
+        meeting=meets if fit.knows_visibility else None,
+        num_samples=len(residual),
+        median=values[0],
+        p90=values[1],
+        mean=_trimmed_mean(residual) if enough else math.nan,
+        verdict=verdict,
+        histogram=tuple(torch.histc(residual.float(), 60, -0.015, 0.015).long().tolist()),
+    )
+
+
+def _camera(
+    view: int,
+    alignment: ViewAlignment,
+    consensus: Consensus,
+    names: Sequence[str],
+    limits: OverlapLimits,
+    *,
+    is_suspect: bool,
+) -> CameraOverlap:
+    seen = [fit.points for fit in alignment.after if view in (fit.source, fit.target)]
+    points = torch.cat(seen)
+    center = points.median(0).values if len(points) else alignment.pivot
+    motion = motion_from_twist(consensus.twists[view], alignment.pivot)
+    shift = motion[:3, :3] @ center + motion[:3, 3] - center
+    angle = float(consensus.twists[view, :3].norm())
+    covariance = _at(center - alignment.pivot, consensus.covariance[view])
+    shift_sigma, unknown_shifts = _spread(covariance[3:, 3:], limits.max_shift_sigma)
+    angle_sigma, unknown_turns = _spread(covariance[:3, :3], math.radians(limits.max_rotation_sigma_degrees))
+    degrees = math.degrees(angle)
+    unknown = (
+        *(f"shift along {_words(direction)}" for direction in unknown_shifts),
+        *(f"turn about {_words(direction)}" for direction in unknown_turns),
+    )
+    verdict = limits.worse(
+        limits.verdict(float(shift.norm()), limits.shift), limits.verdict(degrees, limits.rotation_degrees)
+    )
+    if verdict == "pass" and unknown:
+        verdict = "not measurable"
+    if is_suspect and consensus.candidates and verdict in ("pass", "not measurable"):
+        verdict = "warn"  # it may be this one as well as the other
+    return CameraOverlap(
+        name=names[view],
+        shift=float(shift.norm()),
+        shift_vector=tuple(shift.tolist()),
+        shift_sigma=shift_sigma,
+        rotation_degrees=degrees,
+        rotation_sigma_degrees=math.degrees(angle_sigma),
+        center=tuple(center.tolist()),
+        correction=motion.tolist(),
+        unmeasurable=unknown,
+        verdict=verdict,
+    )
+
+
+def _opposite(fits: Sequence[PairFit], one: PairFit) -> PairFit:
+    return next(fit for fit in fits if (fit.source, fit.target) == (one.target, one.source))
+
+
+def _trimmed_mean(residual: Tensor) -> float:
+    """Return the mean of the central 80 per cent."""
+    cut = len(residual) // 10
+    ordered = residual.sort().values
+    return float(ordered[cut : len(ordered) - cut].mean())
+
+
+def _at(arm: Tensor, covariance: Tensor) -> Tensor:
+    """Move the covariance of a twist from its pivot to pivot + arm: t' = t + w x arm."""
+    x, y, z = arm.tolist()
+    moved = torch.eye(6, dtype=torch.float64, device=covariance.device)
+    moved[3:, :3] = moved.new_tensor([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    return moved @ covariance @ moved.T
+
+
+def _spread(covariance: Tensor, limit: float) -> tuple[float, list[Tensor]]:
+    """Return the largest standard deviation, infinite where unknown, and the directions beyond the limit."""
+    values, vectors = torch.linalg.eigh((covariance + covariance.T) / 2)
+    sigma = values.clamp(min=0).sqrt()
+    beyond = [vectors[:, k] for k in range(3) if float(sigma[k]) > limit]
+    largest = float(sigma[-1])
+    return (largest if largest < 0.1 else math.inf), beyond
+
+
+def _words(direction: Tensor) -> str:
+    leading = direction[direction.abs().argmax()]
+    x, y, z = (float(value) + 0.0 for value in direction * leading.sign())
+    return f"({x:.2f}, {y:.2f}, {z:.2f})"

@@ -1,0 +1,162 @@
+"""What the overlap of several cameras says: numbers, verdicts, advice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pcdata.errors import ConfigError
+
+# From best to worst: what could not be measured is no pass, but nothing was found wrong either.
+VERDICTS = ("pass", "not measurable", "warn", "fail")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlapLimits:
+    """Pairs are (last value that passes, last value that does not fail); in between it warns.
+
+    0.25 and 0.4 degrees move a point at 0.7 m, the reach of a table-top workspace, by 3 and 5 mm.
+    """
+
+    residual: tuple[float, float] = (0.003, 0.005)  # metres, median gap of a pair
+    shift: tuple[float, float] = (0.003, 0.005)  # metres, of a camera at the scene
+    rotation_degrees: tuple[float, float] = (0.25, 0.4)  # of a camera
+    max_shift_sigma: float = 0.001  # metres; half the distance between pass and fail
+    max_rotation_sigma_degrees: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("residual", "shift", "rotation_degrees"):
+            passes, fails = getattr(self, name)
+            if not 0 < passes <= fails < math.inf:
+                raise ConfigError(
+                    f"OverlapLimits: {name} must be (pass, fail) with 0 < pass <= fail, got {passes, fails}"
+                )
+        if not (self.max_shift_sigma > 0 and self.max_rotation_sigma_degrees > 0):
+            raise ConfigError("OverlapLimits: the largest sigmas must be more than 0")
+
+    @staticmethod
+    def verdict(value: float, limit: tuple[float, float]) -> str:
+        """Judge one number."""
+        return "pass" if value <= limit[0] else "warn" if value <= limit[1] else "fail"
+
+    @staticmethod
+    def worse(*verdicts: str) -> str:
+        """Return the worst."""
+        return max(verdicts, key=VERDICTS.index)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairOverlap:
+    """The gap between the surfaces of two cameras, as calibrated; metres."""
+
+    first: str
+    second: str
+    overlap: float  # share of both cameras' samples that have a partner, 0..1
+    meeting: float | None  # of the samples that the other camera could see, the share with a partner; None = unknown
+    num_samples: int  # that have a partner
+    median: float  # of the absolute distances; NaN = too few samples
+    p90: float  # of the absolute distances
+    mean: float  # signed, of the central 80 per cent: positive where ``first`` lies nearer to the cameras
+    verdict: str
+    histogram: tuple[int, ...]  # 60 bins of the signed distances from -15 to +15 mm
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOverlap:
+    """How far one camera is out of place, against the reference camera."""
+
+    name: str
+    shift: float  # metres, at ``center``
+    shift_vector: tuple[float, ...]  # metres, in the common frame: what would bring it back
+    shift_sigma: float  # metres, standard deviation along the worst direction; inf = not determined
+    rotation_degrees: float
+    rotation_sigma_degrees: float  # about the worst axis; inf = not determined
+    center: tuple[float, ...]  # the middle of what it shares with others, in the common frame
+    correction: list[list[float]]  # 4x4 in the common frame: better_pose = correction @ world_from_camera
+    unmeasurable: tuple[str, ...]  # directions about which the scene says too little
+    verdict: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlapResult:
+    """Whether the cameras agree, with everything that this was told from."""
+
+    pairs: tuple[PairOverlap, ...]
+    cameras: tuple[CameraOverlap, ...]
+    wrong: tuple[str, ...]  # the cameras whose removal makes the others agree
+    candidates: tuple[str, ...]  # where no one camera can be named: one or more of these
+    reference: str  # the camera that the others are compared with
+    limits: OverlapLimits
+
+    @property
+    def verdict(self) -> str:
+        """The worst of all pairs that overlap and of all cameras."""
+        found = [camera.verdict for camera in self.cameras]
+        found += [pair.verdict for pair in self.pairs if pair.verdict != "not measurable"]
+        return self.limits.worse(*found)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to do, most urgent first; empty when everything passes."""
+        return tuple(self._advice())
+
+    def _advice(self) -> Iterable[str]:
+        by_name = {camera.name: camera for camera in self.cameras}
+        for name in self.wrong:
+            found = by_name[name]
+            yield (
+                f"recalibrate {name}: the others agree without it, and it is off by {1e3 * found.shift:.1f} mm and "
+                f"{found.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose"
+            )
+        if self.candidates:
+            yield (
+                f"{' and '.join(self.candidates)} contradict each other and the views cannot tell which is wrong; "
+                "check both mounts, add a third camera, or recalibrate them"
+            )
+        for pair in self.pairs:
+            if pair.meeting is not None and pair.verdict == "fail" and not pair.median <= self.limits.residual[1]:
+                yield (
+                    (
+                        f"{pair.first} and {pair.second}: only {100 * pair.meeting:.0f} % of what both could see lies "
+                        "within reach of the other's surface; check that the poses are world_from_camera, in metres, and "
+                        "that nothing moved between the views"
+                    )
+                    if pair.meeting < 0.3
+                    else (f"{pair.first} and {pair.second}: their surfaces lie {1e3 * pair.median:.1f} mm apart")
+                )
+        for camera in self.cameras:
+            if camera.unmeasurable:
+                yield (
+                    f"{camera.name}: not measurable here: {'; '.join(camera.unmeasurable)}; put objects with upright "
+                    "sides where the cameras overlap, or give several captures"
+                )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON; numbers that are not finite become None."""
+        plain = {"verdict": self.verdict, "advice": list(self.advice), **asdict(self)}
+        return _finite(plain)
+
+    def text(self) -> str:
+        """Return the numbers as lines for a terminal."""
+        lines = [f"overlap: {self.verdict}"]
+        for pair in self.pairs:
+            lines.append(
+                f"  {pair.first} - {pair.second}: median {1e3 * pair.median:.1f} mm, 90 % below {1e3 * pair.p90:.1f} "
+                f"mm, mean {1e3 * pair.mean:+.1f} mm, overlap {100 * pair.overlap:.0f} %: {pair.verdict}"
+            )
+        for camera in self.cameras:
+            lines.append(
+                f"  {camera.name}: off by {1e3 * camera.shift:.1f} +- {1e3 * camera.shift_sigma:.1f} mm, "
+                f"{camera.rotation_degrees:.2f} +- {camera.rotation_sigma_degrees:.2f} degrees: {camera.verdict}"
+            )
+        return "\n".join([*lines, *(f"  -> {line}" for line in self.advice)])
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
