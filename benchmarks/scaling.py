@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import resource
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +61,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, nargs="*", default=list(POINTS))
     parser.add_argument("--threads", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--only", default="", help="only operations whose name contains this")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # operation, points, clouds, threads: measured in this process
     arguments = parser.parse_args()
-    if arguments.one:
-        name, *numbers = arguments.one.split(",")
-        print(json.dumps(measure_here(name, *map(int, numbers), arguments.repeats)))
-        return
     rows = []
     for name in OPERATIONS:
         if arguments.only not in name:
@@ -97,14 +92,10 @@ def hold(rows: list[dict[str, Any]]) -> None:
 # -- one measurement ---------------------------------------------------------------------------------------------------
 
 
-def measure_apart(name: str, points: int, clouds: int, threads: int, repeats: int) -> dict[str, Any]:
-    """Measure in a fresh process: the peak of resident memory never goes down."""
-    command = [sys.executable, __file__, "--one", f"{name},{points},{clouds},{threads}", "--repeats", str(repeats)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"{name} on {points} points: {done.stderr}")
-    result: dict[str, Any] = json.loads(done.stdout)
-    return result
+def measure_apart(*case: Any) -> dict[str, Any]:
+    """Measure in a fresh process, as the peak of resident memory never goes down; it is forked before anything ran."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as process:
+        return process.submit(measure_here, *case).result()
 
 
 def measure_here(name: str, points: int, clouds: int, threads: int, repeats: int) -> dict[str, Any]:
