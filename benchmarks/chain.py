@@ -196,7 +196,7 @@ def chain(frame: pcdata.DepthFrame, repeats: int, open3d_runs: int) -> dict[str,
         total = sum(steps["Open3D"].values())
         report["times"]["Open3D"] = {"wall_ms": total, "runs": open3d_runs}
         report["ratio"] = {name: total / report["times"][name]["wall_ms"] for name in ("pipeline", "functions")}
-        report["results"] = compare_results(ours, theirs["normals"])
+        report["results"] = compare_results(theirs)
     report["points"] = counts
     print_chain(report)
     return report
@@ -335,19 +335,35 @@ def run_open3d(frame: pcdata.DepthFrame, runs: int) -> tuple[dict[str, list[floa
     return seconds, clouds
 
 
-def compare_results(ours: pcdata.PointCloud, theirs: Any) -> dict[str, float]:
-    """How far the 1024 points of each lie from the other's, and how much the normals of equal points differ."""
-    from scipy.spatial import cKDTree
+def compare_results(theirs: dict[str, Any]) -> dict[str, float | bool]:
+    """Run each of our steps on what Open3D gave the step before, and compare with what Open3D made of it.
 
-    points, normals = np.asarray(theirs.points), np.asarray(theirs.normals)
-    distance, row = cKDTree(points).query(ours.points.double().numpy())
-    back, _ = cKDTree(ours.points.numpy()).query(points)
-    cosine = (ours.normals.double().numpy() * normals[row]).sum(1)[distance < 1e-5]
+    The planes are compared as planes: ours is refitted to its inliers until they settle, theirs is not.
+    """
+    points = {name: torch.from_numpy(np.asarray(cloud.points)).float() for name, cloud in theirs.items()}
+
+    def same_points(ours: torch.Tensor, name: str) -> bool:
+        return torch.equal(ours, points[name])
+
+    start, smooth, close, standing = (points[name] for name in list(points)[:4])
+    label = F.dbscan(standing)
+    count = torch.bincount(label + 1)
+    count[0] = 0
+    objects = standing[((count >= MIN_SIZE) & (count <= MAX_SIZE))[label + 1]]
+    # Open3D gives the sample in the order of the cloud.
+    picked = points["DBSCAN"][F.farthest_point_sample(points["DBSCAN"], num_samples=1024)[0].sort().values]
+    normals = F.estimate_normals(points["farthest points"]).double().numpy()
+    cosine = np.abs((normals * np.asarray(theirs["normals"].normals)).sum(1)).clip(0, 1)
+    removed = len(close) - len(standing)
     return {
-        "median_distance_mm": 1000 * float(np.median(distance)),
-        "largest_distance_mm": 1000 * float(max(distance.max(), back.max())),
-        "points_in_common": float((distance < 1e-5).mean()),
-        "their_normals_within_1_degree": float((cosine > np.cos(np.radians(1))).mean()) if len(cosine) else 0.0,
+        "statistical_outliers_identical": same_points(
+            start[~F.statistical_outlier_mask(start)], "statistical outliers"
+        ),
+        "radius_outliers_identical": same_points(smooth[~F.radius_outlier_mask(smooth)], "radius outliers"),
+        "plane_inliers_ours_over_theirs": int(F.ransac_plane(close)[1].sum()) / removed,
+        "objects_identical": same_points(objects, "DBSCAN"),
+        "farthest_points_identical": same_points(picked, "farthest points"),
+        "normals_within_half_a_degree": float((np.degrees(np.arccos(cosine)) < 0.5).mean()),
     }
 
 

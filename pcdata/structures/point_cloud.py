@@ -17,7 +17,8 @@ from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
 from pcdata.structures.derive import derived
 from pcdata.structures.fields import CORE_KINDS, Kind
-from pcdata.structures.padded import PaddedClouds
+from pcdata.structures.joining import joinable_parts, rows_per_cloud
+from pcdata.structures.padded import PaddedClouds, padded_clouds
 
 METRE = "m"
 NORMALIZED = "normalized"
@@ -325,7 +326,7 @@ class PointCloud:
             ShapeError: the clouds carry different fields, or there are none.
             DeviceError: the clouds lie on different devices.
         """
-        parts = _joinable_parts(clouds)
+        parts = joinable_parts(clouds)
         viewpoints = [cloud.viewpoint for cloud in clouds]
         first = clouds[0]
         known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
@@ -356,7 +357,7 @@ class PointCloud:
             return self.cat_padded([self], num_points)
         shape = len(counts), counts[0]
         rows = {name: value.reshape(*shape, *value.shape[1:]) for name, value in self.fields().items()}
-        return _padded_clouds([self], rows, counts)
+        return padded_clouds([self], rows, counts)
 
     @staticmethod
     def cat_padded(clouds: Sequence[PointCloud], num_points: int | None = None) -> PaddedClouds:
@@ -365,14 +366,14 @@ class PointCloud:
         Raises:
             FrameError, UnitError, ShapeError, DeviceError: as :meth:`cat` and :meth:`padded`.
         """
-        parts = _joinable_parts(clouds)
+        parts = joinable_parts(clouds)
         counts = [[stop - start for start, stop in itertools.pairwise(cloud.ptr.tolist())] for cloud in clouds]
         flat = list(itertools.chain.from_iterable(counts))
         width = max(flat) if num_points is None else num_points
         if max(flat) > width:
             raise ShapeError(f"PointCloud.padded: a cloud has {max(flat)} points, more than num_points={width}")
-        rows = pad_rows({name: _cut(value, counts) for name, value in parts.items()}, width)
-        return _padded_clouds(clouds, rows, flat)
+        rows = pad_rows({name: rows_per_cloud(value, counts) for name, value in parts.items()}, width)
+        return padded_clouds(clouds, rows, flat)
 
     # -- moving between devices and processes ----------------------------------------------------------------------
 
@@ -420,58 +421,3 @@ def _layout_of(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None
     if len(known) < len(layouts) or len({layout.size for layout in known}) > 1:
         return None
     return ImageLayout(size=known[0].size, intrinsics=torch.cat([layout.intrinsics for layout in known])[clouds])
-
-
-def _joinable_parts(clouds: Sequence[PointCloud]) -> dict[str, list[Tensor]]:
-    """Return every field as a list with the rows of each cloud."""
-    if not clouds:
-        raise ShapeError("PointCloud.cat: needs at least one cloud")
-    fields = [cloud.fields() for cloud in clouds]
-    for position, (cloud, own) in enumerate(zip(clouds, fields)):
-        _check_joinable(clouds[0], cloud, position)
-        if own.keys() != fields[0].keys() or cloud.kinds != clouds[0].kinds:
-            different = own.keys() ^ fields[0].keys() or "kinds"
-            raise ShapeError(f"PointCloud.cat: cloud {position} and cloud 0 carry different fields: {different}")
-    return {name: [own[name] for own in fields] for name in fields[0]}
-
-
-def _padded_clouds(clouds: Sequence[PointCloud], rows: Mapping[str, Tensor], counts: Sequence[int]) -> PaddedClouds:
-    """Put together fields (B, M, ...) and what the clouds know about themselves."""
-    device, width = rows["points"].device, rows["points"].shape[1]
-    return PaddedClouds(
-        mask=torch.arange(width, device=device) < torch.tensor(counts, device=device)[:, None],
-        frame_id=clouds[0].frame_id,
-        unit=clouds[0].unit,
-        source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
-        meta=tuple(entry for cloud in clouds for entry in cloud.meta),
-        **{name: rows[name] for name in CORE_KINDS if name in rows},
-        extra={name: value for name, value in rows.items() if name not in CORE_KINDS},
-    )
-
-
-def _cut(values: Sequence[Tensor], counts: Sequence[Sequence[int]]) -> list[Tensor]:
-    """Return the rows of every single cloud."""
-    if all(len(own) == 1 for own in counts):
-        return list(values)
-    return [part for value, own in zip(values, counts) for part in value.split(list(own))]
-
-
-def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:
-    for name in ("frame_id", "source_frame"):
-        if getattr(first, name) != getattr(other, name):
-            raise FrameError(
-                f"PointCloud.cat: cloud {position} has {name} {getattr(other, name)!r} but cloud 0 has "
-                f"{getattr(first, name)!r}; bring both to one frame (ToFrame) first"
-            )
-    if first.unit != other.unit:
-        raise UnitError(
-            f"PointCloud.cat: cloud {position} has unit {other.unit!r} but cloud 0 has {first.unit!r}; "
-            "normalise both or neither"
-        )
-    if first.device != other.device:
-        raise DeviceError(
-            f"PointCloud.cat: cloud {position} is on {other.device} but cloud 0 is on {first.device}; "
-            "move one with .to()"
-        )
-    if (first.viewpoint is None) != (other.viewpoint is None):
-        raise ShapeError(f"PointCloud.cat: only one of cloud 0 and cloud {position} has a viewpoint")
