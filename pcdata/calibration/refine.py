@@ -185,7 +185,7 @@ def refine_extrinsics(
     refined = tuple(
         CameraRefinement(
             name=camera.name,
-            world_from_camera=correction.to(poses[0].device) @ poses[0][view],
+            world_from_camera=poses[0][view] if view == stays else correction.to(poses[0].device) @ poses[0][view],
             shift=float((correction @ poses[0][view].cpu() - poses[0][view].cpu())[:3, 3].norm()),
             rotation_degrees=camera.rotation_degrees,
             shift_sigma=camera.shift_sigma,

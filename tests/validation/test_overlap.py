@@ -1,3 +1,4 @@
+import functools
 import json
 import math
 from dataclasses import replace
@@ -8,9 +9,14 @@ import torch
 from pcdata.errors import ConfigError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.synthetic import Miscalibration, tabletop
+from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame
 from pcdata.validation import OverlapLimits, verify_overlap
+
+
+@functools.cache
+def scene(seed: int, num_views: int) -> Tabletop:
+    return tabletop(seed, 12, num_views, noise="stereo")
 
 
 def rig(seed: int, num_views: int = 4, *, millimetres: float = 0.0, degrees: float = 0.0, wrong: int = 0) -> DepthFrame:
@@ -18,7 +24,8 @@ def rig(seed: int, num_views: int = 4, *, millimetres: float = 0.0, degrees: flo
         translation=[1e-3 * millimetres * (view == wrong) for view in range(num_views)],
         rotation_degrees=[degrees * (view == wrong) for view in range(num_views)],
     )
-    return tabletop(seed, 8, num_views, noise="stereo", miscalibration=error).frame
+    true = scene(seed, num_views)
+    return replace(true.frame, world_from_camera=error.apply(true.truth.world_from_camera, seed))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -61,16 +68,10 @@ def test_a_shift_along_the_table_is_seen_though_the_gap_stays_small():
 
 
 def test_the_correction_brings_the_camera_back():
-    scene = tabletop(
-        2,
-        8,
-        4,
-        noise="stereo",
-        miscalibration=Miscalibration(translation=[0, 0.008, 0, 0], rotation_degrees=[0, 0.6, 0, 0]),
-    )
-    found = verify_overlap(scene.frame)
-    better = torch.tensor(found.cameras[1].correction, dtype=torch.float64) @ scene.frame.world_from_camera[1]
-    at_scene = better @ rigid.invert_rigid(scene.truth.world_from_camera[1])
+    frame = rig(2, millimetres=8.0, degrees=0.6, wrong=1)
+    found = verify_overlap(frame)
+    better = torch.tensor(found.cameras[1].correction, dtype=torch.float64) @ frame.world_from_camera[1]
+    at_scene = better @ rigid.invert_rigid(scene(2, 4).truth.world_from_camera[1])
     center = torch.tensor(found.cameras[1].center, dtype=torch.float64)
     assert float((at_scene[:3, :3] @ center + at_scene[:3, 3] - center).norm()) < 0.001
 
@@ -84,11 +85,11 @@ def test_two_cameras_contradict_each_other_and_neither_is_named():
 
 
 def test_a_bare_table_leaves_sliding_and_turning_unmeasurable():
-    scene = tabletop(0, 0, 3, noise="stereo", floor=False)
+    bare = tabletop(0, 0, 3, noise="stereo", floor=False, size=(360, 480)).frame
     # The table's edges show sides; a camera that sees the middle alone has none.
-    depth = torch.zeros_like(scene.frame.depth)
-    depth[:, 160:320, 200:440] = scene.frame.depth[:, 160:320, 200:440]
-    found = verify_overlap(replace(scene.frame, depth=depth))
+    depth = torch.zeros_like(bare.depth)
+    depth[:, 120:240, 150:330] = bare.depth[:, 120:240, 150:330]
+    found = verify_overlap(replace(bare, depth=depth))
     assert found.verdict == "not measurable"
     assert all(pair.verdict == "pass" for pair in found.pairs)
     unknown = next(camera for camera in found.cameras if camera.name != found.reference).unmeasurable
@@ -107,19 +108,14 @@ def test_gross_errors_fail_though_nothing_is_within_reach():
 
 
 def test_more_captures_of_one_rig_are_more_certain():
-    frames = [rig(seed, 3) for seed in range(3)]
-    same_rig = [
-        tabletop(
-            seed, 8, 3, noise="stereo", world_from_camera=frames[0].world_from_camera, camera=frames[0].camera
-        ).frame
-        for seed in range(3)
-    ]
-    one, three = verify_overlap(same_rig[0]), verify_overlap(*same_rig)
-    worst_of_one = max(camera.shift_sigma for camera in one.cameras)
-    assert max(camera.shift_sigma for camera in three.cameras) < worst_of_one
-    assert three.verdict == "pass"
+    first = scene(0, 3)
+    poses, camera = first.truth.world_from_camera, first.truth.camera
+    second = tabletop(1, 12, noise="stereo", world_from_camera=poses, camera=camera).frame
+    one, two = verify_overlap(first.frame), verify_overlap(first.frame, second)
+    assert max(found.shift_sigma for found in two.cameras) < max(found.shift_sigma for found in one.cameras)
+    assert two.verdict == "pass"
     with pytest.raises(ShapeError, match="capture 1 has other cameras"):
-        verify_overlap(frames[0], frames[1])
+        verify_overlap(first.frame, rig(1, 3))
 
 
 def test_clouds_on_their_images_give_what_the_frame_gives():
