@@ -65,7 +65,7 @@ class PairOverlap:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOverlap:
-    """How far one camera is out of place, against the reference camera."""
+    """How far one camera is out of place, against the reference camera, along the directions that are measurable."""
 
     name: str
     shift: float  # metres, at ``center``

@@ -8,6 +8,7 @@ import torch
 
 from pcdata.errors import ConfigError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
+from pcdata.io import open_source
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame
@@ -181,3 +182,20 @@ def test_empty_views_are_not_measurable():
     assert math.isinf(found.cameras[1].shift_sigma)
     empty = PointCloud(points=torch.zeros(0, 3), ptr=torch.tensor([0, 0, 0]), frame_id="base")
     assert verify_overlap(empty).verdict == "not measurable"
+
+
+def test_aligning_real_frames_lowers_their_gap(test_data):
+    source = open_source(test_data / "seven_scenes")
+    for first in (0, 30):
+        one, other = (source.load(source.ids[index]) for index in (first, first + 1))
+        pair = DepthFrame(
+            depth=torch.cat([one.depth, other.depth]),
+            camera=replace(one.camera, intrinsics=one.camera.intrinsics.repeat(2, 1, 1)),
+            world_from_camera=torch.cat([one.world_from_camera, other.world_from_camera]),
+            frame_id="world",
+        )
+        found = verify_overlap(pair)
+        moved = torch.tensor(found.cameras[1].correction, dtype=torch.float64) @ pair.world_from_camera[1]
+        fixed = torch.tensor(found.cameras[0].correction, dtype=torch.float64) @ pair.world_from_camera[0]
+        better = verify_overlap(replace(pair, world_from_camera=torch.stack([fixed, moved])))
+        assert better.pairs[0].median < found.pairs[0].median
