@@ -45,10 +45,12 @@ def verify_overlap(
         ShapeError: fewer than two views, or captures with different numbers of them.
         FrameError: the views are not in a common frame, or their poses are unknown or differ between the captures.
         UnitError: a cloud is not in metres.
-        ConfigError: not one name per camera.
+        ConfigError: no capture, or not one name per camera.
     """
     where = "verify_overlap"
     limits = OverlapLimits() if limits is None else limits
+    if not captures:
+        raise ConfigError(f"{where}: give at least one capture")
     surfaces, poses = zip(*(surfaces_of(where, capture, max_samples=max_samples) for capture in captures))
     num_views = len(poses[0])
     for position, pose in enumerate(poses):

@@ -156,6 +156,8 @@ def test_limits_decide():
 
 def test_what_cannot_be_compared_is_refused():
     frame = rig(0, 2)
+    with pytest.raises(ConfigError, match="at least one capture"):
+        verify_overlap()
     with pytest.raises(ShapeError, match="two views or more"):
         verify_overlap(frame.view(0))
     with pytest.raises(FrameError, match="no world_from_camera"):
