@@ -11,15 +11,29 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "pcdata.structures": ["Camera", "DepthFrame", "Kind", "PaddedClouds", "PointCloud"],
+    "pcdata.structures": [
+        "Camera",
+        "Confidence",
+        "DepthFrame",
+        "Kind",
+        "PaddedClouds",
+        "PointCloud",
+        "register_to_color",
+    ],
+    "pcdata.sensors": ["SensorProfile", "sensor_profile"],
     "pcdata.transforms": [
         "Center",
         "ClusterObjects",
+        "CompleteDepth",
         "Compose",
         "CropWorkspace",
+        "DecimateDepth",
         "Deproject",
         "EstimateNormals",
         "FarthestPointSample",
+        "FillHoles",
+        "KeepConfidence",
+        "MarkUnreliableDepth",
         "MaskDepth",
         "MergeViews",
         "NormalizeUnitSphere",
@@ -34,18 +48,33 @@ _HOMES = {
         "RandomRotation",
         "RandomSample",
         "RandomScale",
+        "RandomSensorNoise",
         "RandomTranslation",
+        "RemoveFlyingPixels",
         "RemovePlane",
         "RemoveRadiusOutliers",
         "RemoveStatisticalOutliers",
+        "ResizeDepth",
+        "SpatialFilterDepth",
         "SplitObjects",
         "ToFrame",
         "Transform",
         "VoxelDownsample",
     ],
-    "pcdata.io": ["Calibration", "open_source", "read_pcd", "read_ply", "write_pcd", "write_ply"],
+    "pcdata.io": [
+        "AveragedSource",
+        "Calibration",
+        "TemporalFilterDepth",
+        "TemporallyFilteredSource",
+        "open_source",
+        "read_pcd",
+        "read_ply",
+        "write_pcd",
+        "write_ply",
+    ],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
+    "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _SUBMODULES = [
@@ -56,9 +85,11 @@ _SUBMODULES = [
     "functional",
     "io",
     "report",
+    "sensors",
     "structures",
     "synthetic",
     "transforms",
+    "validation",
 ]
 
 __all__ = ["__version__", *_HOME_OF, *_SUBMODULES]

@@ -57,6 +57,14 @@ class CaptureError(PcdataError, ValueError):
     """A raw capture (depth, colour, intrinsics, pose, cloud file) cannot be trusted."""
 
 
+class IntrinsicsError(CaptureError):
+    """Camera intrinsics cannot belong to the image they are given for."""
+
+
+class NoReadingError(CaptureError):
+    """A depth image has no reading at all."""
+
+
 class CalibrationError(PcdataError, ValueError):
     """A calibration file is wrong, or what was given cannot determine a calibration."""
 

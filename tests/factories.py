@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.functional import rigid
 from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.sensor_noise import facing_depth
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, Kind, PointCloud
 from pcdata.synthetic import tabletop
@@ -119,6 +120,12 @@ def frame_with_counts(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> De
 def tabletop_frame(num_views: int = 2, *, seed: int = 0, num_objects: int = 3) -> DepthFrame:
     """A rendered capture of 60 x 80 pixels."""
     return tabletop(seed, num_objects=num_objects, num_views=num_views, size=(60, 80), floor=False).frame
+
+
+def depth_edges(depth: Tensor, jump: float) -> tuple[Tensor, Tensor]:
+    """The depth of the 4-neighbour that differs most, and where it differs by more than ``jump`` of the nearer one."""
+    across = facing_depth(depth)
+    return across, (across - depth).abs() > jump * torch.minimum(depth, across)
 
 
 def tree(data: Any) -> Any:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.checks import check_tensors
+from pcdata.checks import any_negative, check_tensors
 from pcdata.dispatch import op
 from pcdata.errors import CaptureError
 from pcdata.functional.lens import check_distortion, distort_normalized, fold_radius, undistort_normalized
@@ -149,8 +149,8 @@ def check_lengths(where: str, name: str, lengths: Tensor) -> None:
     Raises:
         CaptureError: with how many are negative, and the lowest.
     """
-    negative = lengths < 0
-    if bool(negative.any()):
+    if any_negative(lengths):
+        negative = lengths < 0
         raise CaptureError(
             f"{where}: {name} must be metres with 0 for no reading, but {int(negative.sum())} values are negative "
             f"(lowest {float(lengths.detach().min()):g}); set them to 0 where the image is read"

@@ -32,9 +32,11 @@ def estimate_normals(
     """Estimate each point's normal: the direction in which its neighbourhood varies least.
 
     The neighbourhood is the nearest ``max_neighbors`` points with d < radius, the point itself included; its covariance
-    and eigenvectors are float64. Fewer than three neighbours, or all at one spot, give (0, 0, 1); points on a line give
-    some direction across the line. The sign is only a convention: the last component of (x, y, z) that is not 0 is
-    positive, so z >= 0; use :func:`orient_normals` to face the camera.
+    and eigenvectors are float64. Where no direction stands out, one is agreed on: fewer than three neighbours, or an
+    equal spread in all directions, give (0, 0, 1); neighbours on a line along d, or spread equally across d, give the
+    direction across d and across (0, d_z, -d_y), or across d and (-d_z, 0, d_x) where d_x is larger than d_y. The sign
+    is a convention: the last component of (x, y, z) that is not 0 is positive, so z >= 0; use :func:`orient_normals`
+    to face the camera.
 
     Args:
         points: the clouds, in any unit of length.
@@ -103,6 +105,9 @@ def _check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None
         )
 
 
+# Differences of covariances (scaled to entries of at most 1) and of unit vectors that are rounding, not shape.
+_ROUND = 1e-12
+
 Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # xx, xy, xz, yy, yz, zz, each (m,) float64
 
 
@@ -135,7 +140,7 @@ def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Te
     mean = (xx + yy + zz) / 3
     dx, dy, dz = xx - mean, yy - mean, zz - mean
     spread = ((dx * dx + dy * dy + dz * dz + 2 * (xy * xy + xz * xz + yz * yz)) / 6).sqrt()
-    is_isotropic = spread == 0
+    is_isotropic = spread <= _ROUND
     safe = torch.where(is_isotropic, 1.0, spread)
     determinant = dx * (dy * dz - yz * yz) - xy * (xy * dz - yz * xz) + xz * (xy * yz - dy * xz)
     half = (determinant / (safe * safe * safe) / 2).clamp(-1.0, 1.0)
@@ -168,7 +173,9 @@ def _smallest_across(matrix: Symmetric, clear: Tensor) -> Tensor:
     v = torch.linalg.cross(clear, u)
     along_u, along_v = _times(matrix, u), _times(matrix, v)
     uu, uv, vv = (u * along_u).sum(-1), (u * along_v).sum(-1), (v * along_v).sum(-1)
-    angle = torch.atan2(2 * uv, uu - vv) / 2  # from u to the larger axis of [[uu, uv], [uv, vv]]
+    p, q = uu - vv, 2 * uv
+    round_ = torch.hypot(p, q) <= _ROUND
+    angle = torch.where(round_, 0.0, torch.atan2(q, p) / 2)  # from u to the larger axis of [[uu, uv], [uv, vv]]
     return angle.cos()[:, None] * v - angle.sin()[:, None] * u
 
 
@@ -176,7 +183,7 @@ def _perpendicular(direction: Tensor) -> Tensor:
     """Return (m, 3) unit vectors across unit vectors, from the two components that cannot both vanish."""
     x, y, z = direction.unbind(-1)
     zero = torch.zeros_like(x)
-    use_x = (x.abs() > y.abs())[:, None]
+    use_x = (x.abs() > y.abs() + _ROUND)[:, None]
     return _unit(torch.where(use_x, torch.stack([-z, zero, x], -1), torch.stack([zero, z, -y], -1)))
 
 

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from pcdata.checks import rising
 from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import counts_from_ptr
@@ -59,12 +60,10 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
         _check_rigid(where, grid.camera_from_points, len(ptr) - 1, points.device)
     if len(pixel) == 0:
         return
-    rises = pixel[1:] > pixel[:-1]
     filled = counts_from_ptr(ptr) > 0
     first, last = ptr[:-1][filled], ptr[1:][filled] - 1
-    rises[first[1:] - 1] = True
     # Where pixels rise, only the ends of a cloud can lie outside the image.
-    if not bool(rises.all()) or int(pixel[first].min()) < 0 or int(pixel[last].max()) >= height * width:
+    if not rising(pixel, ptr) or int(pixel[first].min()) < 0 or int(pixel[last].max()) >= height * width:
         raise ShapeError(
             f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
             "the points were reordered or repeated since they were read, so pass grid=None"

@@ -10,6 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from pcdata.checks import count_true, equal_values
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional.parameters import require_count, require_length
@@ -229,9 +230,9 @@ def _refine(
         if refitted is None or not bool(allowed(refitted)):
             break
         refitted_inliers = work.inlier_mask(points, refitted, distance)
-        if int(refitted_inliers.sum()) < 3:
+        if count_true(refitted_inliers) < 3:
             break
-        settled = torch.equal(refitted_inliers, inliers)
+        settled = equal_values(refitted_inliers, inliers)
         plane, inliers = refitted, refitted_inliers
         if settled:
             break

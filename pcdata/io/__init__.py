@@ -1,5 +1,6 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
+from pcdata.io.averaged import AveragedSource
 from pcdata.io.calibration import Calibration, Evidence
 from pcdata.io.capture_camera import (
     CaptureCamera,
@@ -15,13 +16,17 @@ from pcdata.io.images import read_color, read_depth, read_labels, read_mask, wri
 from pcdata.io.pcd import read_pcd, write_pcd
 from pcdata.io.ply import read_ply, write_ply
 from pcdata.io.source import Source
+from pcdata.io.temporal import TemporalFilterDepth, TemporallyFilteredSource
 
 __all__ = [
     "LAYOUTS",
+    "AveragedSource",
     "Calibration",
     "CaptureCamera",
     "Evidence",
     "Source",
+    "TemporalFilterDepth",
+    "TemporallyFilteredSource",
     "open_source",
     "read_capture_camera",
     "read_color",

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, PcdataError, PoseError, near_matches
+from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, PoseError, near_matches
 from pcdata.functional import rigid
 from pcdata.io.files import map_npy, read_text, replacing
 from pcdata.io.images import check_metres_per_unit
@@ -156,7 +156,7 @@ def _camera(where: str, **values: Any) -> Camera:
     try:
         return Camera.pinhole(**values)
     except PcdataError as error:
-        raise CaptureError(f"{where}: {error}") from error
+        raise IntrinsicsError(f"{where}: {error}") from error
 
 
 def _json_object(where: str, text: str) -> dict[str, Any]:

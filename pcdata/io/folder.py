@@ -15,9 +15,11 @@ from pcdata.io.capture_camera import read_capture_camera
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, check_metres_per_unit, read_depth
 from pcdata.io.source import Source, absolute, by_stem, check_partners, sequence_positions
+from pcdata.io.timestamps import read_timestamps
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
+_TIMESTAMPS = "timestamps.json"
 _PARTNERS = {  # role: folder, suffixes
     "color": ("color", COLOR_SUFFIXES),
     "labels": ("labels", (".png",)),
@@ -33,7 +35,8 @@ class FolderSource(Source):
     kind = "folder"
     needs = (
         "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
-        "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera)"
+        "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera), "
+        "timestamps.json (seconds by NAME)"
     )
 
     def __init__(
@@ -101,6 +104,8 @@ class FolderSource(Source):
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
         self._positions = sequence_positions(self._ids)
+        times = path / _TIMESTAMPS
+        self._times = read_timestamps(times, self._ids) if times.is_file() else {}
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -124,6 +129,7 @@ class FolderSource(Source):
                 **self.provenance(sample_id),
                 "metres_per_unit": self.metres_per_unit,
                 **self._calibrated,
+                **({"timestamps": [self._times[sample_id]]} if self._times else {}),
             },
             background_label=self.background_label,
         )

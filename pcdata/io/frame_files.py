@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, IntrinsicsError
 from pcdata.io.capture_camera import read_pose
 from pcdata.io.confidence import read_confidence
 from pcdata.io.images import read_color, read_labels, read_mask
@@ -46,7 +46,7 @@ def make_frame(
     """
     size = (depth.shape[0], depth.shape[1])
     if size != camera.size:
-        raise CaptureError(
+        raise IntrinsicsError(
             f"{files['depth']}: the depth is {_words(size)} but the intrinsics belong to {_words(camera.size)}; use "
             f"those of the stream that the depth is registered to, or rescale them with Camera.resized({size})"
         )

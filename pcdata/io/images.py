@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.errors import CaptureError, DTypeError, UnitError
+from pcdata.errors import CaptureError, DTypeError, NoReadingError, UnitError
 from pcdata.io.files import existing_file, map_npy, replacing
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
@@ -67,7 +67,7 @@ def read_depth(
     """
     where = f"read_depth: {path}"
     unit = check_metres_per_unit(where, metres_per_unit)
-    raw = _read_raw_depth(where, Path(path))
+    raw = read_raw_depth(where, Path(path))
     if raw.dtype == np.uint16:
         if not all(0 <= value <= 65535 for value in invalid_values):
             raise CaptureError(f"{where}: invalid_values must lie in 0 .. 65535, got {tuple(invalid_values)}")
@@ -80,7 +80,12 @@ def read_depth(
     return torch.from_numpy(depth)
 
 
-def _read_raw_depth(where: str, path: Path) -> NDArray[Any]:
+def read_raw_depth(where: str, path: Path) -> NDArray[Any]:
+    """Return the numbers of a depth image as they are stored: uint16, float32 or float64, with whatever faults.
+
+    Raises:
+        CaptureError: the file is missing, damaged, or not a depth image.
+    """
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         hint = "; convert EXR to a float32 .npy in metres" if suffix == ".exr" else ""
@@ -137,7 +142,7 @@ def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Coll
 def _check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
     valid = depth[depth > 0]
     if not len(valid):
-        raise CaptureError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
+        raise NoReadingError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
     median = float(np.median(valid[:: max(1, len(valid) >> 16)]))  # 65,536 pixels tell as much as all
     if not _NEAREST <= median <= _FARTHEST:
         raise UnitError(

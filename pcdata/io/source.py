@@ -8,13 +8,24 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from pcdata.errors import CaptureError, PcdataError, add_note, near_matches
 from pcdata.structures import DepthFrame, PointCloud
 
 _LITTER = ("thumbs.db", "desktop.ini")
 _SHOWN = 5  # ids or files named in a message before "and n more"
+
+
+class CaptureSource(Protocol):
+    """Anything with ids that loads a capture by id: a :class:`Source`, a synthetic one, one around another."""
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids, unique and in a fixed order."""
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one sample."""
 
 
 class Source(ABC):

@@ -4,8 +4,10 @@ from pcdata.structures.camera import Camera
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
 from pcdata.structures.fields import Kind
+from pcdata.structures.filled import confidence_of, with_filled_depth
 from pcdata.structures.padded import PaddedClouds
 from pcdata.structures.point_cloud import METRE, NORMALIZED, ImageLayout, PointCloud
+from pcdata.structures.registration import register_to_color
 
 __all__ = [
     "CAMERA_FRAME",
@@ -18,4 +20,7 @@ __all__ = [
     "Kind",
     "PaddedClouds",
     "PointCloud",
+    "confidence_of",
+    "register_to_color",
+    "with_filled_depth",
 ]

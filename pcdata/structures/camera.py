@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.errors import CaptureError, ShapeError
+from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,15 +140,15 @@ def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int], *,
     fx, fy, cx, cy = k[0][0], k[1][1], k[0][2], k[1][2]
     where = f"Camera: intrinsics of view {view}"
     if not all(math.isfinite(value) for row in k for value in row) or k[2] != [0.0, 0.0, 1.0] or k[1][0] != 0.0:
-        raise CaptureError(f"{where} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k}")
+        raise IntrinsicsError(f"{where} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k}")
     if fx <= 0 or fy <= 0:
-        raise CaptureError(
+        raise IntrinsicsError(
             f"{where}: focal lengths must be positive, got fx={fx:g}, fy={fy:g}; a simulator's negative focal length "
             "means flipped axes: flip the image or the axes first"
         )
     height, width = size
     if not is_window and not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
-        raise CaptureError(
+        raise IntrinsicsError(
             f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image; "
             "do these intrinsics belong to another resolution? Rescale them with Camera.resized"
         )

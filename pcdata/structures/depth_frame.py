@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.checks import check_tensors
+from pcdata.checks import any_negative, check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
 from pcdata.structures.camera import Camera, check_view
@@ -64,7 +64,7 @@ class DepthFrame:
             {"depth": "V H W : float32", "world_from_camera": "V 4 4 : float64"},
             check_values=False,
         )
-        if bool((self.depth < 0).any()):
+        if any_negative(self.depth):
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
         if self.confidence is not None and bool((self.confidence > max(Confidence)).any()):
             raise CaptureError(

@@ -3,12 +3,16 @@
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
+from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
+from pcdata.transforms.inpainting import NearestCompletion, SmoothCompletion
 from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
 from pcdata.transforms.normals import EstimateNormals
@@ -16,19 +20,25 @@ from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOu
 from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 from pcdata.transforms.sensor_noise import RandomSensorNoise
+from pcdata.transforms.unreliable import MarkUnreliableDepth
 
 __all__ = [
     "REGISTRY",
     "Center",
     "ClusterObjects",
+    "CompleteDepth",
     "Compose",
     "CropWorkspace",
+    "DecimateDepth",
     "Deproject",
     "EstimateNormals",
     "FarthestPointSample",
+    "FillHoles",
     "KeepConfidence",
+    "MarkUnreliableDepth",
     "MaskDepth",
     "MergeViews",
+    "NearestCompletion",
     "NormalizeUnitSphere",
     "NormalizeWorkspace",
     "Pipeline",
@@ -44,10 +54,14 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
+    "ResizeDepth",
     "SelectTransform",
+    "SmoothCompletion",
+    "SpatialFilterDepth",
     "SpatialTransform",
     "SplitObjects",
     "ToFrame",

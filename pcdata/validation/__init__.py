@@ -1,6 +1,25 @@
 """Judging captures: do they hold what training needs, and do several cameras agree."""
 
+from pcdata.validation.check import Check, Verdict
+from pcdata.validation.limits import Limits
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
+from pcdata.validation.report import WHOLE, SampleReport, Summary
+from pcdata.validation.run import check_of_error, validate_frame, validate_source
 
-__all__ = ["CameraOverlap", "OverlapLimits", "OverlapResult", "PairOverlap", "verify_overlap"]
+__all__ = [
+    "WHOLE",
+    "CameraOverlap",
+    "Check",
+    "Limits",
+    "OverlapLimits",
+    "OverlapResult",
+    "PairOverlap",
+    "SampleReport",
+    "Summary",
+    "Verdict",
+    "check_of_error",
+    "validate_frame",
+    "validate_source",
+    "verify_overlap",
+]

@@ -58,6 +58,22 @@ def in_front_of_a_camera(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed) + 0.5, "intrinsics": INTRINSICS, "distortion": LENS}
 
 
+def depth_alone(count: int, seed: int) -> dict[str, Tensor]:
+    return {"depth": depth_image(count, seed)["depth"]}
+
+
+def disparity_alone(count: int, seed: int) -> dict[str, Tensor]:
+    return {"disparity": depth_image(count, seed)["depth"]}
+
+
+def beside_a_color_camera(count: int, seed: int) -> dict[str, Tensor]:
+    color_from_depth = torch.eye(4, dtype=torch.float64)[None].clone()
+    color_from_depth[:, 0, 3] = 0.03 + 0.01 * seed
+    seen = {"color_intrinsics": 1.5 * INTRINSICS, "color_from_depth": color_from_depth, "color_distortion": -0.5 * LENS}
+    seen["color_intrinsics"][:, 2, 2] = 1.0
+    return {**depth_image(count, seed), **seen}
+
+
 @dataclass(frozen=True)
 class Example:
     """One way to call an operation.
@@ -78,16 +94,22 @@ EXAMPLES = [
     Example("ball_query", with_queries, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
     Example("chamfer_distance", two_clouds, ("cloud",)),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
+    Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),
     # Neighbourhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
-    Example("estimate_normals", one_cloud, ("row",), {"radius": 0.5, "max_neighbors": 30}),
+    Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
+    Example("fill_holes", depth_alone, ("row", "row"), {"rule": "nearest"}),
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
+    Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("project_points", in_front_of_a_camera, ("row", "row")),
     Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
     Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
+    Example("register_depth", beside_a_color_camera, ("row",) * 4, {"color_size": (18, 24)}),
+    Example("resize_depth", depth_alone, ("row", "row"), {"size": (7, 30), "max_jump": 0.3}),
+    Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
     Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),
 ]

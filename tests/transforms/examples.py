@@ -36,6 +36,9 @@ EXAMPLES: dict[str, list[Example]] = {
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
         T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
     ),
+    "CompleteDepth": _of(
+        T.CompleteDepth(completion="smooth"), T.CompleteDepth(completion="nearest", reach=1), make=frame_with_counts
+    ),
     "Compose": [
         Example(
             T.Compose([T.CropWorkspace(frame="base", **BOX), T.NormalizeUnitSphere(), T.RandomRotation(axis=None)])
@@ -50,13 +53,30 @@ EXAMPLES: dict[str, list[Example]] = {
         T.CropWorkspace(frame="base", **BOX),
         T.CropWorkspace(frame="base", frame_from_box=QUARTER_TURN, lower=(0.1, 0.0, -0.5), upper=(0.5, 0.3, 0.5)),
     ),
+    "DecimateDepth": _of(
+        T.DecimateDepth(factor=2),
+        T.DecimateDepth(factor=5, max_jump=0.5),
+        T.DecimateDepth(factor=3, rule="mean"),
+        make=frame_with_counts,
+    ),
     "Deproject": _of(T.Deproject(), make=frame_with_counts),
     "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(max_neighbors=8, orient="none")),
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
     ),
+    "FillHoles": _of(
+        *(T.FillHoles(rule=rule, max_distance=2) for rule in ("left", "farthest", "nearest")),
+        T.FillHoles(max_size=1),
+        make=frame_with_counts,
+    ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
+    "MarkUnreliableDepth": _of(
+        T.MarkUnreliableDepth(sensor="realsense_d435"),
+        T.MarkUnreliableDepth(sensor="kinect_v1", enclosed=False),
+        T.MarkUnreliableDepth(sensor="photoneo_phoxi_m", rough=False),
+        make=frame_with_counts,
+    ),
     "MaskDepth": _of(
         T.MaskDepth(near=0.6, far=0.9),
         T.MaskDepth(use_mask=False, drop_labels=(0, 2)),
@@ -101,12 +121,27 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RemoveFlyingPixels": _of(
+        T.RemoveFlyingPixels(),
+        T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
+        make=frame_with_counts,
+    ),
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),
         T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, seed=4),
     ),
     "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
     "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),
+    "ResizeDepth": _of(
+        T.ResizeDepth(size=(7, 9), max_jump=None),
+        T.ResizeDepth(size=(24, 31), max_jump=0.3),
+        make=frame_with_counts,
+    ),
+    "SpatialFilterDepth": _of(
+        T.SpatialFilterDepth(),
+        T.SpatialFilterDepth(alpha=0.3, delta=5.0, iterations=1, hole_fill_radius=2, baseline=0.1),
+        make=frame_with_counts,
+    ),
     "SplitObjects": _of(T.SplitObjects()),
     "ToFrame": [
         Example(T.ToFrame(frame="base"), cloud_in_camera),

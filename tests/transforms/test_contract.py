@@ -63,7 +63,7 @@ def test_every_registered_transform_has_an_example():
 def test_it_does_something_on_its_example(example):
     data = example.make(COUNTS)
     results = [run(example, data, seed) for seed in range(5)]
-    watched = ("depth", "points", "colors", "normals", "labels", "meta")
+    watched = ("depth", "confidence", "points", "colors", "normals", "labels", "meta")
     seen = [{name: value for name, value in tree(result).items() if name in watched} for result in results]
     before = {name: value for name, value in tree(data).items() if name in watched}
     assert any(differences(before, after) for after in seen)
@@ -266,7 +266,19 @@ def changed_values(value: Any) -> list[Any]:
     if isinstance(value, (int, float)):
         return [value + 1, value / 2, value * 0.9, 0.3]
     if isinstance(value, str):
-        return [f"{value}x", "camera", "all", "above", "none", "centroid", "keep", "kinect_v1", "hallucinated"]
+        return [
+            f"{value}x",
+            "camera",
+            "all",
+            "above",
+            "none",
+            "centroid",
+            "keep",
+            "kinect_v1",
+            "hallucinated",
+            "nearest",
+            "mean",
+        ]
     if isinstance(value, T.Transform):
         return [T.Center()]
     if value is None:

@@ -52,6 +52,12 @@ def test_the_numbers_alone_give_the_same_pipeline():
     assert "sensor" not in pipeline.to_yaml()
 
 
+def test_steps_that_take_a_sensor_may_take_the_one_that_was_named():
+    steps = "[MarkUnreliableDepth: {sensor: sensor}, RandomSensorNoise: {sensor: sensor}, Deproject]"
+    pipeline = config_from_yaml(f"sensor: kinect_v1\ndepth: {steps}").pipeline
+    assert [step.sensor for step in pipeline.depth[:2]] == ["kinect_v1", "kinect_v1"]
+
+
 def test_a_name_may_still_be_called_sensor():
     pipeline = pipeline_from_yaml("- Deproject\n- ToFrame: {frame: sensor}")
     assert pipeline.steps[1].frame == "sensor"
@@ -80,7 +86,7 @@ def test_each_fault_is_told_with_its_place(text: str, expected: str):
 def test_a_field_that_no_profile_gives_says_which_do():
     (line,) = faults("sensor: kinect_v1\ncloud:\n  - RemovePlane: {distance: sensor}")
     assert line.startswith("c.yaml:3:29: RemovePlane.distance: Input should be a valid number (got 'sensor')")
-    assert "no sensor profile gives this field, only MaskDepth.far, MaskDepth.near" in line
+    assert "no sensor profile gives this field, only MarkUnreliableDepth.sensor, MaskDepth.far, MaskDepth.near" in line
 
 
 def test_an_unknown_sensor_does_not_hide_the_other_faults():

@@ -11,8 +11,9 @@
 #include <exception>
 #include <memory>
 #include <new>
-#include <thread>
 #include <vector>
+
+#include "pc/crew.hpp"
 
 #define PC_EXPORT extern "C" __attribute__((visibility("default")))
 
@@ -38,6 +39,7 @@ using std::uint8_t;
 template <class Body>
 int32_t guarded(Body&& body) noexcept {
   try {
+    Crew crew;
     body();
     return kOk;
   } catch (const std::bad_alloc&) {
@@ -70,40 +72,53 @@ class Poll {
   Clock::time_point next_;
 };
 
-// Call body(begin, end, thread) over [0, count) in pieces of `grain`, taken in order by up to context.threads threads.
-// Threads are made per call (35 us each): nothing lives on that a fork could break. Pieces may run in any order, so
-// bodies write disjoint results. A long piece delays Ctrl-C: keep it well under a second.
+// Call body(begin, end, thread) over [0, count) in pieces of `grain` by up to context.threads threads. Pieces may run in
+// any order, so bodies write disjoint results. A long piece delays Ctrl-C: keep it well under a second.
+//
+// Every thread has a stretch of its own, the same in every loop over the same pieces, so that it meets what it has in its
+// cache; one that is done helps the others.
 template <class Body>
 void parallel_for(const pc_context& context, int64_t count, int64_t grain, Body&& body) {
   if (count <= 0) return;
   const int64_t pieces = (count + grain - 1) / grain;
-  const int64_t threads = std::max<int64_t>(1, std::min<int64_t>(context.threads, pieces));
+  Crew* crew = Crew::current();
+  const int64_t threads = crew == nullptr ? 1 : std::max<int64_t>(1, std::min<int64_t>(context.threads, pieces));
   Poll poll(context);
-  std::atomic<int64_t> next{0};
+  if (threads == 1) {
+    for (int64_t piece = 0; piece < pieces; ++piece) {
+      poll.check();
+      body(piece * grain, std::min(count, (piece + 1) * grain), int64_t{0});
+    }
+    return;
+  }
+  struct alignas(64) Stretch {
+    std::atomic<int64_t> next;
+    int64_t end;
+  };
+  std::vector<Stretch> stretches(static_cast<size_t>(threads));
+  for (int64_t t = 0; t < threads; ++t) {
+    stretches[static_cast<size_t>(t)].next.store(pieces * t / threads, std::memory_order_relaxed);
+    stretches[static_cast<size_t>(t)].end = pieces * (t + 1) / threads;
+  }
   std::atomic<bool> stop{false};
   std::vector<std::exception_ptr> errors(static_cast<size_t>(threads));
   auto work = [&](int64_t thread) {
     try {
-      while (!stop.load(std::memory_order_relaxed)) {
-        if (thread == 0) poll.check();
-        const int64_t piece = next.fetch_add(1, std::memory_order_relaxed);
-        if (piece >= pieces) return;
-        body(piece * grain, std::min(count, (piece + 1) * grain), thread);
+      for (int64_t turn = 0; turn < threads; ++turn) {
+        Stretch& stretch = stretches[static_cast<size_t>((thread + turn) % threads)];
+        while (!stop.load(std::memory_order_relaxed)) {
+          if (thread == 0) poll.check();
+          const int64_t piece = stretch.next.fetch_add(1, std::memory_order_relaxed);
+          if (piece >= stretch.end) break;
+          body(piece * grain, std::min(count, (piece + 1) * grain), thread);
+        }
       }
     } catch (...) {
       errors[static_cast<size_t>(thread)] = std::current_exception();
       stop.store(true);
     }
   };
-  std::vector<std::thread> crew;
-  crew.reserve(static_cast<size_t>(threads));
-  try {
-    for (int64_t t = 1; t < threads; ++t) crew.emplace_back(work, t);
-  } catch (...) {
-    // No more threads to be had: the ones there are do the work.
-  }
-  work(0);
-  for (auto& thread : crew) thread.join();
+  crew->run(threads, work);
   for (auto& error : errors)
     if (error) std::rethrow_exception(error);
 }

@@ -27,6 +27,9 @@ struct Moments {
   Symmetric3 square;
 };
 
+// Differences of covariances (scaled to entries of at most 1) and of unit vectors that are rounding, not shape.
+constexpr double kRound = 1e-12;
+
 PC_HD double larger(double a, double b) { return a > b ? a : b; }
 
 PC_HD Vector3 cross(const Vector3& a, const Vector3& b) {
@@ -77,7 +80,7 @@ PC_HD Vector3 separate_eigenvector(const Symmetric3& m, double value) {
 
 // A unit vector across a unit vector, from the two components that cannot both vanish.
 PC_HD Vector3 perpendicular(const Vector3& v) {
-  const bool use_x = fabs(v.x) > fabs(v.y);
+  const bool use_x = fabs(v.x) > fabs(v.y) + kRound;
   return unit({use_x ? -v.z : 0.0, use_x ? 0.0 : v.z, use_x ? v.x : -v.y});
 }
 
@@ -88,7 +91,7 @@ PC_HD Vector3 smallest_across(const Symmetric3& m, const Vector3& clear) {
   // The larger axis of [[uu, uv], [uv, vv]] stands at half the angle of (p, q); half-angle formulas, the larger first.
   const double p = dot(u, along_u) - dot(v, along_v), q = 2 * dot(u, along_v);
   const double radius = sqrt(p * p + q * q);
-  const bool is_round = radius == 0;
+  const bool is_round = radius <= kRound;
   const double safe = is_round ? 1.0 : radius;
   const double main = sqrt((safe + fabs(p)) / (2 * safe)), other = fabs(q) / (2 * safe * main);
   const double cosine = is_round || p >= 0 ? main : other;
@@ -98,7 +101,7 @@ PC_HD Vector3 smallest_across(const Symmetric3& m, const Vector3& clear) {
 }
 
 // The unit eigenvector of the smallest eigenvalue. The eigenvalue that stands clear of the other two gives its vector;
-// where that is the largest, the smallest is found in the plane across it. A multiple of the identity: (0, 0, 1).
+// where that is the largest, the smallest is found in the plane across it. Where none stands out: as the reference says.
 PC_HD Vector3 smallest_eigenvector(const Symmetric3& a) {
   const double scale = larger(larger(larger(fabs(a.xx), fabs(a.xy)), larger(fabs(a.xz), fabs(a.yy))),
                               larger(fabs(a.yz), fabs(a.zz)));
@@ -108,7 +111,7 @@ PC_HD Vector3 smallest_eigenvector(const Symmetric3& a) {
   const double dx = m.xx - mean, dy = m.yy - mean, dz = m.zz - mean;
   const double off = m.xy * m.xy + m.xz * m.xz + m.yz * m.yz;
   const double spread = sqrt((dx * dx + dy * dy + dz * dz + 2 * off) / 6);
-  const bool is_isotropic = spread == 0;
+  const bool is_isotropic = spread <= kRound;
   const double safe = is_isotropic ? 1.0 : spread;
   const double determinant = dx * (dy * dz - m.yz * m.yz) - m.xy * (m.xy * dz - m.yz * m.xz) +
                              m.xz * (m.xy * m.yz - dy * m.xz);

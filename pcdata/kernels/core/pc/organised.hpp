@@ -27,11 +27,17 @@ struct Grid {
 struct CameraFrame {
   const double* matrix;  // (4, 4), or null for none
 
-  // One row of the matrix times a point, rounded once at the end.
-  float along(int row, float x, float y, float z) const {
-    if (matrix == nullptr) return row == 0 ? x : row == 1 ? y : z;
-    const double* m = matrix + 4 * row;
-    return static_cast<float>(m[0] * x + m[1] * y + m[2] * z + m[3]);
+  // Sixteen points; every coordinate is rounded once, at the end.
+  void move(Floats& x, Floats& y, Floats& z) const {
+    if (matrix == nullptr) return;
+    alignas(64) float from[3][kQueries], to[3][kQueries];
+    x.store(from[0]), y.store(from[1]), z.store(from[2]);
+    for (int axis = 0; axis < 3; ++axis) {
+      const double* m = matrix + 4 * axis;
+      for (int lane = 0; lane < kQueries; ++lane)
+        to[axis][lane] = static_cast<float>(m[0] * from[0][lane] + m[1] * from[1][lane] + m[2] * from[2][lane] + m[3]);
+    }
+    x = Floats::load(to[0]), y = Floats::load(to[1]), z = Floats::load(to[2]);
   }
 };
 
@@ -195,13 +201,14 @@ class OrganisedCloud {
 
   bool measure_slopes(const pc_context& context, ScratchFrame& scratch) {
     const int64_t bands = (height_ + kRowsPerPiece - 1) / kRowsPerPiece;
-    float* column = scratch.take<float>(2 * bands * width_);  // least, then most, of each band
+    const int64_t columns = (width_ + kQueries - 1) / kQueries * kQueries;
+    float* column = scratch.take<float>(2 * bands * columns);  // least, then most, of each band
     float* line = scratch.take<float>(2 * height_);
     std::atomic<bool> in_front{true};
     parallel_for(context, bands, 1, [&](int64_t band, int64_t, int64_t) {
-      float *least = column + 2 * band * width_, *most = least + width_;
+      float *least = column + 2 * band * columns, *most = least + columns;
       std::fill(least, most, kInfinity);
-      std::fill(most, most + width_, -kInfinity);
+      std::fill(most, most + columns, -kInfinity);
       bool fine = true;
       for (int64_t v = band * kRowsPerPiece, end = std::min(height_, v + kRowsPerPiece); v < end; ++v)
         fine &= slopes_of_line(v, least, most, line[v], line[height_ + v]);
@@ -210,36 +217,37 @@ class OrganisedCloud {
     if (!in_front.load()) return false;
     for (int64_t band = 1; band < bands; ++band)
       for (int64_t u = 0; u < width_; ++u) {
-        column[u] = std::min(column[u], column[2 * band * width_ + u]);
-        column[width_ + u] = std::max(column[width_ + u], column[(2 * band + 1) * width_ + u]);
+        column[u] = std::min(column[u], column[2 * band * columns + u]);
+        column[columns + u] = std::max(column[columns + u], column[(2 * band + 1) * columns + u]);
       }
-    columns_.build(scratch, column, column + width_, width_, max_reach_ + 1, max_reach_ + 1 + kQueries);
+    columns_.build(scratch, column, column + columns, width_, max_reach_ + 1, max_reach_ + 1 + kQueries);
     lines_.build(scratch, line, line + height_, height_, max_reach_ + 1, max_reach_ + 1);
     return true;
   }
 
+  // Missing pixels are at infinity, so their slopes are NaN, and a minimum with NaN gives the second value.
   bool slopes_of_line(int64_t v, float* least, float* most, float& line_least, float& line_most) const {
-    const float *x = image_[0] + v * stride_, *y = image_[1] + v * stride_, *z = image_[2] + v * stride_;
-    float low = kInfinity, high = -kInfinity;
-    int32_t bad = 0;
-    const bool moved = camera_.matrix != nullptr;
-    for (int64_t u = 0; u < width_; ++u) {
-      const bool real = z[u] < kInfinity;
-      const float cx = moved ? camera_.along(0, x[u], y[u], z[u]) : x[u];
-      const float cy = moved ? camera_.along(1, x[u], y[u], z[u]) : y[u];
-      const float cz = moved ? camera_.along(2, x[u], y[u], z[u]) : z[u];
-      const float inverse = 1.0f / cz, across = cx * inverse, down = cy * inverse;
+    Floats low(kInfinity), high(-kInfinity);
+    LaneMask bad = 0;
+    for (int64_t u = 0; u < width_; u += kQueries) {
+      const int64_t at = v * stride_ + u;
+      Floats x = Floats::load(image_[0] + at), y = Floats::load(image_[1] + at), z = Floats::load(image_[2] + at);
+      const LaneMask real = less(z, Floats(kInfinity));
+      camera_.move(x, y, z);
+      const Floats inverse = Floats(1.0f) / z, across = x * inverse, down = y * inverse;
       // Every comparison is false for NaN, which so counts as bad.
-      const bool fine = cz > kMinDepth && cz < kInfinity && std::fabs(across) < kMaxSlope && std::fabs(down) < kMaxSlope;
-      bad |= real & !fine;
-      least[u] = real && across < least[u] ? across : least[u];
-      most[u] = real && across > most[u] ? across : most[u];
-      low = real && down < low ? down : low;
-      high = real && down > high ? down : high;
+      bad |= real & ~(less(Floats(kMinDepth), z) & less(z, Floats(kInfinity)) & within(across) & within(down));
+      minimum(across, Floats::load(least + u)).store(least + u);
+      maximum(across, Floats::load(most + u)).store(most + u);
+      low = minimum(down, low);
+      high = maximum(down, high);
     }
-    line_least = low;
-    line_most = high;
+    line_least = -largest(Floats(0.0f) - low);
+    line_most = largest(high);
     return bad == 0;
+  }
+  static LaneMask within(const Floats& slope) {
+    return less(slope, Floats(kMaxSlope)) & less(Floats(-kMaxSlope), slope);
   }
 
   int64_t first_row_ = 0, first_column_ = 0, width_ = 0, height_ = 0, stride_ = 0, origin_ = 0;
@@ -295,6 +303,7 @@ class WindowSearch {
     for (int ring = 0; ring <= reach; ++ring) offer_ring(queries, ring, nearest);
     const Place place(cloud_, queries);
     for (;; offer_ring(queries, ++reach, nearest)) {
+      nearest.settle();
       reach_ = reach;
       const LaneMask proved = less(nearest.bound(), clear_within(place, reach)) & queries.active;
       if (proved == queries.active || reach == cloud_.max_reach()) return proved;
@@ -304,17 +313,18 @@ class WindowSearch {
     }
   }
 
-  // Show again every pixel of the last window: body(x, y, z, row of the point in each lane).
+  // Show again every pixel of the last window: body(x, y, z, id), where row_in_lane(id, lane) is the point's row.
   template <class Body>
   void replay(const QueryGroup&, const Floats&, Body&& body) const {
     for (int ring = 0; ring <= reach_; ++ring)
       for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
         const int64_t at = pixel(*offset);
         body(Floats::load(cloud_.x() + at), Floats::load(cloud_.y() + at), Floats::load(cloud_.z() + at),
-             [&](int lane) { return cloud_.row(at + lane); });
+             static_cast<uint32_t>(at));
       }
   }
   uint32_t row(uint32_t id) const { return cloud_.row(id); }
+  uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(int64_t{id} + lane); }
 
  private:
   // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each
@@ -323,18 +333,7 @@ class WindowSearch {
     Floats x, y, z, slack;
 
     Place(const OrganisedCloud& cloud, const QueryGroup& queries) : x(queries.x), y(queries.y), z(queries.z) {
-      if (cloud.camera().matrix != nullptr) {
-        alignas(64) float from[3][kQueries], to[3][kQueries];
-        x.store(from[0]);
-        y.store(from[1]);
-        z.store(from[2]);
-        for (int axis = 0; axis < 3; ++axis)
-          for (int lane = 0; lane < kQueries; ++lane)
-            to[axis][lane] = cloud.camera().along(axis, from[0][lane], from[1][lane], from[2][lane]);
-        x = Floats::load(to[0]);
-        y = Floats::load(to[1]);
-        z = Floats::load(to[2]);
-      }
+      cloud.camera().move(x, y, z);
       const Floats zero(0.0f);
       slack = (maximum(x, zero - x) + maximum(y, zero - y) + z) * Floats(1e-6f);
     }

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #include <utility>
 
 #if defined(__SSE2__)
@@ -26,6 +27,8 @@ constexpr int kRegisterBytes = 16;
 
 using FloatRegister = float __attribute__((vector_size(kRegisterBytes)));
 using DoubleRegister = double __attribute__((vector_size(kRegisterBytes)));
+using Int32Register = int32_t __attribute__((vector_size(kRegisterBytes)));
+using Int64Register = int64_t __attribute__((vector_size(kRegisterBytes)));
 
 // One bit per lane, lane 0 lowest.
 using LaneMask = uint32_t;
@@ -132,6 +135,8 @@ struct Sixteen {
     each([&](size_t p) { return std::memcpy(to + p * kPerPart, &part[p], sizeof(Register)), part[p]; });
   }
 
+  Scalar operator[](int lane) const { return part[lane / kPerPart][lane % kPerPart]; }
+
   // The lanes whose parts are body(0), body(1), ...
   template <class Body>
   static Sixteen each(Body&& body) {
@@ -207,17 +212,20 @@ inline Doubles widen(const Floats& a) {
 }
 
 // The values of the lanes in `mask`, 0 in the others.
-inline Doubles keep(LaneMask mask, const Doubles& value) {
-  return Doubles::each([&](size_t p) -> DoubleRegister {
-    const LaneMask chosen = mask >> (p * Doubles::kPerPart);
+template <class Scalar, class Register>
+Sixteen<Scalar, Register> keep(LaneMask mask, const Sixteen<Scalar, Register>& value) {
+  using All = Sixteen<Scalar, Register>;
+  return All::each([&](size_t p) -> Register {
+    const LaneMask chosen = mask >> (p * All::kPerPart);
 #if defined(PC_AVX512)
-    return _mm512_maskz_mov_pd(static_cast<__mmask8>(chosen), value.part[p]);
+    if constexpr (sizeof(Scalar) == 4) return _mm512_maskz_mov_ps(static_cast<__mmask16>(chosen), value.part[p]);
+    else return _mm512_maskz_mov_pd(static_cast<__mmask8>(chosen), value.part[p]);
 #else
-    using Integers = int64_t __attribute__((vector_size(kRegisterBytes)));
+    using Integers = std::conditional_t<sizeof(Scalar) == 4, Int32Register, Int64Register>;
     Integers bit;
-    for (int i = 0; i < Doubles::kPerPart; ++i) bit[i] = int64_t{1} << i;
-    const Integers all = (bit & int64_t{chosen}) == bit;
-    return reinterpret_cast<DoubleRegister>(reinterpret_cast<Integers>(value.part[p]) & all);
+    for (int i = 0; i < All::kPerPart; ++i) bit[i] = 1 << i;
+    const Integers all = (bit & (Integers{} + static_cast<int32_t>(chosen))) == bit;
+    return reinterpret_cast<Register>(reinterpret_cast<Integers>(value.part[p]) & all);
 #endif
   });
 }

@@ -64,8 +64,10 @@ class TreeSearch {
   }
 
   uint32_t row(uint32_t id) const { return id; }
+  uint32_t row_in_lane(uint32_t id, int) const { return id; }
 
-  // Show again every point that run() has shown, and is at most `reach` away from some lane: body(x, y, z, row of the point in each lane).
+  // Show again every point that run() has shown and that lies in a box at most `reach` away from some lane:
+  // body(x, y, z, id), where row_in_lane(id, lane) is the point's row.
   template <class Body>
   void replay(const QueryGroup& queries, const Floats& reach, Body&& body) const {
     for (const int64_t index : visited_) {
@@ -73,7 +75,7 @@ class TreeSearch {
       const Leaf& leaf = tree_.leaf[index];
       for (int i = 0; i < kLeafSize; ++i)
         if (leaf.row[i] != kNoId)
-          body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), [&](int) { return leaf.row[i]; });
+          body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), leaf.row[i]);
     }
   }
 
@@ -87,6 +89,7 @@ class TreeSearch {
                                             Floats(leaf.z[i]) - queries.z);
       if (nearest.wants(squared)) nearest.offer(squared, Ids::same(leaf.row[i]));
     }
+    nearest.settle();
   }
 
   template <class Nearest>

@@ -7,9 +7,9 @@
 namespace pc {
 namespace {
 
-// The search finds only the k-th distance. A second look at its candidates sums the moments of the nearer ones in all
-// lanes at once, which costs less than carrying sixteen lists of who they are; those at exactly the k-th distance are
-// noted and enter by row until there are k.
+// The search finds only the k-th distance. A second look at its candidates sums the moments of those that are no
+// farther in all lanes at once, which costs less than carrying sixteen lists of who they are. Where several lie at
+// exactly the k-th distance that may be more than k: the highest rows among these are taken out again.
 class WriteNormals {
  public:
   WriteNormals(int64_t k, float* normals) : k_(k), normals_(normals) {}
@@ -17,28 +17,36 @@ class WriteNormals {
   template <class Search, class Nearest>
   void operator()(const Search& search, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) {
     const Floats kth = nearest.bound();
-    LaneMoments sums;
-    for (auto& tied : tied_) tied.clear();
     const Doubles query_x = widen(group.x), query_y = widen(group.y), query_z = widen(group.z);
-    search.replay(group, kth, [&](const Floats& x, const Floats& y, const Floats& z, auto&& row_of) {
+    Sums sums;
+    tied_.clear();
+    search.replay(group, kth, [&](const Floats& x, const Floats& y, const Floats& z, uint32_t id) {
       const Floats squared = squared_length(x - group.x, y - group.y, z - group.z);
       const LaneMask reached = less_equal(squared, kth) & group.active;
       if (reached == 0) return;
-      const LaneMask nearer = less(squared, kth);
-      const Doubles dx = widen(x) - query_x, dy = widen(y) - query_y, dz = widen(z) - query_z;
-      sums.add(reached & nearer, dx, dy, dz);
-      if (const LaneMask tied = reached & ~nearer) note_ties(tied, dx, dy, dz, row_of);
+      sums.add(reached, widen(x) - query_x, widen(y) - query_y, widen(z) - query_z);
+      if (const LaneMask tied = reached & ~less(squared, kth)) tied_.push_back({x, y, z, tied, id});
     });
-    write(sums, group.active, row);
+    alignas(64) double sum[kSums][kQueries];
+    sums.store(sum);
+    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      if (sum[0][lane] > static_cast<double>(k_)) take_out_surplus(search, group, lane, sum);
+    }
+    write(sum, group.active, row);
   }
 
  private:
-  struct LaneMoments {
-    Doubles count{0.0}, x{0.0}, y{0.0}, z{0.0}, xx{0.0}, xy{0.0}, xz{0.0}, yy{0.0}, yz{0.0}, zz{0.0};
+  // Count, then first and second moments.
+  static constexpr int kSums = 10;
+
+  struct Sums {
+    Floats count{0.0f};  // whole and small: exact
+    Doubles x{0.0}, y{0.0}, z{0.0}, xx{0.0}, xy{0.0}, xz{0.0}, yy{0.0}, yz{0.0}, zz{0.0};
 
     void add(LaneMask mask, const Doubles& all_dx, const Doubles& all_dy, const Doubles& all_dz) {
       const Doubles dx = keep(mask, all_dx), dy = keep(mask, all_dy), dz = keep(mask, all_dz);
-      count = count + keep(mask, Doubles(1.0));
+      count = count + keep(mask, Floats(1.0f));
       x = x + dx;
       y = y + dy;
       z = z + dz;
@@ -49,58 +57,37 @@ class WriteNormals {
       yz = yz + dy * dz;
       zz = zz + dz * dz;
     }
+    void store(double (&to)[kSums][kQueries]) const {
+      const Doubles all[kSums] = {widen(count), x, y, z, xx, xy, xz, yy, yz, zz};
+      for (int s = 0; s < kSums; ++s) all[s].store(to[s]);
+    }
   };
-  static constexpr int kSums = sizeof(LaneMoments) / sizeof(Doubles);
 
+  // A candidate at the k-th distance in some lanes.
   struct Tied {
-    uint32_t row;
-    double dx, dy, dz;
+    Floats x, y, z;
+    LaneMask lanes;
+    uint32_t id;
   };
 
-  template <class RowOf>
-  void note_ties(LaneMask lanes, const Doubles& dx, const Doubles& dy, const Doubles& dz, RowOf&& row_of) {
-    alignas(64) double x[kQueries], y[kQueries], z[kQueries];
-    dx.store(x);
-    dy.store(y);
-    dz.store(z);
-    for (; lanes != 0; lanes &= lanes - 1) {
-      const int lane = __builtin_ctz(lanes);
-      tied_[lane].push_back({row_of(lane), x[lane], y[lane], z[lane]});
+  template <class Search>
+  void take_out_surplus(const Search& search, const QueryGroup& group, int lane, double (&sum)[kSums][kQueries]) {
+    order_.clear();
+    for (const Tied& tied : tied_)
+      if (tied.lanes >> lane & 1) order_.push_back({search.row_in_lane(tied.id, lane), &tied});
+    const auto surplus = static_cast<ptrdiff_t>(sum[0][lane]) - static_cast<ptrdiff_t>(k_);
+    std::nth_element(order_.begin(), order_.end() - surplus, order_.end());
+    for (auto out = order_.end() - surplus; out != order_.end(); ++out) {
+      const Tied& tied = *out->second;
+      const double x = double{tied.x[lane]} - double{group.x[lane]}, y = double{tied.y[lane]} - double{group.y[lane]},
+                   z = double{tied.z[lane]} - double{group.z[lane]};
+      const double term[kSums] = {1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z};
+      for (int s = 0; s < kSums; ++s) sum[s][lane] -= term[s];
     }
   }
 
-  void add_ties(int lane, Moments& sums) {
-    auto& tied = tied_[lane];
-    const int64_t wanted = k_ - static_cast<int64_t>(sums.count);
-    if (static_cast<int64_t>(tied.size()) > wanted) {
-      std::sort(tied.begin(), tied.end(), [](const Tied& a, const Tied& b) { return a.row < b.row; });
-      tied.resize(static_cast<size_t>(wanted));
-    }
-    for (const Tied& t : tied) {
-      sums.count += 1;
-      sums.x += t.dx;
-      sums.y += t.dy;
-      sums.z += t.dz;
-      sums.square.xx += t.dx * t.dx;
-      sums.square.xy += t.dx * t.dy;
-      sums.square.xz += t.dx * t.dz;
-      sums.square.yy += t.dy * t.dy;
-      sums.square.yz += t.dy * t.dz;
-      sums.square.zz += t.dz * t.dz;
-    }
-  }
-
-  void write(const LaneMoments& lanes, LaneMask active, const uint32_t* row) {
-    alignas(64) double sum[kSums][kQueries], normal[3][kQueries];
-    std::memcpy(sum, &lanes, sizeof(sum));
-    for (LaneMask left = active; left != 0; left &= left - 1) {
-      const int i = __builtin_ctz(left);
-      Moments m = at(sum, i);
-      add_ties(i, m);
-      const double with_ties[kSums] = {m.count,     m.x,         m.y,         m.z,         m.square.xx,
-                                       m.square.xy, m.square.xz, m.square.yy, m.square.yz, m.square.zz};
-      for (int s = 0; s < kSums; ++s) sum[s][i] = with_ties[s];
-    }
+  void write(const double (&sum)[kSums][kQueries], LaneMask active, const uint32_t* row) {
+    alignas(64) double normal[3][kQueries];
     for (int i = 0; i < kQueries; ++i) {
       const Vector3 n = normal_of(at(sum, i));
       normal[0][i] = n.x;
@@ -119,7 +106,8 @@ class WriteNormals {
 
   int64_t k_;
   float* normals_;  // (N, 3)
-  std::vector<Tied> tied_[kQueries];
+  std::vector<Tied> tied_;
+  std::vector<std::pair<uint32_t, const Tied*>> order_;  // by row
 };
 
 template <class Nearest>

@@ -1,0 +1,79 @@
+"""The command that judges raw captures: validate."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, Any
+
+from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.progress import Progress
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    validate = commands.add_parser("validate", help="check raw captures, each camera on its own, before any fusion")
+    validate.add_argument("path", metavar="PATH", help="folder of captures, or one cloud file")
+    add_capture_options(validate)
+    validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    depths = validate.add_mutually_exclusive_group()
+    depths.add_argument("--sensor", metavar="NAME", help="depths of interest: the range of a sensor (pcdata profiles)")
+    depths.add_argument(
+        "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
+    )
+    validate.add_argument("--json", metavar="FILE", help="write every check on every capture to a new file")
+    validate.set_defaults(run=_validate)
+
+
+def _validate(arguments: argparse.Namespace) -> int:
+    from pcdata.errors import IntrinsicsError, PoseError, UnitError
+    from pcdata.io.files import replacing
+    from pcdata.report.validation import validation_text
+    from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict, check_of_error, validate_source
+
+    limits = Limits.for_sensor(arguments.sensor) if arguments.sensor else Limits()
+    if arguments.workspace:
+        limits = Limits(workspace=tuple(arguments.workspace))
+    summary = Summary()
+    total = 0
+    try:
+        source = open_captures(arguments.path, arguments, limit=arguments.limit)
+        reports, total = validate_source(source, limits=limits), len(source)
+    except (IntrinsicsError, PoseError, UnitError) as error:  # a calibration that no capture can be read with
+        reports = iter([SampleReport(WHOLE, (check_of_error(error),))])
+    target = replacing("validate --json", arguments.json) if arguments.json else nullcontext()
+    with target as temporary, Progress("validate") as progress:
+        writer = None if temporary is None else _Writer(temporary, arguments.path, asdict(limits))
+        for done, report in enumerate(reports, 1):
+            summary.add(report)
+            if writer is not None:
+                writer.add(report.to_json())
+            if report.sample_id != WHOLE:
+                progress(done, total, report.sample_id)
+        if writer is not None:
+            writer.close(summary.to_json())
+    print(validation_text(summary))
+    return int(summary.verdict is Verdict.FAIL)
+
+
+class _Writer:
+    """Writes the JSON document report by report, so that a long recording need not fit into memory."""
+
+    def __init__(self, path: Path, source: str, limits: dict[str, Any]) -> None:
+        self._file: IO[str] = open(path, "w", encoding="utf-8")  # noqa: SIM115  # closed by close
+        head = {"schema": "pcdata.validation/1", "source": str(source), "limits": limits}
+        self._file.write(json.dumps(head, indent=1)[:-2] + ',\n "samples": [')
+        self._first = True
+
+    def add(self, report: dict[str, Any]) -> None:
+        """Write one report."""
+        self._file.write(("\n  " if self._first else ",\n  ") + json.dumps(report, allow_nan=False))
+        self._first = False
+
+    def close(self, summary: dict[str, Any]) -> None:
+        """Write the end."""
+        self._file.write('\n ],\n "summary": ' + json.dumps(summary, allow_nan=False) + "\n}\n")
+        self._file.close()

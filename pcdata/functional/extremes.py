@@ -1,0 +1,36 @@
+"""Readings that pile up at the end of the range, as they do where a sensor or a converter clips."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+_NEXT = 0.02  # of the value: how far the neighbourhood reaches that a pile is compared with
+
+
+class Pile(NamedTuple):
+    """Readings that are exactly the highest or the lowest one."""
+
+    value: float  # metres
+    fraction: float  # of all readings
+
+
+def pile_at_extreme(
+    depth: Tensor,  # (H, W) float32, metres, 0 = no reading
+    *,
+    end: str = "far",  # "far" or "near"
+) -> Pile | None:
+    """Return the readings exactly at the highest (or lowest) depth if they outnumber those within 2 % of it.
+
+    A surface that ends there gives no pile: with noise, fewer readings lie at the very end than just before it.
+    None = no pile, or no reading.
+    """
+    valid = depth[depth > 0]
+    if not len(valid):
+        return None
+    value = valid.max() if end == "far" else valid.min()
+    here = int((valid == value).sum())
+    close = valid > (1 - _NEXT) * value if end == "far" else valid < (1 + _NEXT) * value
+    beside = int(close.sum()) - here
+    return Pile(float(value), here / len(valid)) if here > beside else None

@@ -1,0 +1,37 @@
+"""When each capture was taken: ``timestamps.json`` beside the images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from pcdata.errors import CaptureError
+from pcdata.io.files import read_text
+from pcdata.io.source import check_partners
+
+_LONGEST = 1e12  # seconds, 30,000 years: more are microseconds or nanoseconds
+
+
+def read_timestamps(path: Path, ids: Iterable[str]) -> dict[str, float]:
+    """Read ``{"NAME": seconds, ...}``, one number for every sample.
+
+    The seconds may count from any moment, the same for all.
+
+    Raises:
+        CaptureError: the file is no such JSON object, or names other samples than there are.
+    """
+    where = f"read_timestamps: {path}"
+    try:
+        times = json.loads(read_text(where, path))
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{where}: not valid JSON: {error}") from error
+    if not isinstance(times, dict) or not all(_is_time(time) for time in times.values()):
+        raise CaptureError(f'{where}: must be a JSON object of seconds by name, such as {{"0001": 12.033}}')
+    check_partners(where, ids, {"timestamp": times})
+    return {name: float(time) for name, time in times.items()}
+
+
+def _is_time(value: object) -> bool:
+    # A bound instead of isfinite, which cannot take the whole numbers of any length that JSON allows.
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -_LONGEST < value < _LONGEST

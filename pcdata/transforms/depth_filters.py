@@ -1,0 +1,85 @@
+"""Filters of depth images: SpatialFilterDepth, FillHoles, RemoveFlyingPixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import torch
+from annotated_types import Ge, Gt, Interval, Le
+
+from pcdata.functional.depth_holes import fill_holes, fill_rows
+from pcdata.functional.disparity import depth_to_disparity, disparity_to_depth, spatial_filter
+from pcdata.functional.flying_pixels import flying_pixel_mask
+from pcdata.structures import Confidence, DepthFrame
+from pcdata.structures.filled import with_filled_depth
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
+
+
+class SpatialFilterDepth(Transform):
+    """Smooth surfaces and keep edges, in disparity, with the parameters of librealsense's spatial filter.
+
+    The focal length is fx of the frame's camera. Pixels filled by ``hole_fill_radius`` are COMPLETED.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    alpha: Annotated[float, Gt(0), Le(1)] = 0.5  # weight of the pixel itself; 1 = no smoothing
+    delta: Positive = 20.0  # 1/32 pixel of disparity: the smallest step that is an edge
+    iterations: Count = 2
+    hole_fill_radius: Annotated[int, Ge(0)] = 0  # pixels filled from both ends of every gap in a row
+    baseline: Metres = 0.05  # between the two imagers; it scales what delta means
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Filter all views in one call."""
+        focal = data.camera.intrinsics[:, 0, 0].to(data.device)
+        disparity = depth_to_disparity(data.depth, focal, self.baseline)
+        disparity = spatial_filter(disparity, alpha=self.alpha, delta=self.delta, iterations=self.iterations)
+        if self.hole_fill_radius:
+            disparity = fill_rows(disparity, self.hole_fill_radius)
+        depth = disparity_to_depth(disparity, focal, self.baseline)
+        return with_filled_depth(data, depth, (depth > 0) & (data.depth == 0))
+
+
+class FillHoles(Transform):
+    """Give pixels without a reading the depth of a reading beside them, by one of librealsense's three rules.
+
+    Filled pixels are marked in the confidence: COMPLETED up to ``max_distance`` pixels from the reading they copy,
+    HALLUCINATED beyond.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    rule: Literal["left", "farthest", "nearest"] = "farthest"
+    max_size: Count | None = None  # only where no square of this many pixels + 1 without a reading fits; None = all
+    max_distance: Count = 8  # pixels
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Fill all views in one call."""
+        depth, distance = fill_holes(data.depth, rule=self.rule, max_size=self.max_size)
+        return with_filled_depth(data, depth, distance > 0, distance > self.max_distance)
+
+
+class RemoveFlyingPixels(Transform):
+    """Set readings to "no reading" that hang between two surfaces at a depth edge.
+
+    Cheap enough for every frame, and best done before any filter that averages or fills: those would spread them.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    # As a part of the depth: neighbours that differ more lie on two surfaces.
+    tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02
+    min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3  # of the eight, on the reading's own surface
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Blank the flying pixels of all views."""
+        flying = flying_pixel_mask(data.depth, tolerance=self.tolerance, min_neighbors=self.min_neighbors)
+        confidence = data.confidence
+        if confidence is not None:
+            confidence = torch.where(flying, int(Confidence.NO_READING), confidence).to(torch.uint8)
+        return replace(data, depth=torch.where(flying, 0.0, data.depth), confidence=confidence)

@@ -1,0 +1,87 @@
+"""Depth frames of another size: DecimateDepth, ResizeDepth. The intrinsics always follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import torch
+from annotated_types import Interval
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from pcdata.functional.depth_resampling import MAX_FACTOR, decimate_depth, resize_depth
+from pcdata.structures import DepthFrame
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.fields import Count, Positive
+
+
+class DecimateDepth(Transform):
+    """Make one pixel of every ``factor`` x ``factor`` block from its readings; rows and columns left over are cut off.
+
+    Labels, confidence and mask are those of the pixel with the median reading, so they describe the surface that stays;
+    colours are averaged over the block.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    factor: Annotated[int, Interval(ge=2, le=MAX_FACTOR)] = 2
+    rule: Literal["median", "mean"] = "median"  # the mean mixes the surfaces that meet in a block
+    max_jump: Positive = 0.02  # as a part of the depth: what differs more is another surface
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Reduce every image and rewrite the intrinsics."""
+        depth, pixel_index = decimate_depth(data.depth, factor=self.factor, rule=self.rule, max_jump=self.max_jump)
+        size = (depth.shape[1], depth.shape[2])
+        covered = (size[0] * self.factor, size[1] * self.factor)
+        camera = data.camera if covered == data.size else data.camera.cropped(0, 0, covered)
+        colors = None
+        if data.colors is not None:
+            colors = _as_bytes(avg_pool2d(_channels_first(data.colors[:, : covered[0], : covered[1]]), self.factor))
+        return replace(
+            data, depth=depth, camera=camera.resized(size), colors=colors, **_images_of_pixels(data, pixel_index)
+        )
+
+
+class ResizeDepth(Transform):
+    """Sample the images at another size: depth never blends across an edge, labels never blend at all.
+
+    Depth on one surface is interpolated, exactly on planes; across edges, beside holes, and everywhere if ``max_jump``
+    is None, a pixel takes the nearest reading, up to half a pixel off. Labels, confidence and mask are those of the
+    nearest pixel; colours are filtered against aliasing.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    size: tuple[Count, Count]  # (height, width)
+    max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Resize every image and rewrite the intrinsics."""
+        depth, pixel_index = resize_depth(data.depth, size=self.size, max_jump=self.max_jump)
+        colors = None
+        if data.colors is not None:
+            # Not kornia's resize: its antialiasing is a Gaussian blur of the whole image before it interpolates.
+            images = _channels_first(data.colors)
+            colors = _as_bytes(interpolate(images, self.size, mode="bilinear", antialias=True))
+        camera = data.camera.resized(self.size)
+        return replace(data, depth=depth, camera=camera, colors=colors, **_images_of_pixels(data, pixel_index))
+
+
+def _images_of_pixels(frame: DepthFrame, pixel_index: Tensor) -> dict[str, Any]:
+    """Return labels, confidence and mask at the given (V, h, w) pixels ``v * W + u`` of the frame."""
+    images = {"labels": frame.labels, "confidence": frame.confidence, "mask": frame.mask}
+    return {
+        name: None if image is None else image.flatten(1).gather(1, pixel_index.flatten(1)).reshape(pixel_index.shape)
+        for name, image in images.items()
+    }
+
+
+def _channels_first(colors: Tensor) -> Tensor:
+    return colors.permute(0, 3, 1, 2).float()
+
+
+def _as_bytes(images: Tensor) -> Tensor:
+    return images.round_().clamp_(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()

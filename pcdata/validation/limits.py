@@ -1,0 +1,53 @@
+"""The thresholds of the checks, each with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pcdata.errors import ConfigError
+from pcdata.sensors import sensor_profile
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Where checks stop passing and where they fail; the defaults suit a camera above a table.
+
+    Pairs are (last value that passes, last value that does not fail).
+    """
+
+    # Depth that the task is about, (nearest, farthest) in metres.
+    workspace: tuple[float, float] = (0.2, 2.0)
+    # Of a 640x480 image 200,000 readings are usual, and fewer than 100,000 are a coverage problem; as fractions they
+    # hold for every resolution.
+    valid_fraction: tuple[float, float] = (200_000 / 307_200, 100_000 / 307_200)
+    # One region may not miss as much as all holes together may; at half of that it is worth a look.
+    missing_region: tuple[float, float] = (0.5 * (1 - 200_000 / 307_200), 1 - 200_000 / 307_200)
+    # Most readings should be of the workspace; a third is what coverage demands of the whole image.
+    workspace_fraction: tuple[float, float] = (0.5, 100_000 / 307_200)
+    # A single depth holds less than 1 in 500 readings of any real scene's end; 1 in 100 makes a false wall.
+    saturation: tuple[float, float] = (0.002, 0.01)
+    # Of the image's width or height. Lenses are mounted within 5 %; K of an image resized by 1.25 is off by 10 %.
+    principal_point: tuple[float, float] = (0.05, 0.10)
+    # Degrees across the image: depth cameras lie between 40 (long-range stereo) and 110 (wide time of flight).
+    field_of_view: tuple[float, float] = (30.0, 120.0)
+    # Pixels are square to 1 % in every depth camera; an image resized unevenly differs on purpose, so this warns only.
+    pixel_aspect: float = 0.03
+    # Pixels: halfway between registered and off by 3, which must be told apart.
+    color_shift: float = 1.5
+    # Seconds between the views of one capture: half a frame and a whole one at 30 per second.
+    sync: tuple[float, float] = (0.0167, 0.0334)
+
+    @classmethod
+    def for_sensor(cls, name: str) -> Limits:
+        """Return limits whose workspace is the range in which the named sensor works well.
+
+        Raises:
+            ConfigError: there is no profile of this name.
+        """
+        return cls(workspace=sensor_profile(name).range)
+
+    def __post_init__(self) -> None:
+        near, far = self.workspace
+        if not (0 < near < far and math.isfinite(far)):
+            raise ConfigError(f"Limits: workspace must be (near, far) in metres with 0 < near < far, got {near}, {far}")

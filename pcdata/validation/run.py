@@ -1,0 +1,141 @@
+"""Run the checks: on one frame, or on every capture of a source, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+from pcdata.errors import IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
+from pcdata.functional.edge_offset import EdgeVotes
+from pcdata.io.source import Source
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.validation.cameras import intrinsics_checks, pose_checks
+from pcdata.validation.check import Check, Verdict, worst
+from pcdata.validation.clouds import cloud_checks
+from pcdata.validation.coverage import coverage_checks
+from pcdata.validation.limits import Limits
+from pcdata.validation.pose_direction import PoseDirectionOverTime, direction_checks
+from pcdata.validation.raw_files import raw_value_check
+from pcdata.validation.readings import reading_checks
+from pcdata.validation.registration import frame_votes, registration_check
+from pcdata.validation.report import WHOLE, SampleReport
+from pcdata.validation.sequence import ClockChecks, RepeatChecks
+from pcdata.validation.view_overlap import overlap_checks
+
+# What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
+READABLE = "readable"
+_CHECK_OF_ERROR: dict[type[PcdataError], str] = {
+    IntrinsicsError: "intrinsics",
+    NoReadingError: "valid_fraction",
+    PoseError: "pose",
+    UnitError: "depth_unit",
+}
+
+
+class Captures(Protocol):
+    """What has ids and loads one capture for each: every Source, and SyntheticSource."""
+
+    @property
+    def ids(self) -> list[str]: ...  # noqa: D102
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud: ...  # noqa: D102
+
+
+def validate_frame(frame: DepthFrame, *, limits: Limits | None = None) -> list[Check]:
+    """Check every view of one capture on its own, then the views against each other.
+
+    Args:
+        frame: the capture as it was read, before any filter.
+        limits: thresholds; None = the defaults, for a camera above a table.
+    """
+    return _frame_checks(frame, frame_votes(frame), limits or Limits())
+
+
+def validate_source(source: Captures, *, limits: Limits | None = None) -> Iterator[SampleReport]:
+    """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
+
+    One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
+    report with a failed check, and the others follow. After a recording with colour a last report, with the sample id
+    :data:`WHOLE`, judges the registration over all captures together, which sees more rims than any single one.
+
+    Args:
+        source: anything with ``ids`` and ``load``; a :class:`Source` also has its files looked at.
+        limits: thresholds; None = the defaults, for a camera above a table.
+    """
+    series = _Series(limits or Limits())
+    for sample_id in source.ids:
+        yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
+    if whole := series.whole():
+        yield SampleReport(WHOLE, tuple(whole))
+
+
+def check_of_error(error: PcdataError) -> Check:
+    """Turn what a reader refused into the failed check that its type names."""
+    names = (name for kind, name in _CHECK_OF_ERROR.items() if isinstance(error, kind))
+    return Check(
+        name=next(names, READABLE),
+        verdict=Verdict.FAIL,
+        found=str(error),
+        advice="see the message; this capture is refused wherever it is read",
+    )
+
+
+class _Series:
+    """Checks captures one after another and remembers what the next ones are compared with."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._over_time = (RepeatChecks(), ClockChecks(limits), PoseDirectionOverTime())
+        self._votes: list[EdgeVotes] = []  # by view, summed over the captures
+        self._voted = 0
+
+    def check(self, source: Captures, sample_id: str) -> list[Check]:
+        checks: list[Check] = []
+        try:
+            if isinstance(source, Source) and "depth" in (files := source.files(sample_id)):
+                checks.append(raw_value_check(files["depth"]))
+            capture = source.load(sample_id)
+        except PcdataError as error:
+            return [*checks, check_of_error(error)]
+        if isinstance(capture, PointCloud):
+            return [*checks, *cloud_checks(capture, self._limits)]
+        votes = frame_votes(capture)
+        checks += _frame_checks(capture, votes, self._limits)
+        self._add(votes)
+        for over_time in self._over_time:
+            checks += over_time.check(capture)
+        return checks
+
+    def whole(self) -> list[Check]:
+        """Judge what all captures tell together."""
+        if self._voted < 2:
+            return []
+        return [registration_check(votes, self._limits, view) for view, votes in enumerate(self._votes)]
+
+    def _add(self, votes: list[EdgeVotes]) -> None:
+        """Add up the votes, of captures with equal numbers of views and resolution."""
+        if not votes:
+            return
+        if not self._votes:
+            self._votes = votes
+        elif [one.scale for one in votes] == [one.scale for one in self._votes]:
+            self._votes = [total + one for total, one in zip(self._votes, votes)]
+        else:
+            return
+        self._voted += 1
+
+
+def _frame_checks(frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits) -> list[Check]:
+    unit = frame.provenance.get("metres_per_unit")
+    checks = []
+    for view, depth in enumerate(frame.depth):
+        checks += coverage_checks(depth > 0, limits, view)
+        checks += reading_checks(depth, limits, metres_per_unit=unit, view=view)
+    checks += intrinsics_checks(frame.camera, limits)
+    checks += pose_checks(frame)
+    direction = direction_checks(frame)
+    checks += direction
+    if worst(direction) is not Verdict.FAIL:  # views carried the wrong way have no gap worth a number
+        checks += overlap_checks(frame)
+    checks += [registration_check(one, limits, view) for view, one in enumerate(votes)]
+    return checks

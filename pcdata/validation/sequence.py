@@ -1,0 +1,120 @@
+"""What only a series of captures can tell: images that repeat, and clocks."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict, deque
+from statistics import median
+
+from torch import Tensor
+
+from pcdata.structures import DepthFrame
+from pcdata.validation.check import Check, Verdict, graded
+from pcdata.validation.limits import Limits
+
+_REMEMBERED = 10_000  # captures: an image that comes again later than this goes unnoticed
+_INTERVALS = 100  # the usual interval is the median of so many
+_GAP = 2.5  # usual intervals without a capture: two frames are lost at least
+_SENSORS_DIFFER = "no sensor gives one image twice: the stream stands still, or captures were stored twice"
+
+
+class RepeatChecks:
+    """Compares every image of a view with those of earlier captures, bit for bit, by their hashes."""
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[str, int], OrderedDict[bytes, tuple[int, str]]] = {}
+        self._count = 0
+
+    def check(self, frame: DepthFrame) -> list[Check]:
+        """Judge the views of the next capture."""
+        self._count += 1
+        checks = []
+        for view in range(frame.num_views):
+            depth = self._earlier("depth", view, frame.depth[view], frame.sample_id)
+            checks.append(_repeat("repeated_depth", depth, view))
+            if frame.colors is not None:
+                color = self._earlier("color", view, frame.colors[view], frame.sample_id)
+                checks.append(_repeat("repeated_color", color, view))
+        return checks
+
+    def _earlier(self, image: str, view: int, pixels: Tensor, sample_id: str) -> tuple[int, str] | None:
+        """Return how many captures ago this image was there, and in which one."""
+        digest = hashlib.blake2b(pixels.contiguous().cpu().numpy().data, digest_size=16).digest()
+        seen = self._seen.setdefault((image, view), OrderedDict())
+        before = seen.get(digest)
+        seen[digest] = self._count, sample_id
+        seen.move_to_end(digest)
+        if len(seen) > _REMEMBERED:
+            seen.popitem(last=False)
+        return None if before is None else (self._count - before[0], before[1])
+
+
+def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Check:
+    what = "depth" if name == "repeated_depth" else "colour"
+    found = f"the {what} image is a new one"
+    if before is not None:
+        ago, sample_id = before
+        found = f"the {what} image is bit for bit that of {sample_id!r}, {ago} capture{'s' * (ago > 1)} before"
+    return graded(
+        name,
+        float(before is not None),
+        threshold=0.0,
+        fails_at=0.0,
+        found=found,
+        advice=f"{_SENSORS_DIFFER}; drop the repetitions (a simulator without noise may repeat itself on purpose)",
+        view=view,
+    )
+
+
+class ClockChecks:
+    """Judges ``provenance["timestamps"]``, the seconds of every view, where a capture has them."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._last: list[float] = []
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+
+    def check(self, frame: DepthFrame) -> list[Check]:
+        """Judge the times of the next capture."""
+        times = frame.provenance.get("timestamps")
+        if times is None:
+            return []
+        checks = [self._sync(times)] if len(times) > 1 else []
+        if len(self._last) == len(times):
+            checks.append(self._interval(min(now - last for now, last in zip(times, self._last))))
+        self._last = list(times)
+        return checks
+
+    def _sync(self, times: list[float]) -> Check:
+        apart = max(times) - min(times)
+        early, late = times.index(min(times)), times.index(max(times))
+        return graded(
+            "sync",
+            apart,
+            threshold=self._limits.sync[0],
+            fails_at=self._limits.sync[1],
+            found=f"view {late} is {1e3 * apart:.1f} ms later than view {early}",
+            advice="trigger the cameras together, or pair their images by nearest time; what moves is in two places",
+            unit="s",
+        )
+
+    def _interval(self, interval: float) -> Check:
+        usual = median(self._intervals) if self._intervals else interval
+        if interval > 0:
+            self._intervals.append(interval)
+        verdict = Verdict.FAIL if interval <= 0 else Verdict.WARN if interval > _GAP * usual else Verdict.PASS
+        advice = {
+            Verdict.PASS: "",
+            Verdict.WARN: "captures are missing here: do not treat the two as consecutive",
+            Verdict.FAIL: "time runs backwards or stands still: sort the captures by time, drop the repetitions",
+        }[verdict]
+        return Check(
+            name="clock",
+            verdict=verdict,
+            found=f"{interval:.4g} s after the capture before, usually {usual:.4g} s",
+            value=interval,
+            threshold=_GAP * usual,
+            fails_at=0.0,
+            unit="s",
+            advice=advice,
+        )

@@ -1,0 +1,116 @@
+"""The shift between colour and depth: found where it is known, told apart from fattened objects, else not given."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from pcdata.functional import EdgeOffset, edge_votes, offset_from_votes
+from pcdata.synthetic import tabletop
+
+HEIGHT, WIDTH = 480, 640
+V, U = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+PLATES = [(150, 120, 60), (420, 130, 75), (200, 340, 70), (480, 350, 65)]  # u, v, radius
+
+
+def inside(grow: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+    covered = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    for u, v, radius in PLATES:
+        covered |= ((U - u - shift[0]) ** 2 + (V - v - shift[1]) ** 2).sqrt() <= radius + grow
+    return covered
+
+
+def plates_depth(grow: float = 0.0) -> Tensor:
+    return torch.where(inside(grow), 0.6, 0.9)
+
+
+def plates_color(shift: tuple[float, float] = (0.0, 0.0), *, texture: float = 5.0) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    noise = texture * torch.randn(HEIGHT, WIDTH, 3, generator=generator)
+    plain = torch.where(inside(shift=shift)[..., None], torch.tensor([190.0, 60.0, 50.0]), torch.tensor([90.0] * 3))
+    return (plain + noise).clamp(1, 255).byte()
+
+
+def measured(depth: Tensor, colors: Tensor) -> EdgeOffset:
+    return offset_from_votes(edge_votes(depth, colors))
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, 0), (-3, 0), (0, 3), (0, -3), (2, -5), (-9, 6)])
+def test_a_shift_is_measured_to_half_a_pixel_and_within_its_own_spread(shift: tuple[int, int]) -> None:
+    offset = measured(plates_depth(), plates_color(shift))
+    assert offset.problem is None
+    assert offset.num_edges > 150
+    for found, truth, spread in zip(offset.shift, shift, offset.spread):
+        assert abs(found - truth) < 0.5
+        assert abs(found - truth) <= spread + 0.25
+    assert offset.least_length <= offset.length <= offset.greatest_length
+
+
+@pytest.mark.parametrize("grow", [-3.0, 3.0])
+def test_depth_that_is_fatter_or_thinner_all_around_is_a_bias_and_no_shift(grow: float) -> None:
+    offset = measured(plates_depth(grow), plates_color((4, 0)))
+    assert offset.problem is None
+    assert offset.shift == pytest.approx((4.0, 0.0), abs=0.6)
+    assert offset.bias == pytest.approx(-grow, abs=0.75)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (3, 0), (-3, 0), (0, 3), (0, -3), (2, 2)])
+def test_on_a_noisy_table_a_good_frame_and_one_that_is_off_by_3_pixels_differ(seed: int, x: int, y: int) -> None:
+    frame = tabletop(seed, noise="stereo").frame
+    assert frame.colors is not None
+    offset = measured(frame.depth[0], frame.colors[0].roll((y, x), (0, 1)))
+    assert offset.problem is None
+    assert (offset.least_length > 1.5) == (x != 0 or y != 0)
+    assert offset.shift == pytest.approx((x, y), abs=1.25)
+
+
+def test_a_side_that_no_rim_shows_makes_the_answer_less_sure_by_the_bias() -> None:
+    """Of the plates only the upper half is near: fat rims look like a shift downwards, and nothing says otherwise."""
+    upper = torch.where(inside(3.0) & (V % 240 < 115), 0.6, 0.9)
+    table = torch.where(V % 240 < 115, 0.0, (V % 240 - 115) / 125.0)  # below, the table rises to meet the plates
+    depth = torch.where(inside(3.0) & (V % 240 >= 115), 0.6, upper - 0.3 * table)
+    one_sided, all_around = measured(depth, plates_color()), measured(plates_depth(3.0), plates_color())
+    assert one_sided.spread[1] > all_around.spread[1] + 0.5
+
+
+def test_too_few_rims_and_colours_that_share_no_edge_give_a_reason_instead_of_a_number() -> None:
+    flat = measured(torch.full((HEIGHT, WIDTH), 0.8), plates_color())
+    assert flat.problem is not None
+    assert "0 points on the rims" in flat.problem
+    generator = torch.Generator().manual_seed(3)
+    chaos = torch.randint(1, 256, (HEIGHT, WIDTH, 3), generator=generator).byte()
+    lost = measured(plates_depth(), chaos)
+    assert lost.problem is not None or max(lost.spread) > 1.0
+
+
+def test_black_pixels_are_no_image_and_do_not_vote() -> None:
+    """Colour warped onto the depth is black where there is no depth: that edge fits by construction."""
+    depth = plates_depth().masked_fill(inside(6.0) & ~inside(), 0.0)
+    colors = plates_color((5, 0))
+    colors[depth == 0] = 0
+    offset = measured(depth, colors)
+    assert offset.problem is not None or abs(offset.shift[0]) + offset.spread[0] > 2.0
+
+
+def test_votes_of_several_frames_add_up() -> None:
+    depth, colors = plates_depth(), plates_color((2, 0))
+    one = edge_votes(depth, colors)
+    both = one + edge_votes(depth, plates_color((2, 0), texture=8.0))
+    assert both.num_edges == 2 * one.num_edges
+    assert offset_from_votes(both).shift == pytest.approx((2.0, 0.0), abs=0.5)
+
+
+def test_neither_the_input_nor_the_votes_are_changed() -> None:
+    depth, colors = plates_depth(), plates_color()
+    before = depth.clone(), colors.clone()
+    votes = edge_votes(depth, colors)
+    histogram = votes.histogram.clone()
+    first, second = offset_from_votes(votes), offset_from_votes(votes)
+    assert dataclasses.asdict(first) == dataclasses.asdict(second)
+    assert torch.equal(votes.histogram, histogram)
+    assert torch.equal(depth, before[0])
+    assert torch.equal(colors, before[1])

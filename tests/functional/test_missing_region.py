@@ -1,0 +1,54 @@
+"""The largest region without readings."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from pcdata.errors import DTypeError
+from pcdata.functional import largest_missing_region
+
+
+@pytest.mark.parametrize("size", [(480, 640), (720, 1280), (100, 90), (7, 5)])
+def test_the_missing_half_of_an_image_is_measured_and_located(size: tuple[int, int]) -> None:
+    valid = torch.ones(size, dtype=torch.bool)
+    valid[:, size[1] // 2 :] = False
+    region = largest_missing_region(valid)
+    cell = -(-max(size) // 32)
+    assert region.fraction == pytest.approx(0.5, abs=cell / size[1])
+    top, left, bottom, right = region.box
+    assert (top, bottom, right) == (0, size[0], size[1])
+    assert abs(left - size[1] / 2) <= cell
+
+
+def test_scattered_holes_are_no_region_and_stray_readings_join_none() -> None:
+    generator = torch.Generator().manual_seed(0)
+    valid = torch.rand(480, 640, generator=generator) < 0.5
+    assert largest_missing_region(valid).fraction == 0.0
+    valid[:240] = torch.rand(240, 640, generator=generator) < 0.02
+    assert largest_missing_region(valid).fraction == pytest.approx(0.5 * 0.98, abs=0.03)
+
+
+def test_all_and_nothing() -> None:
+    assert largest_missing_region(torch.ones(48, 64, dtype=torch.bool)) == (0.0, (0, 0, 0, 0))
+    assert largest_missing_region(torch.zeros(48, 64, dtype=torch.bool)) == (1.0, (0, 0, 48, 64))
+
+
+@given(st.integers(0, 10_000), st.floats(0.2, 0.8))
+def test_it_is_the_region_that_scipy_finds(seed: int, share: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    valid = torch.rand(24, 32, generator=generator) < share  # 32 pixels wide: one cell is one pixel
+    labels, count = ndimage.label(~valid.numpy())
+    sizes = ndimage.sum_labels(~valid.numpy(), labels, range(1, count + 1))
+    region = largest_missing_region(valid)
+    assert region.fraction == pytest.approx(float(sizes.max()) / valid.numel() if count else 0.0)
+    boxes = [(s[0].start, s[1].start, s[0].stop, s[1].stop) for s in ndimage.find_objects(labels)]
+    assert region.box in [box for box, size in zip(boxes, sizes) if size == sizes.max()] or not count
+
+
+def test_a_depth_image_in_place_of_the_mask_is_refused() -> None:
+    with pytest.raises(DTypeError, match="largest_missing_region: valid"):
+        largest_missing_region(torch.zeros(4, 4))
