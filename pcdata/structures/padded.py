@@ -42,11 +42,3 @@ class PaddedClouds:
     def __repr__(self) -> str:
         batch, width = self.mask.shape
         return f"PaddedClouds({batch} x {width} in {self.frame_id!r} [{self.unit}])"
-
-
-def pad_rows(values: Tensor, mask: Tensor) -> Tensor:
-    """Spread packed (N, ...) rows over the True places of (B, M); the rest is 0, or -1 for integers."""
-    filler = -1 if values.dtype in (torch.int16, torch.int32, torch.int64) else 0
-    padded = torch.full((*mask.shape, *values.shape[1:]), filler, dtype=values.dtype, device=values.device)
-    padded[mask] = values
-    return padded

@@ -25,10 +25,10 @@ class RemoveStatisticalOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""
-        outlier = statistical_outlier_mask(
+        keep = ~statistical_outlier_mask(
             cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
         )
-        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)
+        return keep, ptr_after_mask(keep, cloud.ptr)
 
 
 class RemoveRadiusOutliers(SelectTransform):
@@ -42,7 +42,7 @@ class RemoveRadiusOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""
-        outlier = radius_outlier_mask(
+        keep = ~radius_outlier_mask(
             cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
         )
-        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)
+        return keep, ptr_after_mask(keep, cloud.ptr)

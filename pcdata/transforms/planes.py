@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.errors import ConfigError
 from pcdata.functional import rigid
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, segment_sum
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform
@@ -67,7 +67,7 @@ class RemovePlane(SelectTransform):
             "index": keep,
             "ptr": ptr_after_mask(keep, data.ptr),
             "planes": planes,
-            "num_inliers": segment_sum(inlier.long(), data.ptr),
+            "num_inliers": counts_from_ptr(ptr_after_mask(inlier, data.ptr)),
         }
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
