@@ -6,6 +6,7 @@ from typing import Annotated
 
 from torch import Tensor
 
+from pcdata.checks import negated
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
@@ -25,9 +26,10 @@ class RemoveStatisticalOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""
-        keep = ~statistical_outlier_mask(
+        outlier = statistical_outlier_mask(
             cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
         )
+        keep = negated(outlier)
         return keep, ptr_after_mask(keep, cloud.ptr)
 
 
@@ -42,7 +44,8 @@ class RemoveRadiusOutliers(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""
-        keep = ~radius_outlier_mask(
+        outlier = radius_outlier_mask(
             cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
         )
+        keep = negated(outlier)
         return keep, ptr_after_mask(keep, cloud.ptr)

@@ -9,6 +9,7 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from pcdata.checks import negated
 from pcdata.errors import ConfigError
 from pcdata.functional import rigid
 from pcdata.functional.planes import ransac_plane
@@ -59,7 +60,7 @@ class RemovePlane(SelectTransform):
             up=self.up,
             max_tilt=self.max_tilt,
         )
-        keep = ~inlier
+        keep = negated(inlier)
         if self.keep == "above":
             plane = planes.double()[cloud_of_rows(data.ptr)]
             keep &= (plane[:, :3] * data.points).sum(1) + plane[:, 3] > 0
