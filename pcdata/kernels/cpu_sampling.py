@@ -105,18 +105,16 @@ def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
 
 
 def _fit(points: Tensor, chosen: Tensor) -> Tensor | None:
-    sums, centre = torch.empty(11, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    call("pc_moments", points, chosen, len(points), centre, sums)
-    count, largest = float(sums[0]), sums[1].clone()
+    # Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
+    sums, origin = torch.empty(11, dtype=torch.float64), points[int(chosen.numpy().argmax())].double()
+    call("pc_moments", points, chosen, len(points), origin, sums)
+    count, largest = float(sums[0]), sums[1]
     if count < 3:
         return None
-    centre += sums[2:5] / count
-    # Again about the centre: squares of the offsets from afar would lose most of their digits.
-    call("pc_moments", points, chosen, len(points), centre, sums)
-    left = sums[2:5] / count  # of rounding; next to nothing
+    mean = sums[2:5] / count
     xx, xy, xz, yy, yz, zz = (sums[5:] / count).unbind()
-    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(left, left)
-    return plane_of_moments(centre, covariance, largest)
+    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(mean, mean)
+    return plane_of_moments(origin + mean, covariance, largest)
 
 
 def _too_long(ptr: Tensor) -> bool:
