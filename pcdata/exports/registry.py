@@ -44,7 +44,7 @@ def target_named(name: str, options: Mapping[str, Any]) -> Target:
 
     if name not in TARGETS:
         known = "\n".join(f"  {target.name} (from {target.takes}): {target.layout}" for target in TARGETS.values())
-        raise ConfigError(f"export: no target {name!r}{near_matches(str(name), TARGETS)}; there are\n{known}")
+        raise ConfigError(f"export: no target {name!r}{near_matches(str(name), TARGETS)}\nThe targets are:\n{known}")
     kind = TARGETS[name]
     known_options = [field.name for field in fields(kind)]
     for option in options:
