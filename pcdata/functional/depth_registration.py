@@ -32,7 +32,7 @@ class _View(NamedTuple):
 
     depth: Tensor  # (H, W)
     rays: tuple[Tensor, Tensor]  # x/z and y/z of the depth camera, each (H, W) float32
-    focal: Tensor  # (2,) of the depth camera
+    half_pixel: Tensor  # (2,), see half_pixels
     color_intrinsics: Tensor  # (3, 3)
     color_from_depth: Tensor  # (4, 4)
     color_distortion: Tensor | None  # (E,)
@@ -85,6 +85,33 @@ def register_depth(
     Source: the z-buffer is as old as Catmull, 1974; librealsense's align draws the same boxes, but per pixel, so
     slanted surfaces crack.
     """
+    check_registration(
+        depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth, color_size, max_jump
+    )
+    rays = pixel_rays(intrinsics, (depth.shape[1], depth.shape[2]), distortion)
+    check_rays("register_depth", rays, depth > 0)
+    halves = half_pixels(intrinsics, color_intrinsics, color_from_depth)
+    lenses = [None] * len(depth) if color_distortion is None else color_distortion.unbind(0)
+    x, y = (part.contiguous() for part in rays.float().unbind(-1))
+    views = zip(depth, zip(x, y), halves, color_intrinsics.double(), color_from_depth, lenses)
+    results = [_register_view(_View(*view), color_size, max_jump) for view in views]
+    if not results:
+        none = torch.empty((0, *color_size), device=depth.device)
+        return RegisteredDepth(none, none.long(), none.bool(), torch.zeros_like(depth, dtype=torch.bool))
+    return RegisteredDepth(*(torch.stack(images) for images in zip(*results, strict=True)))
+
+
+def check_registration(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    color_intrinsics: Tensor,
+    color_distortion: Tensor | None,
+    color_from_depth: Tensor,
+    color_size: tuple[int, int],
+    max_jump: float,
+) -> None:
+    """Refuse what :func:`register_depth` says it refuses, but for rays that a lens does not have."""
     where = "register_depth"
     if len(color_size) != 2 or min(color_size) < 1 or not max_jump > 0:
         raise ConfigError(
@@ -100,17 +127,15 @@ def register_depth(
     if depth.shape[1] * depth.shape[2] > MAX_PIXELS:
         raise CaptureError(f"{where}: depth images of more than {MAX_PIXELS} pixels are not supported")
 
-    rays = pixel_rays(intrinsics, (depth.shape[1], depth.shape[2]), distortion)
-    check_rays(where, rays, depth > 0)
-    focal = intrinsics.double().diagonal(dim1=1, dim2=2)[:, :2]
-    lenses = [None] * len(depth) if color_distortion is None else color_distortion.unbind(0)
-    x, y = (part.contiguous() for part in rays.float().unbind(-1))
-    views = zip(depth, zip(x, y), focal, color_intrinsics.double(), color_from_depth, lenses)
-    results = [_register_view(_View(*view), color_size, max_jump) for view in views]
-    if not results:
-        none = torch.empty((0, *color_size), device=depth.device)
-        return RegisteredDepth(none, none.long(), none.bool(), torch.zeros_like(depth, dtype=torch.bool))
-    return RegisteredDepth(*(torch.stack(images) for images in zip(*results, strict=True)))
+
+def half_pixels(intrinsics: Tensor, color_intrinsics: Tensor, color_from_depth: Tensor) -> Tensor:
+    """Return (V, 2) float64: half the width and height, in colour pixels, of the box around a depth pixel.
+
+    It is that of a pixel that faces its camera and is as far from both; it grows with the depth in the depth camera
+    over the depth in the colour camera.
+    """
+    focal, color_focal = (k.double().diagonal(dim1=1, dim2=2)[:, :2] for k in (intrinsics, color_intrinsics))
+    return 0.5 * ((color_from_depth[:, :2, :2].abs() / focal[:, None]).sum(2) * color_focal)
 
 
 def _register_view(view: _View, size: tuple[int, int], max_jump: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -123,9 +148,10 @@ def _register_view(view: _View, size: tuple[int, int], max_jump: float) -> tuple
         rows = slice(start - first, stop - first)
         seen = _project(view, first, last)
         linked = on_one_surface(torch.where(seen.visible, view.depth[first:last], 0.0), max_jump)
-        half_width, half_height = _half_pixel(view, view.depth[first:last] / seen.depth)
-        left, right = cell_of_pixels(seen.u, half_width, linked)
-        top, bottom = cell_of_pixels(seen.v, half_height, linked)
+        nearness = view.depth[first:last] / seen.depth
+        half_width, half_height = view.half_pixel.tolist()
+        left, right = cell_of_pixels(seen.u, half_width * nearness, linked)
+        top, bottom = cell_of_pixels(seen.v, half_height * nearness, linked)
         cells = (left[rows], right[rows], top[rows], bottom[rows])
         buffer.paint(seen.depth[rows], seen.visible[rows], cells, first_index=start * width)
         projections.append(_Projection(*(image[rows] for image in seen)))
@@ -162,18 +188,6 @@ def _project(view: _View, first: int, last: int) -> _Projection:
         x, y = distort_normalized(xy[None].double(), lens)[0].float().unbind(-1)
     (fx, skew, cx), (_, fy, cy), _ = view.color_intrinsics.tolist()
     return _Projection(fx * x + skew * y + cx, fy * y + cy, z, visible)
-
-
-def _half_pixel(view: _View, nearness: Tensor) -> tuple[Tensor, Tensor]:
-    """Return half the width and height, in colour pixels, of the box around a depth pixel that faces its camera.
-
-    Args:
-        view: the cameras.
-        nearness: (h, W) depth in the depth camera over depth in the colour camera.
-    """
-    extent = (view.color_from_depth[:2, :2].abs() / view.focal).sum(1) * view.color_intrinsics.diagonal()[:2]
-    half_width, half_height = (0.5 * extent).tolist()
-    return half_width * nearness, half_height * nearness
 
 
 def _behind(seen: _Projection, registered: Tensor, max_jump: float) -> tuple[Tensor, Tensor, Tensor]:

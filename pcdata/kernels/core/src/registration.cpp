@@ -1,0 +1,370 @@
+// Depth images rendered as colour cameras see them: project every reading, paint its cell into a z-buffer, and say which
+// readings the colour camera does not see. The float32 operations are the reference's, in its order.
+#include <cmath>
+#include <limits>
+
+#include "pc/common.hpp"
+
+namespace pc {
+namespace {
+
+constexpr int64_t kRowsPerPiece = 64;  // of the depth image: two more are projected for every piece
+constexpr int64_t kPixelsPerPiece = 1 << 16;
+// Beyond it sums of coordinates could overflow, and what infinities become is the reference's to say.
+constexpr float kFarthest = 1e30F;
+constexpr uint64_t kEmpty = ~uint64_t{0};  // as an index: -1
+
+// OpenCV's lens model with k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4, and the radius at which it folds back.
+struct Lens {
+  double k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, fold;
+
+  static double cubic(double t, double a, double b, double c) { return 1 + t * (a + t * (b + t * c)); }
+
+  bool within_fold(float fx, float fy) const {
+    const double x = fx, y = fy;
+    return std::sqrt(x * x + y * y) < fold;
+  }
+  void bend(float& fx, float& fy) const {
+    const double x = fx, y = fy, r2 = x * x + y * y;
+    const double radial = cubic(r2, k1, k2, k3) / cubic(r2, k4, k5, k6);
+    fx = static_cast<float>(((x * radial + 2 * p1 * x * y) + p2 * (r2 + 2 * x * x)) + (s1 + s2 * r2) * r2);
+    fy = static_cast<float>(((y * radial + p1 * (r2 + 2 * y * y)) + 2 * p2 * x * y) + (s3 + s4 * r2) * r2);
+  }
+};
+
+// One view's depth image (height, width) and both cameras.
+struct View {
+  const float* depth;
+  int64_t height, width;
+  const float* column_rays;  // x/z of every column (width,) and
+  const float* row_rays;     // y/z of every row (height,); or null, and then
+  const float* rays;         // both of every pixel (height, width, 2)
+  float move[12];            // the upper rows of color_from_depth
+  float fx, skew, cx, fy, cy;
+  float half_width, half_height;  // of a pixel's box, in colour pixels, at equal depths
+  const Lens* lens;               // of the colour camera, or null
+};
+
+// A row of depth pixels in the colour camera; each (width,).
+struct Seen {
+  float *u, *v;
+  float* z;        // along the colour camera's axis
+  float* reading;  // the depth, 0 where the pixel has none or the colour camera cannot see it
+  float *half_width, *half_height;
+
+  static constexpr int64_t kArrays = 6;
+  Seen(float* room, int64_t width)
+      : u(room), v(room + width), z(room + 2 * width), reading(room + 3 * width), half_width(room + 4 * width),
+        half_height(room + 5 * width) {}
+};
+
+// The corners above or below a row of pixels, outer ones included; each (width + 1,).
+struct Corners {
+  float *u, *v;
+  int32_t* linked;  // the four pixels around lie on one surface
+
+  static constexpr int64_t kArrays = 3;
+  Corners(float* room, int64_t width)
+      : u(room), v(room + (width + 1)), linked(reinterpret_cast<int32_t*>(room + 2 * (width + 1))) {}
+};
+
+// The colour pixels that a row of depth pixels covers, ends excluded; each (width,).
+struct Cells {
+  int32_t *left, *right, *top, *bottom;
+
+  static constexpr int64_t kArrays = 4;
+  Cells(int32_t* room, int64_t width) : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
+};
+
+template <class Ray>
+bool project_row(const View& view, const float* depth, const Ray& ray, const Seen& seen) {
+  const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
+  const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
+  const float a2 = view.move[8], b2 = view.move[9], c2 = view.move[10], d2 = view.move[11];
+  float* __restrict u = seen.u;
+  float* __restrict v = seen.v;
+  float* __restrict z = seen.z;
+  float* __restrict reading = seen.reading;
+  int32_t wrong = 0;
+  for (int64_t i = 0; i < view.width; ++i) {
+    const float x = ray.x(i), y = ray.y(i), d = depth[i];
+    const float moved_z = ((a2 * x + b2 * y) + c2) * d + d2;
+    const bool visible = (d > 0) & (moved_z > 0);
+    wrong |= (d > 0) & (x != x);
+    z[i] = visible ? moved_z : 1.0F;
+    reading[i] = visible ? d : 0.0F;
+    u[i] = (((a0 * x + b0 * y) + c0) * d + d0) / z[i];
+    v[i] = (((a1 * x + b1 * y) + c1) * d + d1) / z[i];
+  }
+  if (view.lens != nullptr) {
+    const Lens lens = *view.lens;
+    for (int64_t i = 0; i < view.width; ++i) {
+      const bool visible = (reading[i] > 0) & lens.within_fold(u[i], v[i]);
+      reading[i] = visible ? reading[i] : 0.0F;
+      float x = visible ? u[i] : 0.0F, y = visible ? v[i] : 0.0F;
+      lens.bend(x, y);
+      u[i] = x;
+      v[i] = y;
+    }
+  }
+  float* __restrict half_width = seen.half_width;
+  float* __restrict half_height = seen.half_height;
+  for (int64_t i = 0; i < view.width; ++i) {
+    const float x = u[i], y = v[i], nearness = depth[i] / z[i];
+    u[i] = (view.fx * x + view.skew * y) + view.cx;
+    v[i] = view.fy * y + view.cy;
+    half_width[i] = view.half_width * nearness;
+    half_height[i] = view.half_height * nearness;
+    const bool near = (std::fabs(u[i]) <= kFarthest) & (std::fabs(v[i]) <= kFarthest) &
+                      (half_width[i] <= kFarthest) & (half_height[i] <= kFarthest);
+    wrong |= (reading[i] > 0) & !near;
+  }
+  return wrong == 0;
+}
+
+struct PinholeRays {
+  const float* columns;
+  float row;
+  float x(int64_t i) const { return columns[i]; }
+  float y(int64_t) const { return row; }
+};
+
+struct PixelRays {
+  const float* pixels;
+  float x(int64_t i) const { return pixels[2 * i]; }
+  float y(int64_t i) const { return pixels[2 * i + 1]; }
+};
+
+// Returns whether every reading has a ray and projects where floats can be computed with.
+bool project(const View& view, int64_t row, const Seen& seen) {
+  const float* depth = view.depth + row * view.width;
+  if (view.rays != nullptr) return project_row(view, depth, PixelRays{view.rays + 2 * row * view.width}, seen);
+  return project_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]}, seen);
+}
+
+float lower(float a, float b) { return a < b ? a : b; }
+float upper(float a, float b) { return a > b ? a : b; }
+
+// The corners between two rows of pixels; the outer ones keep what they are, not linked.
+void link(const Seen& above, const Seen& below, int64_t width, float max_jump, const Corners& corners) {
+  float* __restrict u = corners.u + 1;
+  float* __restrict v = corners.v + 1;
+  int32_t* __restrict linked = corners.linked + 1;
+  for (int64_t i = 0; i + 1 < width; ++i) {
+    const float low = lower(lower(above.reading[i], below.reading[i]), lower(above.reading[i + 1], below.reading[i + 1]));
+    const float high = upper(upper(above.reading[i], below.reading[i]), upper(above.reading[i + 1], below.reading[i + 1]));
+    linked[i] = (low > 0) & (high - low <= max_jump * low);
+    u[i] = 0.25F * ((below.u[i + 1] + above.u[i + 1]) + (below.u[i] + above.u[i]));
+    v[i] = 0.25F * ((below.v[i + 1] + above.v[i + 1]) + (below.v[i] + above.v[i]));
+  }
+}
+
+// One coordinate's ends of a row of cells, from the corners above and below, cut to [0, limit).
+void cut_cells(const float* __restrict center, const float* __restrict half, const float* __restrict above,
+               const float* __restrict below, const Corners& upper_corners, const Corners& lower_corners, int64_t width,
+               int64_t limit, int32_t* __restrict first, int32_t* __restrict end) {
+  constexpr float kInfinity = std::numeric_limits<float>::infinity();
+  const float most = static_cast<float>(limit);
+  const int32_t* __restrict linked_above = upper_corners.linked;
+  const int32_t* __restrict linked_below = lower_corners.linked;
+  for (int64_t i = 0; i < width; ++i) {
+    const int32_t a = linked_above[i], b = linked_above[i + 1], c = linked_below[i], d = linked_below[i + 1];
+    float low = kInfinity, high = -kInfinity;
+    low = lower(low, a ? above[i] : kInfinity);
+    high = upper(high, a ? above[i] : -kInfinity);
+    low = lower(low, b ? above[i + 1] : kInfinity);
+    high = upper(high, b ? above[i + 1] : -kInfinity);
+    low = lower(low, c ? below[i] : kInfinity);
+    high = upper(high, c ? below[i] : -kInfinity);
+    low = lower(low, d ? below[i + 1] : kInfinity);
+    high = upper(high, d ? below[i + 1] : -kInfinity);
+    const float reach = (a & b & c & d) ? -kInfinity : half[i];  // reaches nowhere
+    low = lower(low, center[i] - reach);
+    high = upper(high, center[i] + reach);
+    first[i] = static_cast<int32_t>(lower(upper(std::ceil(low), 0.0F), most));
+    end[i] = static_cast<int32_t>(lower(upper(std::ceil(high), 0.0F), most));
+  }
+}
+
+// The nearest reading of every colour pixel so far: the bits of its depth, which are ordered as positive floats are,
+// above its index. The smallest stays, so the order of painting does not matter.
+struct ZBuffer {
+  uint64_t* nearest;
+  int64_t height, width;
+  bool shared;  // by several threads
+
+  void put(uint64_t* pixel, uint64_t key) const {
+    uint64_t found = __atomic_load_n(pixel, __ATOMIC_RELAXED);
+    if (!shared) {
+      if (key < found) *pixel = key;
+      return;
+    }
+    while (key < found &&
+           !__atomic_compare_exchange_n(pixel, &found, key, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+    }
+  }
+  void paint_row(const Seen& seen, const Cells& cells, int64_t count, uint64_t first_index) const {
+    for (int64_t i = 0; i < count; ++i) {
+      if (!(seen.reading[i] > 0)) continue;
+      uint32_t bits;
+      std::memcpy(&bits, seen.z + i, sizeof(bits));
+      const uint64_t key = uint64_t{bits} << 32 | (first_index + static_cast<uint64_t>(i));
+      for (int64_t v = cells.top[i]; v < cells.bottom[i]; ++v)
+        for (int64_t u = cells.left[i]; u < cells.right[i]; ++u) put(nearest + v * width + u, key);
+    }
+  }
+};
+
+// What one thread needs for its rows.
+struct Room {
+  Seen seen[2];
+  Corners corners[2];
+  Cells cells;
+
+  static int64_t size(int64_t width) {
+    return 2 * Seen::kArrays * width + 2 * Corners::kArrays * (width + 1) + Cells::kArrays * width;
+  }
+  Room(float* room, int64_t width)
+      : seen{{room, width}, {room + Seen::kArrays * width, width}},
+        corners{{room + 2 * Seen::kArrays * width, width},
+                {room + 2 * Seen::kArrays * width + Corners::kArrays * (width + 1), width}},
+        cells(reinterpret_cast<int32_t*>(room + 2 * Seen::kArrays * width + 2 * Corners::kArrays * (width + 1)), width) {}
+};
+
+// Paint the rows [first, last) of a view. Two rows of pixels and two of corners are kept at a time, in the cache.
+bool paint_rows(const View& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer, const Room& room) {
+  const int64_t width = view.width;
+  bool possible = true;
+  for (const Corners& corners : room.corners) std::fill_n(corners.linked, width + 1, 0);
+  if (first > 0) {
+    possible &= project(view, first - 1, room.seen[(first - 1) & 1]);
+    possible &= project(view, first, room.seen[first & 1]);
+    link(room.seen[(first - 1) & 1], room.seen[first & 1], width, max_jump, room.corners[(first - 1) & 1]);
+  } else {
+    possible &= project(view, 0, room.seen[0]);
+  }
+  for (int64_t row = first; row < last; ++row) {
+    const Seen& seen = room.seen[row & 1];
+    const Corners& above = room.corners[(row - 1) & 1];
+    const Corners& below = room.corners[row & 1];
+    if (row + 1 < view.height) {
+      possible &= project(view, row + 1, room.seen[(row + 1) & 1]);
+      link(seen, room.seen[(row + 1) & 1], width, max_jump, below);
+    } else {
+      std::fill_n(below.linked, width + 1, 0);
+    }
+    if (!possible) return false;
+    cut_cells(seen.u, seen.half_width, above.u, below.u, above, below, width, buffer.width, room.cells.left,
+              room.cells.right);
+    cut_cells(seen.v, seen.half_height, above.v, below.v, above, below, width, buffer.height, room.cells.top,
+              room.cells.bottom);
+    buffer.paint_row(seen, room.cells, width, static_cast<uint64_t>(row * width));
+  }
+  return true;
+}
+
+// Keys to depths, 0 where nothing was painted, and, in their place, indices.
+void read_keys(uint64_t* __restrict keys, float* __restrict depth, int64_t first, int64_t last) {
+  for (int64_t i = first; i < last; ++i) {
+    const uint64_t key = keys[i];
+    const uint32_t bits = key == kEmpty ? 0 : static_cast<uint32_t>(key >> 32);
+    std::memcpy(depth + i, &bits, sizeof(bits));
+    keys[i] = key == kEmpty ? kEmpty : key & 0xFFFFFFFFU;
+  }
+}
+
+// Say which readings of a row the colour camera does not see, and where a nearer surface is why.
+void find_hidden(const View& view, int64_t row, const float* registered, int64_t color_height, int64_t color_width,
+                 float farthest, const Room& room, uint8_t* hidden, uint8_t* occluding) {
+  const Seen& seen = room.seen[0];
+  project(view, row, seen);
+  const float* depth = view.depth + row * view.width;
+  int32_t* __restrict columns = room.cells.left;
+  int32_t* __restrict rows = room.cells.top;
+  const float width = static_cast<float>(color_width), height = static_cast<float>(color_height);
+  for (int64_t i = 0; i < view.width; ++i) {
+    const float u = std::floor(seen.u[i] + 0.5F), v = std::floor(seen.v[i] + 0.5F);
+    const bool inside = (seen.reading[i] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height);
+    columns[i] = inside ? static_cast<int32_t>(u) : -1;
+    rows[i] = inside ? static_cast<int32_t>(v) : -1;
+  }
+  for (int64_t i = 0; i < view.width; ++i) {
+    if (columns[i] < 0) {
+      hidden[i] = depth[i] > 0;
+      continue;
+    }
+    const int64_t target = rows[i] * color_width + columns[i];
+    const float front = registered[target];
+    hidden[i] = (front > 0) & (seen.z[i] > farthest * front);
+    if (hidden[i]) __atomic_store_n(occluding + target, uint8_t{1}, __ATOMIC_RELAXED);
+  }
+}
+
+}  // namespace
+}  // namespace pc
+
+// Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of that
+// shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels. Per view:
+// color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null. *possible
+// becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be computed with.
+PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                    int64_t width, const float* column_rays, const float* row_rays, const float* rays,
+                                    const double* color_from_depth, const double* color_intrinsics,
+                                    const double* half_pixels, const double* lenses, int64_t color_height,
+                                    int64_t color_width, double max_jump, float* registered, int64_t* pixel_index,
+                                    uint8_t* occluding, uint8_t* hidden, int64_t* possible) {
+  return pc::guarded([&] {
+    const int64_t pixels = height * width, color_pixels = color_height * color_width;
+    const int64_t threads = std::max<int64_t>(1, context->threads);
+    const float jump = static_cast<float>(max_jump), farthest = static_cast<float>(1 + max_jump);
+    pc::ScratchFrame scratch;
+    std::vector<pc::Room> rooms;
+    for (int64_t t = 0; t < threads; ++t) rooms.emplace_back(scratch.take<float>(pc::Room::size(width)), width);
+    std::atomic<bool> all_possible{true};
+    for (int64_t number = 0; number < views && all_possible; ++number) {
+      pc::Lens lens{};
+      if (lenses != nullptr) std::memcpy(&lens, lenses + 13 * number, sizeof(lens));
+      pc::View view{};
+      view.depth = depth + number * pixels;
+      view.height = height;
+      view.width = width;
+      if (rays != nullptr) {
+        view.rays = rays + 2 * number * pixels;
+      } else {
+        view.column_rays = column_rays + number * width;
+        view.row_rays = row_rays + number * height;
+      }
+      for (int i = 0; i < 12; ++i) view.move[i] = static_cast<float>(color_from_depth[16 * number + i]);
+      const double* k = color_intrinsics + 9 * number;
+      view.fx = static_cast<float>(k[0]);
+      view.skew = static_cast<float>(k[1]);
+      view.cx = static_cast<float>(k[2]);
+      view.fy = static_cast<float>(k[4]);
+      view.cy = static_cast<float>(k[5]);
+      view.half_width = static_cast<float>(half_pixels[2 * number]);
+      view.half_height = static_cast<float>(half_pixels[2 * number + 1]);
+      view.lens = lenses == nullptr ? nullptr : &lens;
+
+      float* image = registered + number * color_pixels;
+      auto* keys = reinterpret_cast<uint64_t*>(pixel_index + number * color_pixels);
+      uint8_t* marks = occluding + number * color_pixels;
+      const pc::ZBuffer buffer{keys, color_height, color_width, threads > 1};
+      pc::parallel_for(*context, color_pixels, pc::kPixelsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+        std::fill(keys + first, keys + last, pc::kEmpty);
+        std::fill(marks + first, marks + last, uint8_t{0});
+      });
+      pc::parallel_for(*context, height, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
+        if (!pc::paint_rows(view, first, last, jump, buffer, rooms[static_cast<size_t>(thread)]))
+          all_possible.store(false, std::memory_order_relaxed);
+      });
+      pc::parallel_for(*context, color_pixels, pc::kPixelsPerPiece,
+                       [&](int64_t first, int64_t last, int64_t) { pc::read_keys(keys, image, first, last); });
+      pc::parallel_for(*context, height, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
+        for (int64_t row = first; row < last; ++row)
+          pc::find_hidden(view, row, image, color_height, color_width, farthest, rooms[static_cast<size_t>(thread)],
+                          hidden + number * pixels + row * width, marks);
+      });
+    }
+    *possible = all_possible;
+  });
+}
