@@ -76,52 +76,6 @@ struct Cells {
   Cells(int32_t* room, int64_t width) : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
 };
 
-template <class Ray>
-bool project_row(const View& view, const float* depth, const Ray& ray, const Seen& seen) {
-  const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
-  const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
-  const float a2 = view.move[8], b2 = view.move[9], c2 = view.move[10], d2 = view.move[11];
-  float* __restrict u = seen.u;
-  float* __restrict v = seen.v;
-  float* __restrict z = seen.z;
-  float* __restrict reading = seen.reading;
-  int32_t wrong = 0;
-  for (int64_t i = 0; i < view.width; ++i) {
-    const float x = ray.x(i), y = ray.y(i), d = depth[i];
-    const float moved_z = ((a2 * x + b2 * y) + c2) * d + d2;
-    const bool visible = (d > 0) & (moved_z > 0);
-    wrong |= (d > 0) & (x != x);
-    z[i] = visible ? moved_z : 1.0F;
-    reading[i] = visible ? d : 0.0F;
-    u[i] = (((a0 * x + b0 * y) + c0) * d + d0) / z[i];
-    v[i] = (((a1 * x + b1 * y) + c1) * d + d1) / z[i];
-  }
-  if (view.lens != nullptr) {
-    const Lens lens = *view.lens;
-    for (int64_t i = 0; i < view.width; ++i) {
-      const bool visible = (reading[i] > 0) & lens.within_fold(u[i], v[i]);
-      reading[i] = visible ? reading[i] : 0.0F;
-      float x = visible ? u[i] : 0.0F, y = visible ? v[i] : 0.0F;
-      lens.bend(x, y);
-      u[i] = x;
-      v[i] = y;
-    }
-  }
-  float* __restrict half_width = seen.half_width;
-  float* __restrict half_height = seen.half_height;
-  for (int64_t i = 0; i < view.width; ++i) {
-    const float x = u[i], y = v[i], nearness = depth[i] / z[i];
-    u[i] = (view.fx * x + view.skew * y) + view.cx;
-    v[i] = view.fy * y + view.cy;
-    half_width[i] = view.half_width * nearness;
-    half_height[i] = view.half_height * nearness;
-    const bool near = (std::fabs(u[i]) <= kFarthest) & (std::fabs(v[i]) <= kFarthest) &
-                      (half_width[i] <= kFarthest) & (half_height[i] <= kFarthest);
-    wrong |= (reading[i] > 0) & !near;
-  }
-  return wrong == 0;
-}
-
 struct PinholeRays {
   const float* columns;
   float row;
@@ -135,27 +89,97 @@ struct PixelRays {
   float y(int64_t i) const { return pixels[2 * i + 1]; }
 };
 
+// The three steps from a row of depths to colour pixels. Plain loops over arguments and local values: they vectorise.
+
+// Move the readings into the colour camera: x/z, y/z and z there. Returns how many have no ray.
+template <class Ray>
+int32_t move_row(const View& view, const float* __restrict depth, const Ray ray, int64_t width, float* __restrict x,
+                 float* __restrict y, float* __restrict z, float* __restrict reading) {
+  const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
+  const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
+  const float a2 = view.move[8], b2 = view.move[9], c2 = view.move[10], d2 = view.move[11];
+  int32_t lost = 0;
+  for (int64_t i = 0; i < width; ++i) {
+    const float ray_x = ray.x(i), ray_y = ray.y(i), d = depth[i];
+    const float moved_z = ((a2 * ray_x + b2 * ray_y) + c2) * d + d2;
+    const bool visible = (d > 0) & (moved_z > 0);
+    const float divisor = visible ? moved_z : 1.0F;
+    x[i] = (((a0 * ray_x + b0 * ray_y) + c0) * d + d0) / divisor;
+    y[i] = (((a1 * ray_x + b1 * ray_y) + c1) * d + d1) / divisor;
+    z[i] = divisor;
+    reading[i] = visible ? d : 0.0F;
+    lost += (d > 0) & (ray_x != ray_x);
+  }
+  return lost;
+}
+
+void bend_row(const Lens lens, int64_t width, float* __restrict x, float* __restrict y, float* __restrict reading) {
+  for (int64_t i = 0; i < width; ++i) {
+    const bool visible = (reading[i] > 0) & lens.within_fold(x[i], y[i]);
+    reading[i] = visible ? reading[i] : 0.0F;
+    float bent_x = visible ? x[i] : 0.0F, bent_y = visible ? y[i] : 0.0F;
+    lens.bend(bent_x, bent_y);
+    x[i] = bent_x;
+    y[i] = bent_y;
+  }
+}
+
+// Turn x/z and y/z into pixels, in place, and size their boxes. Returns how many readings lie beyond kFarthest.
+int32_t to_pixels(const View& view, const float* __restrict depth, const float* __restrict z,
+                  const float* __restrict reading, int64_t width, float* __restrict u, float* __restrict v,
+                  float* __restrict half_width, float* __restrict half_height) {
+  const float fx = view.fx, skew = view.skew, cx = view.cx, fy = view.fy, cy = view.cy;
+  const float box_width = view.half_width, box_height = view.half_height;
+  int32_t beyond = 0;
+  for (int64_t i = 0; i < width; ++i) {
+    const float nearness = depth[i] / z[i], half_u = box_width * nearness, half_v = box_height * nearness;
+    const float pixel_u = (fx * u[i] + skew * v[i]) + cx, pixel_v = fy * v[i] + cy;
+    const bool near = (std::fabs(pixel_u) <= kFarthest) & (std::fabs(pixel_v) <= kFarthest) & (half_u <= kFarthest) &
+                      (half_v <= kFarthest);
+    u[i] = pixel_u;
+    v[i] = pixel_v;
+    half_width[i] = half_u;
+    half_height[i] = half_v;
+    beyond += (reading[i] > 0) & !near;
+  }
+  return beyond;
+}
+
 // Returns whether every reading has a ray and projects where floats can be computed with.
 bool project(const View& view, int64_t row, const Seen& seen) {
-  const float* depth = view.depth + row * view.width;
-  if (view.rays != nullptr) return project_row(view, depth, PixelRays{view.rays + 2 * row * view.width}, seen);
-  return project_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]}, seen);
+  const int64_t width = view.width;
+  const float* depth = view.depth + row * width;
+  const int32_t lost =
+      view.rays != nullptr
+          ? move_row(view, depth, PixelRays{view.rays + 2 * row * width}, width, seen.u, seen.v, seen.z, seen.reading)
+          : move_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]}, width, seen.u, seen.v, seen.z,
+                     seen.reading);
+  if (view.lens != nullptr) bend_row(*view.lens, width, seen.u, seen.v, seen.reading);
+  const int32_t beyond =
+      to_pixels(view, depth, seen.z, seen.reading, width, seen.u, seen.v, seen.half_width, seen.half_height);
+  return lost + beyond == 0;
 }
 
 float lower(float a, float b) { return a < b ? a : b; }
 float upper(float a, float b) { return a > b ? a : b; }
 
+// The mean coordinates at the inner corners between two rows of pixels.
+void average(const float* __restrict above, const float* __restrict below, int64_t width, float* __restrict corners) {
+  for (int64_t i = 0; i + 1 < width; ++i)
+    corners[i] = 0.25F * ((below[i + 1] + above[i + 1]) + (below[i] + above[i]));
+}
+
 // The corners between two rows of pixels; the outer ones keep what they are, not linked.
-void link(const Seen& above, const Seen& below, int64_t width, float max_jump, const Corners& corners) {
-  float* __restrict u = corners.u + 1;
-  float* __restrict v = corners.v + 1;
+void link(const Seen& seen_above, const Seen& seen_below, int64_t width, float max_jump, const Corners& corners) {
+  average(seen_above.u, seen_below.u, width, corners.u + 1);
+  average(seen_above.v, seen_below.v, width, corners.v + 1);
+  const float* __restrict above = seen_above.reading;
+  const float* __restrict below = seen_below.reading;
   int32_t* __restrict linked = corners.linked + 1;
   for (int64_t i = 0; i + 1 < width; ++i) {
-    const float low = lower(lower(above.reading[i], below.reading[i]), lower(above.reading[i + 1], below.reading[i + 1]));
-    const float high = upper(upper(above.reading[i], below.reading[i]), upper(above.reading[i + 1], below.reading[i + 1]));
+    const float low = lower(lower(above[i], below[i]), lower(above[i + 1], below[i + 1]));
+    const float high = upper(upper(above[i], below[i]), upper(above[i + 1], below[i + 1]));
     linked[i] = (low > 0) & (high - low <= max_jump * low);
-    u[i] = 0.25F * ((below.u[i + 1] + above.u[i + 1]) + (below.u[i] + above.u[i]));
-    v[i] = 0.25F * ((below.v[i + 1] + above.v[i + 1]) + (below.v[i] + above.v[i]));
   }
 }
 
@@ -281,10 +305,13 @@ void find_hidden(const View& view, int64_t row, const float* registered, int64_t
   const float* depth = view.depth + row * view.width;
   int32_t* __restrict columns = room.cells.left;
   int32_t* __restrict rows = room.cells.top;
+  const float* __restrict seen_u = seen.u;
+  const float* __restrict seen_v = seen.v;
+  const float* __restrict reading = seen.reading;
   const float width = static_cast<float>(color_width), height = static_cast<float>(color_height);
   for (int64_t i = 0; i < view.width; ++i) {
-    const float u = std::floor(seen.u[i] + 0.5F), v = std::floor(seen.v[i] + 0.5F);
-    const bool inside = (seen.reading[i] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height);
+    const float u = std::floor(seen_u[i] + 0.5F), v = std::floor(seen_v[i] + 0.5F);
+    const bool inside = (reading[i] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height);
     columns[i] = inside ? static_cast<int32_t>(u) : -1;
     rows[i] = inside ? static_cast<int32_t>(v) : -1;
   }
