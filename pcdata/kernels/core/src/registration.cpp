@@ -1,62 +1,17 @@
-// Depth images rendered as colour cameras see them: project every reading, paint its cell into a z-buffer, and say which
-// readings the colour camera does not see. The float32 operations are the reference's, in its order.
+// Depth images rendered as colour cameras see them: project every reading, paint its cell into a z-buffer, and say
+// which readings the colour camera does not see. The float32 operations are the reference's, in its order.
 #include <cmath>
 #include <limits>
 
 #include "pc/common.hpp"
+#include "pc/projection.hpp"
 
 namespace pc {
 namespace {
 
 constexpr int64_t kRowsPerPiece = 64;  // of the depth image: two more are projected for every piece
 constexpr int64_t kPixelsPerPiece = 1 << 16;
-// Beyond it sums of coordinates could overflow, and what infinities become is the reference's to say.
-constexpr float kFarthest = 1e30F;
 constexpr uint64_t kEmpty = ~uint64_t{0};  // as an index: -1
-
-// OpenCV's lens model with k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4, and the radius at which it folds back.
-struct Lens {
-  double k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, fold;
-
-  static double cubic(double t, double a, double b, double c) { return 1 + t * (a + t * (b + t * c)); }
-
-  bool within_fold(float fx, float fy) const {
-    const double x = fx, y = fy;
-    return std::sqrt(x * x + y * y) < fold;
-  }
-  void bend(float& fx, float& fy) const {
-    const double x = fx, y = fy, r2 = x * x + y * y;
-    const double radial = cubic(r2, k1, k2, k3) / cubic(r2, k4, k5, k6);
-    fx = static_cast<float>(((x * radial + 2 * p1 * x * y) + p2 * (r2 + 2 * x * x)) + (s1 + s2 * r2) * r2);
-    fy = static_cast<float>(((y * radial + p1 * (r2 + 2 * y * y)) + 2 * p2 * x * y) + (s3 + s4 * r2) * r2);
-  }
-};
-
-// One view's depth image (height, width) and both cameras.
-struct View {
-  const float* depth;
-  int64_t height, width;
-  const float* column_rays;  // x/z of every column (width,) and
-  const float* row_rays;     // y/z of every row (height,); or null, and then
-  const float* rays;         // both of every pixel (height, width, 2)
-  float move[12];            // the upper rows of color_from_depth
-  float fx, skew, cx, fy, cy;
-  float half_width, half_height;  // of a pixel's box, in colour pixels, at equal depths
-  const Lens* lens;               // of the colour camera, or null
-};
-
-// A row of depth pixels in the colour camera; each (width,).
-struct Seen {
-  float *u, *v;
-  float* z;        // along the colour camera's axis
-  float* reading;  // the depth, 0 where the pixel has none or the colour camera cannot see it
-  float *half_width, *half_height;
-
-  static constexpr int64_t kArrays = 6;
-  Seen(float* room, int64_t width)
-      : u(room), v(room + width), z(room + 2 * width), reading(room + 3 * width), half_width(room + 4 * width),
-        half_height(room + 5 * width) {}
-};
 
 // The corners above or below a row of pixels, outer ones included; each (width + 1,).
 struct Corners {
@@ -73,92 +28,9 @@ struct Cells {
   int32_t *left, *right, *top, *bottom;
 
   static constexpr int64_t kArrays = 4;
-  Cells(int32_t* room, int64_t width) : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
+  Cells(int32_t* room, int64_t width)
+      : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
 };
-
-struct PinholeRays {
-  const float* columns;
-  float row;
-  float x(int64_t i) const { return columns[i]; }
-  float y(int64_t) const { return row; }
-};
-
-struct PixelRays {
-  const float* pixels;
-  float x(int64_t i) const { return pixels[2 * i]; }
-  float y(int64_t i) const { return pixels[2 * i + 1]; }
-};
-
-// The three steps from a row of depths to colour pixels. Plain loops over arguments and local values: they vectorise.
-
-// Move the readings into the colour camera: x/z, y/z and z there. Returns how many have no ray.
-template <class Ray>
-int32_t move_row(const View& view, const float* __restrict depth, const Ray ray, int64_t width, float* __restrict x,
-                 float* __restrict y, float* __restrict z, float* __restrict reading) {
-  const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
-  const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
-  const float a2 = view.move[8], b2 = view.move[9], c2 = view.move[10], d2 = view.move[11];
-  int32_t lost = 0;
-  for (int64_t i = 0; i < width; ++i) {
-    const float ray_x = ray.x(i), ray_y = ray.y(i), d = depth[i];
-    const float moved_z = ((a2 * ray_x + b2 * ray_y) + c2) * d + d2;
-    const bool visible = (d > 0) & (moved_z > 0);
-    const float divisor = visible ? moved_z : 1.0F;
-    x[i] = (((a0 * ray_x + b0 * ray_y) + c0) * d + d0) / divisor;
-    y[i] = (((a1 * ray_x + b1 * ray_y) + c1) * d + d1) / divisor;
-    z[i] = divisor;
-    reading[i] = visible ? d : 0.0F;
-    lost += (d > 0) & (ray_x != ray_x);
-  }
-  return lost;
-}
-
-void bend_row(const Lens lens, int64_t width, float* __restrict x, float* __restrict y, float* __restrict reading) {
-  for (int64_t i = 0; i < width; ++i) {
-    const bool visible = (reading[i] > 0) & lens.within_fold(x[i], y[i]);
-    reading[i] = visible ? reading[i] : 0.0F;
-    float bent_x = visible ? x[i] : 0.0F, bent_y = visible ? y[i] : 0.0F;
-    lens.bend(bent_x, bent_y);
-    x[i] = bent_x;
-    y[i] = bent_y;
-  }
-}
-
-// Turn x/z and y/z into pixels, in place, and size their boxes. Returns how many readings lie beyond kFarthest.
-int32_t to_pixels(const View& view, const float* __restrict depth, const float* __restrict z,
-                  const float* __restrict reading, int64_t width, float* __restrict u, float* __restrict v,
-                  float* __restrict half_width, float* __restrict half_height) {
-  const float fx = view.fx, skew = view.skew, cx = view.cx, fy = view.fy, cy = view.cy;
-  const float box_width = view.half_width, box_height = view.half_height;
-  int32_t beyond = 0;
-  for (int64_t i = 0; i < width; ++i) {
-    const float nearness = depth[i] / z[i], half_u = box_width * nearness, half_v = box_height * nearness;
-    const float pixel_u = (fx * u[i] + skew * v[i]) + cx, pixel_v = fy * v[i] + cy;
-    const bool near = (std::fabs(pixel_u) <= kFarthest) & (std::fabs(pixel_v) <= kFarthest) & (half_u <= kFarthest) &
-                      (half_v <= kFarthest);
-    u[i] = pixel_u;
-    v[i] = pixel_v;
-    half_width[i] = half_u;
-    half_height[i] = half_v;
-    beyond += (reading[i] > 0) & !near;
-  }
-  return beyond;
-}
-
-// Returns whether every reading has a ray and projects where floats can be computed with.
-bool project(const View& view, int64_t row, const Seen& seen) {
-  const int64_t width = view.width;
-  const float* depth = view.depth + row * width;
-  const int32_t lost =
-      view.rays != nullptr
-          ? move_row(view, depth, PixelRays{view.rays + 2 * row * width}, width, seen.u, seen.v, seen.z, seen.reading)
-          : move_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]}, width, seen.u, seen.v, seen.z,
-                     seen.reading);
-  if (view.lens != nullptr) bend_row(*view.lens, width, seen.u, seen.v, seen.reading);
-  const int32_t beyond =
-      to_pixels(view, depth, seen.z, seen.reading, width, seen.u, seen.v, seen.half_width, seen.half_height);
-  return lost + beyond == 0;
-}
 
 float lower(float a, float b) { return a < b ? a : b; }
 float upper(float a, float b) { return a > b ? a : b; }
@@ -239,24 +111,27 @@ struct ZBuffer {
   }
 };
 
-// What one thread needs for its rows.
+// What one thread needs for its rows: two of pixels and two of corners at a time, which stay in the cache.
 struct Room {
   Seen seen[2];
   Corners corners[2];
   Cells cells;
 
-  static int64_t size(int64_t width) {
-    return 2 * Seen::kArrays * width + 2 * Corners::kArrays * (width + 1) + Cells::kArrays * width;
-  }
+  static int64_t size(int64_t width) { return cells_start(width) + Cells::kArrays * width; }
   Room(float* room, int64_t width)
       : seen{{room, width}, {room + Seen::kArrays * width, width}},
-        corners{{room + 2 * Seen::kArrays * width, width},
-                {room + 2 * Seen::kArrays * width + Corners::kArrays * (width + 1), width}},
-        cells(reinterpret_cast<int32_t*>(room + 2 * Seen::kArrays * width + 2 * Corners::kArrays * (width + 1)), width) {}
+        corners{{room + corners_start(width), width},
+                {room + corners_start(width) + Corners::kArrays * (width + 1), width}},
+        cells(reinterpret_cast<int32_t*>(room + cells_start(width)), width) {}
+
+ private:
+  static int64_t corners_start(int64_t width) { return 2 * Seen::kArrays * width; }
+  static int64_t cells_start(int64_t width) { return corners_start(width) + 2 * Corners::kArrays * (width + 1); }
 };
 
-// Paint the rows [first, last) of a view. Two rows of pixels and two of corners are kept at a time, in the cache.
-bool paint_rows(const View& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer, const Room& room) {
+// Paint the rows [first, last) of a view. Returns false where `project` does.
+bool paint_rows(const View& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer,
+                const Room& room) {
   const int64_t width = view.width;
   bool possible = true;
   for (const Corners& corners : room.corners) std::fill_n(corners.linked, width + 1, 0);
@@ -330,10 +205,11 @@ void find_hidden(const View& view, int64_t row, const float* registered, int64_t
 }  // namespace
 }  // namespace pc
 
-// Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of that
-// shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels. Per view:
-// color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null. *possible
-// becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be computed with.
+// Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of
+// that shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels.
+// Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null.
+// *possible becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be
+// computed with.
 PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
                                     int64_t width, const float* column_rays, const float* row_rays, const float* rays,
                                     const double* color_from_depth, const double* color_intrinsics,
@@ -351,25 +227,14 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
     for (int64_t number = 0; number < views && all_possible; ++number) {
       pc::Lens lens{};
       if (lenses != nullptr) std::memcpy(&lens, lenses + 13 * number, sizeof(lens));
-      pc::View view{};
-      view.depth = depth + number * pixels;
-      view.height = height;
-      view.width = width;
+      pc::View view{depth + number * pixels, height, width};
       if (rays != nullptr) {
         view.rays = rays + 2 * number * pixels;
       } else {
         view.column_rays = column_rays + number * width;
         view.row_rays = row_rays + number * height;
       }
-      for (int i = 0; i < 12; ++i) view.move[i] = static_cast<float>(color_from_depth[16 * number + i]);
-      const double* k = color_intrinsics + 9 * number;
-      view.fx = static_cast<float>(k[0]);
-      view.skew = static_cast<float>(k[1]);
-      view.cx = static_cast<float>(k[2]);
-      view.fy = static_cast<float>(k[4]);
-      view.cy = static_cast<float>(k[5]);
-      view.half_width = static_cast<float>(half_pixels[2 * number]);
-      view.half_height = static_cast<float>(half_pixels[2 * number + 1]);
+      view.set_cameras(color_from_depth + 16 * number, color_intrinsics + 9 * number, half_pixels + 2 * number);
       view.lens = lenses == nullptr ? nullptr : &lens;
 
       float* image = registered + number * color_pixels;
