@@ -73,6 +73,10 @@ class CacheError(PcdataError, RuntimeError):
     """A stored dataset is damaged, hostile, incomplete or made by another pipeline."""
 
 
+class VolumeTooLargeError(PcdataError, MemoryError):
+    """A volume would need more memory than it was allowed."""
+
+
 class BackendError(PcdataError, RuntimeError):
     """A named backend is absent or cannot keep the contract for this call."""
 
