@@ -116,8 +116,8 @@ class TSDFVolume:
         needed = (self.num_blocks + new) * per_block
         if needed > self.max_bytes:
             raise VolumeTooLargeError(
-                f"TSDFVolume: {frame!r} needs {new} more blocks of {per_block} bytes at voxels of {self.voxel_size:g} "
-                f"m, {needed / 2**20:.1f} MiB in all, but max_bytes allows {self.max_bytes / 2**20:.1f} MiB; use larger "
+                f"TSDFVolume: {frame!r} needs {new} more blocks of {per_block} bytes at voxels of "
+                f"{self.voxel_size:g} m, {needed / 2**20:.1f} MiB in all, but max_bytes allows {self.max_bytes / 2**20:.1f} MiB; use larger "
                 "voxels, mask depth outside the workspace (MaskDepth), or allow more"
             )
 
@@ -130,8 +130,8 @@ class TSDFVolume:
             raise DTypeError(f"TSDFVolume.integrate takes a DepthFrame, got {type(frame).__name__}")
         if frame.world_from_camera is None:
             raise FrameError(
-                f"TSDFVolume: {frame!r} has no world_from_camera, so its views cannot be put together; give the capture "
-                "poses"
+                f"TSDFVolume: {frame!r} has no world_from_camera, so its views cannot be put together; give the "
+                "capture poses"
             )
         if self.frame_id is not None and frame.frame_id != self.frame_id:
             raise FrameError(

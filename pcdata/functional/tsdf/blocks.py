@@ -92,8 +92,14 @@ class VoxelBlocks:
         """Open blocks for sorted, distinct keys that have none."""
         rows = torch.arange(len(self), len(self) + len(keys), device=self.device)
         self.keys = torch.cat([self.keys, keys])
-        merged, order = torch.cat([self.sorted_keys, keys]).sort()
-        self.sorted_keys, self.sorted_rows = merged, torch.cat([self.sorted_rows, rows])[order]
+        # Merge the two sorted lists: what is new goes behind the known keys below it.
+        places = torch.searchsorted(self.sorted_keys, keys) + torch.arange(len(keys), device=self.device)
+        is_known = torch.ones(len(self.keys), dtype=torch.bool, device=self.device)
+        is_known[places] = False
+        merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
+        merged_keys[places], merged_rows[places] = keys, rows
+        merged_keys[is_known], merged_rows[is_known] = self.sorted_keys, self.sorted_rows
+        self.sorted_keys, self.sorted_rows = merged_keys, merged_rows
         while len(self.chunks) * CHUNK < len(self):
             self.chunks.append(Chunk.empty(self.planes, self.device))
 

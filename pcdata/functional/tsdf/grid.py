@@ -58,8 +58,8 @@ def pack_keys(blocks: Tensor) -> Tensor:
     """
     if len(blocks) and int(blocks.abs().max()) >= BLOCKS_PER_SIDE:
         raise UnitError(
-            f"TSDF: a reading lies {int(blocks.abs().max()):.3g} blocks from the origin, more than 2^20; are depth, pose "
-            "and voxel size in metres?"
+            f"TSDF: a reading lies {int(blocks.abs().max()):.3g} blocks from the origin, more than 2^20; are depth, "
+            "pose and voxel size in metres?"
         )
     x, y, z = (blocks + BLOCKS_PER_SIDE).unbind(-1)
     return (x << 2 * _BITS) | (y << _BITS) | z

@@ -1,7 +1,8 @@
 """Finding the blocks that a view touches, and averaging its signed distances into them.
 
 Source: Curless & Levoy, A Volumetric Method for Building Complex Models from Range Images, 1996; blocks as in Niessner
-et al., Real-time 3D Reconstruction at Scale using Voxel Hashing, 2013; the vote of labels is Boyer & Moore, MJRTY, 1991.
+et al., Real-time 3D Reconstruction at Scale using Voxel Hashing, 2013; the vote of labels is that of Boyer & Moore,
+MJRTY, 1991.
 """
 
 from __future__ import annotations

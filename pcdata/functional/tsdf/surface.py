@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,21 +33,23 @@ class Crossings:
 
     def select(self, keep: Tensor) -> Crossings:
         """Keep some rows."""
-        rows = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return Crossings(**{name: None if value is None else value[keep] for name, value in rows.items()})
+        rows: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return Crossings(**{name: value if value is None else value[keep] for name, value in rows.items()})
 
     @staticmethod
     def cat(parts: list[Crossings]) -> Crossings:
         """Put parts one after another."""
         columns = {entry.name: [getattr(part, entry.name) for part in parts] for entry in fields(Crossings)}
-        return Crossings(**{name: None if v[0] is None else torch.cat(v) for name, v in columns.items()})
+        joined: dict[str, Any] = {name: None if v[0] is None else torch.cat(v) for name, v in columns.items()}
+        return Crossings(**joined)
 
 
 def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid) -> Crossings:
     """Find every zero crossing between two seen neighbours along x, y and z.
 
     The point is interpolated linearly, as is the colour; normal and label are those of the nearer end, of the first at
-    equal distance; the normal is the gradient's direction there. An edge whose ends differ by more than a truncation belongs to no surface.
+    equal distance; the normal is the gradient's direction there. An edge whose ends differ by more than a truncation
+    belongs to no surface.
     """
     keys = blocks.sorted_keys
     parts = [
