@@ -12,6 +12,7 @@ from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, Spati
 from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
+from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.inpainting import NearestCompletion, SmoothCompletion
 from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
@@ -34,6 +35,7 @@ __all__ = [
     "EstimateNormals",
     "FarthestPointSample",
     "FillHoles",
+    "FuseTSDF",
     "KeepConfidence",
     "MarkUnreliableDepth",
     "MaskDepth",

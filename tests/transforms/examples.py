@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
 
 from pcdata import transforms as T
 from pcdata.structures import DepthFrame, PointCloud
-from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts
+from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
 QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
 BOX = {"lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
@@ -24,6 +26,12 @@ class Example:
     transform: T.Transform
     make: Callable[[Sequence[int]], PointCloud | DepthFrame] = cloud_in_base
     displacement: float = 0.0  # metres that a point may move beyond what source_from_cloud undoes (noise, averages)
+
+
+def tabletop_with_counts(counts: Sequence[int]) -> DepthFrame:
+    """A rendered capture with as many views as there are counts, each with confidences."""
+    frame = tabletop_frame(len(counts))
+    return replace(frame, confidence=3 - (frame.depth == 0).to(torch.uint8))
 
 
 def _of(*transforms: T.Transform, **others: object) -> list[Example]:
@@ -70,6 +78,11 @@ EXAMPLES: dict[str, list[Example]] = {
         T.FillHoles(max_size=1),
         make=frame_with_counts,
     ),
+    "FuseTSDF": _of(
+        T.FuseTSDF(voxel_size=0.02),
+        T.FuseTSDF(voxel_size=0.02, truncation=0.05, weighting="angle", carve=True, min_confidence="completed"),
+        make=tabletop_with_counts,
+    ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MarkUnreliableDepth": _of(
         T.MarkUnreliableDepth(sensor="realsense_d435"),
@@ -84,7 +97,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.MaskDepth(min_confidence="completed"),
         make=frame_with_counts,
     ),
-    "MergeViews": _of(T.MergeViews()),
+    "MergeViews": _of(T.MergeViews(), T.MergeViews(face_cameras=False)),
     "NormalizeUnitSphere": _of(T.NormalizeUnitSphere()),
     "NormalizeWorkspace": _of(T.NormalizeWorkspace(frame="base", **BOX)),
     "RandomApply": [
