@@ -1,17 +1,22 @@
-"""Fusion kernels: the blocks that a view touches, and averaging the view into them."""
+"""Fusion kernels: the blocks that a view touches, averaging the view into them, and the surface within them."""
 
 from __future__ import annotations
+
+from dataclasses import fields
 
 import torch
 from torch import Tensor
 
+from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.tsdf import integrate
 from pcdata.functional.tsdf.backends import BODIES
 from pcdata.functional.tsdf.blocks import TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
+from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView
 from pcdata.kernels.native import call
 
+_MARK_BYTES = 192  # per block: a bit per edge
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
@@ -68,6 +73,29 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
     del kept  # until here the addresses are good
 
 
+def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid) -> Crossings:
+    """Mark the edges that cross zero, then write every block's points where they belong."""
+    count = len(blocks)
+    planes, kept = plane_addresses(blocks)
+    field = (blocks.sorted_keys, blocks.sorted_rows, count, planes)
+    marks, counts = torch.empty((count, _MARK_BYTES), dtype=torch.uint8), torch.empty(count, dtype=torch.int64)
+    call("pc_tsdf_mark", *field, marks, counts)
+    starts = ptr_from_counts(counts)
+    total = int(starts[-1])
+    found = Crossings(
+        edge=torch.empty(total, dtype=torch.int64),
+        points=torch.empty((total, 3)),
+        normals=torch.empty((total, 3)),
+        weight=torch.empty(total, dtype=torch.int32),
+        views=torch.empty(total, dtype=torch.int32),
+        colors=torch.empty((total, 3)) if blocks.planes.colors else None,
+        labels=torch.empty(total, dtype=torch.int64) if blocks.planes.labels else None,
+    )
+    call("pc_tsdf_points", *field, marks, starts, grid.voxel_size, *(getattr(found, f.name) for f in fields(found)))
+    del kept  # until here the addresses are good
+    return found
+
+
 def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
     """Return the core's table of planes, (6,) addresses of arrays of chunk addresses, and what keeps these alive."""
     kept = []
@@ -82,3 +110,4 @@ def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
 
 BODIES["touched_blocks", "cpu"] = touched_blocks
 BODIES["integrate_view", "cpu"] = integrate_view
+BODIES["find_crossings", "cpu"] = find_crossings

@@ -117,8 +117,9 @@ class TSDFVolume:
         if needed > self.max_bytes:
             raise VolumeTooLargeError(
                 f"TSDFVolume: {frame!r} needs {new} more blocks of {per_block} bytes at voxels of "
-                f"{self.voxel_size:g} m, {needed / 2**20:.1f} MiB in all, but max_bytes allows {self.max_bytes / 2**20:.1f} MiB; use larger "
-                "voxels, mask depth outside the workspace (MaskDepth), or allow more"
+                f"{self.voxel_size:g} m, {needed / 2**20:.1f} MiB in all, but max_bytes allows "
+                f"{self.max_bytes / 2**20:.1f} MiB; use larger voxels, mask depth outside the workspace (MaskDepth), "
+                "or allow more"
             )
 
     def _planes_of(self, frame: DepthFrame) -> tsdf.Planes:
