@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pcdata.build import load_config
 from pcdata.errors import ConfigError, FrameError, VolumeTooLargeError
 from pcdata.sensors import sensor_profile
 from pcdata.structures import TSDFVolume
-from pcdata.transforms import Compose, CropWorkspace, FuseTSDF, MaskDepth
+from pcdata.transforms import Compose, CropWorkspace, FuseTSDF, MaskDepth, Pipeline
 from tests.factories import frame_with_counts, tabletop_frame
 
 
@@ -41,11 +40,9 @@ def test_it_stands_between_masks_and_crops():
     assert names == ["MaskDepth", "TSDFVolume", "FuseTSDF", "CropWorkspace"]
 
 
-def test_the_voxel_size_may_come_from_the_sensor(tmp_path):
+def test_the_voxel_size_may_come_from_the_sensor():
     profile = sensor_profile("realsense_d435")
-    config = tmp_path / "fuse.yaml"
-    config.write_text("version: 1\nsensor: realsense_d435\npipeline:\n- FuseTSDF: {voxel_size: sensor}\n")
-    (step,) = load_config(config).pipeline.steps
+    (step,) = Pipeline.from_yaml("sensor: realsense_d435\ndepth:\n- FuseTSDF: {voxel_size: sensor}\n").depth
     assert step.voxel_size == pytest.approx(profile.voxel_size(profile.reference_depth), rel=0.01)
 
 
