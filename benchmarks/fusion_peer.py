@@ -1,6 +1,8 @@
 """The peer of fusion: Open3D's tensor VoxelBlockGrid, with the truncation, the weights and the colours that pcdata has.
 
-Its legacy ScalableTSDFVolume integrates nothing in release 0.20.
+Its legacy ScalableTSDFVolume integrates nothing in release 0.20. It reads the pixel that a projection is rounded down
+to, so it takes integer coordinates for pixel corners: half a pixel is added to the principal point, which makes it read
+the nearest one, as pcdata does. (Given the intrinsics as they are, its surfaces lie half a pixel to the side.)
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ def open3d_integrate(grid: Any, frame: DepthFrame, voxel_size: float, truncation
     assert frame.colors is not None
     depth = o3d.t.geometry.Image(o3d.core.Tensor(frame.depth[0].numpy()))
     color = o3d.t.geometry.Image(o3d.core.Tensor(frame.colors[0].numpy().astype(np.float32) / 255))
-    k = o3d.core.Tensor(frame.camera.intrinsics[0].numpy())
+    corners = frame.camera.intrinsics[0].numpy().copy()
+    corners[:2, 2] += 0.5
+    k = o3d.core.Tensor(corners)
     pose = o3d.core.Tensor(np.linalg.inv(frame.world_from_camera[0].numpy()))
     multiple = truncation / voxel_size
     blocks = grid.compute_unique_block_coordinates(depth, k, pose, 1.0, _FAR, multiple)

@@ -20,6 +20,7 @@ from pcdata.structures.fields import Kind
 from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
+_CAMERAS_KEPT = 8  # 5 MB each at 640x480
 _WEIGHTINGS = ("constant", "inverse_square", "angle")
 
 
@@ -42,6 +43,7 @@ class TSDFVolume:
     frame_id: str | None = None  # the frame of the surface; None = that of the first frame
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
+    _kept_rays: dict[tuple[float, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.weighting not in _WEIGHTINGS:
@@ -154,11 +156,12 @@ class TSDFVolume:
         camera = frame.camera
         k = camera.intrinsics[index]
         lens = None if camera.distortion is None else camera.distortion[index]
-        rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0].to(frame.device)
+        rays = self._rays(k, lens, frame)
         depth = frame.depth[index]
         if self.min_confidence is not None and frame.confidence is not None:
             depth = torch.where(frame.confidence[index] >= self.min_confidence, depth, 0.0)
-        check_rays("TSDFVolume", rays[None], (depth > 0)[None])
+        if lens is not None:
+            check_rays("TSDFVolume", rays[None], (depth > 0)[None])
         assert frame.world_from_camera is not None
         return tsdf.FusionView(
             depth=depth,
@@ -170,6 +173,17 @@ class TSDFVolume:
             color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index]),
             label=None if frame.labels is None else frame.labels[index].int(),
         )
+
+    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
+        """Return the rays (H, W, 2) of a camera; those of the last few cameras are kept, as frames mostly repeat them."""
+        coefficients = () if lens is None else tuple(lens.tolist())
+        known = (*k.flatten().tolist(), *coefficients, *frame.size)
+        if known not in self._kept_rays:
+            if len(self._kept_rays) >= _CAMERAS_KEPT:
+                self._kept_rays.pop(next(iter(self._kept_rays)))
+            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0]
+            self._kept_rays[known] = rays.to(frame.device)
+        return self._kept_rays[known]
 
     # -- out -------------------------------------------------------------------------------------------------------
 

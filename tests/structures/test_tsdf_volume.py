@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,7 @@ def test_a_mesh_is_written_with_its_faces(tmp_path):
     assert np.array_equal(rows["v"], mesh.triangles.numpy())
 
 
+ROOT = Path(__file__).parents[2]
 SCENE = tabletop(1, num_objects=4, num_views=4, floor=False)
 NOISY = tabletop(1, num_objects=4, num_views=4, floor=False, noise="stereo")
 
@@ -165,15 +167,16 @@ def test_four_noisy_views_together_are_closer_to_the_truth_than_any_alone():
 
 
 @pytest.mark.open3d
-@pytest.mark.parametrize("voxel_size", [0.005])
-def test_the_surface_agrees_with_open3d(test_data: Path, voxel_size):
+def test_the_surface_agrees_with_open3d(test_data: Path):
     pytest.importorskip("open3d")
-    from benchmarks.fusion_peer import open3d_surface
-
+    voxel_size = 0.005
+    spec = importlib.util.spec_from_file_location("fusion_peer", ROOT / "benchmarks" / "fusion_peer.py")
+    peer = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(peer)
     source = open_source(test_data / "seven_scenes", limit=3)
     frames = [source.load(name) for name in source.ids]
     ours = fused(*frames, voxel_size=voxel_size).extract_points().points
-    theirs = open3d_surface(frames, voxel_size)
+    theirs = peer.open3d_surface(frames, voxel_size)
     for one, other in ((ours, theirs), (theirs, ours)):
         _, distance = knn(other, queries=one[::53], k=1)
         assert float(distance.median()) < voxel_size / 4

@@ -34,7 +34,8 @@ class Crossings:
     def select(self, keep: Tensor) -> Crossings:
         """Keep some rows."""
         rows: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return Crossings(**{name: value if value is None else value[keep] for name, value in rows.items()})
+        chosen: dict[str, Any] = {name: None if value is None else value[keep] for name, value in rows.items()}
+        return Crossings(**chosen)
 
     @staticmethod
     def cat(parts: list[Crossings]) -> Crossings:
