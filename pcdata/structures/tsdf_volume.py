@@ -175,7 +175,7 @@ class TSDFVolume:
         )
 
     def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
-        """Return the rays (H, W, 2) of a camera; those of the last few cameras are kept, as frames mostly repeat them."""
+        """Return the rays (H, W, 2) of a camera; those of a few cameras are kept: frames repeat them."""
         coefficients = () if lens is None else tuple(lens.tolist())
         known = (*k.flatten().tolist(), *coefficients, *frame.size)
         if known not in self._kept_rays:

@@ -19,29 +19,49 @@ struct TouchingView {
   double per_block;
 };
 
-// The keys of one image row at one offset: -1 without a reading. False if a block lies out of reach.
-bool row_keys(const TouchingView& view, int64_t row, double offset, int64_t* keys) {
-  const float* depth = view.depth + row * view.width;
-  const double* rays = view.rays + 2 * row * view.width;
-  const double* m = view.pose;
-  constexpr double reach = static_cast<double>(kBlocksPerSide);
-  int32_t far = 0;
-  for (int64_t u = 0; u < view.width; ++u) {
-    const double z = static_cast<double>(depth[u]) + offset;
-    const bool read = depth[u] > 0 && z > 0;
-    const double x = rays[2 * u] * z, y = rays[2 * u + 1] * z;
-    double place[3];
-    for (int a = 0; a < 3; ++a)
-      place[a] = std::floor((((m[4 * a] * x + m[4 * a + 1] * y) + m[4 * a + 2] * z) + m[4 * a + 3]) * view.per_block);
-    const bool inside = std::fabs(place[0]) < reach && std::fabs(place[1]) < reach && std::fabs(place[2]) < reach;
-    far |= static_cast<int32_t>(read && !inside);
-    const bool good = read && inside;
-    const auto at = [&](int a) { return static_cast<int64_t>(static_cast<int32_t>(good ? place[a] : 0.0)); };
-    const int64_t key = BlockPlace{at(0), at(1), at(2)}.key();
-    keys[u] = good ? key : -1;
+// What the threads compute a row in: all of 64 bits, so that compilers vectorise the loops.
+struct Line {
+  double *depth, *z, *place[3];
+  int64_t* keys;
+
+  Line(ScratchFrame& scratch, int64_t width)
+      : depth(scratch.take<double>(width)),
+        z(scratch.take<double>(width)),
+        place{scratch.take<double>(width), scratch.take<double>(width), scratch.take<double>(width)},
+        keys(scratch.take<int64_t>(width)) {}
+
+  void start(const TouchingView& view, int64_t row) {
+    for (int64_t u = 0; u < view.width; ++u) depth[u] = static_cast<double>(view.depth[row * view.width + u]);
   }
-  return far == 0;
-}
+
+  // The keys of the row at one offset, -1 without a reading. False if a block lies out of reach.
+  bool fill(const TouchingView& view, int64_t row, double offset) {
+    const double* rays = view.rays + 2 * row * view.width;
+    const int64_t width = view.width;
+    for (int64_t u = 0; u < width; ++u) z[u] = depth[u] + offset;
+    for (int a = 0; a < 3; ++a) {
+      const double *m = view.pose + 4 * a, per_block = view.per_block;
+      const double m0 = m[0], m1 = m[1], m2 = m[2], m3 = m[3];
+      double* out = place[a];
+      for (int64_t u = 0; u < width; ++u)
+        out[u] = std::floor(
+            (((m0 * (rays[2 * u] * z[u]) + m1 * (rays[2 * u + 1] * z[u])) + m2 * z[u]) + m3) * per_block);
+    }
+    constexpr auto reach = static_cast<double>(kBlocksPerSide);
+    int64_t far = 0;
+    for (int64_t u = 0; u < width; ++u) {
+      const double x = place[0][u], y = place[1][u], w = place[2][u];
+      const bool read = (depth[u] > 0) & (z[u] > 0);
+      const bool inside = (std::fabs(x) < reach) & (std::fabs(y) < reach) & (std::fabs(w) < reach);
+      const bool good = read & inside;
+      far += static_cast<int64_t>(read & !inside);
+      const BlockPlace block{static_cast<int64_t>(good ? x : 0.0), static_cast<int64_t>(good ? y : 0.0),
+                             static_cast<int64_t>(good ? w : 0.0)};
+      keys[u] = good ? block.key() : -1;
+    }
+    return far == 0;
+  }
+};
 
 struct KeyItem {
   uint64_t key;
@@ -55,16 +75,14 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   const auto threads = static_cast<size_t>(std::max<int32_t>(1, context.threads));
   struct Own {
     PackedVoxel* keys;
-    int64_t* line;
-    int64_t* before;
+    Line line;
     bool used = false;
   };
-  std::vector<Own> own(threads);
+  std::vector<Own> own;
   std::vector<VoxelTable<PackedVoxel>> tables;
-  for (Own& one : own) {
+  for (size_t t = 0; t < threads; ++t) {
     tables.emplace_back(scratch, most);
-    one.keys = scratch.take<PackedVoxel>(most);
-    one.line = scratch.take<int64_t>(view.width);
+    own.push_back({scratch.take<PackedVoxel>(most), Line(scratch, view.width)});
   }
   std::atomic<bool> far{false};
   parallel_for(context, view.height, kRows, [&](int64_t begin, int64_t end, int64_t thread) {
@@ -72,16 +90,18 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
     VoxelTable<PackedVoxel>& table = tables[static_cast<size_t>(thread)];
     if (!mine.used) table.start(mine.keys);
     mine.used = true;
-    for (int64_t row = begin; row < end; ++row)
+    for (int64_t row = begin; row < end; ++row) {
+      mine.line.start(view, row);
       for (int64_t step = 0; step < view.num_offsets; ++step) {
-        if (!row_keys(view, row, view.offsets[step], mine.line)) far.store(true, std::memory_order_relaxed);
+        if (!mine.line.fill(view, row, view.offsets[step])) far.store(true, std::memory_order_relaxed);
         int64_t last = -1;
         for (int64_t u = 0; u < view.width; ++u)
-          if (const int64_t key = mine.line[u]; key != last && key >= 0) {
+          if (const int64_t key = mine.line.keys[u]; key != last && key >= 0) {
             table.number({static_cast<uint64_t>(key)});
             last = key;
           }
       }
+    }
   });
   if (far) return -1;
   int64_t total = 0;
