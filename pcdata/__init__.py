@@ -77,6 +77,7 @@ _HOMES = {
     ],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.build": ["build_dataset", "load_config"],
+    "pcdata.exports": ["export_dataset"],
     "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
@@ -85,6 +86,7 @@ _SUBMODULES = [
     "calibration",
     "datasets",
     "errors",
+    "exports",
     "functional",
     "io",
     "report",
