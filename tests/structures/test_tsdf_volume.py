@@ -68,7 +68,10 @@ def test_views_count_from_one_to_all():
     counts = cloud.extra["num_views"]
     assert (int(counts.min()), int(counts.max())) == (1, 4)
     for least in (1, 2, 4):
-        assert fused(frame).extract_points(min_weight=least).num_points == int((counts >= least).sum())
+        kept = fused(frame).extract_points(min_weight=least)
+        assert kept.num_points == int((counts >= least).sum())
+        assert kept.history[0][-1]["min_weight"] == least
+        assert kept.history[0][-1]["dropped"] == cloud.num_points - kept.num_points
 
 
 def test_save_and_load_give_the_same_volume_back(tmp_path):
