@@ -3,6 +3,7 @@
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.columns import RandomColumn, ShiftToOrigin
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.confidence import KeepConfidence
@@ -21,6 +22,7 @@ from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.unreliable import MarkUnreliableDepth
+from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
 
 __all__ = [
     "REGISTRY",
@@ -45,6 +47,7 @@ __all__ = [
     "PipelineOrderWarning",
     "RandomApply",
     "RandomColorJitter",
+    "RandomColumn",
     "RandomFlip",
     "RandomJitter",
     "RandomPointCount",
@@ -54,12 +57,14 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RandomVoxelSample",
     "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
     "ResizeDepth",
     "SelectTransform",
+    "ShiftToOrigin",
     "SmoothCompletion",
     "SpatialFilterDepth",
     "SpatialTransform",
@@ -67,5 +72,6 @@ __all__ = [
     "ToFrame",
     "Transform",
     "VoxelDownsample",
+    "VoxelSample",
     "planes_in_cloud",
 ]

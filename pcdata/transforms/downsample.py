@@ -133,10 +133,23 @@ class RandomSample(_Sample):
 
     Cheap, and what several official loaders do; it keeps the density of the sensor, so close surfaces get most points
     and thin or far objects may get none. FarthestPointSample covers evenly. A short cloud is filled up with random
-    duplicates (``if_short: repeat``) or with the same permutation again (``tile``).
+    duplicates (``if_short: repeat``) or with the same permutation again (``tile``). With replacement every row is drawn
+    anew, so no cloud but an empty one is short; some loaders do so even where there are enough points.
     """
 
     is_random = True
+
+    with_replacement: bool = False  # draw every row anew: about a third of the points of a full cloud come twice
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Draw with replacement, or sample as the base class does."""
+        if not self.with_replacement or 0 in cloud.counts.tolist():
+            return super().pick(cloud, streams)
+        assert streams is not None
+        wanted = self.wanted_counts(cloud, streams)
+        cases = zip(cloud.ptr.tolist(), cloud.counts.tolist(), wanted, streams.seeds().tolist(), strict=False)
+        rows = [start + torch.randint(have, (want,), generator=seeded(seed)) for start, have, want, seed in cases]
+        return torch.cat(rows).to(cloud.device), ptr_from_counts(wanted, device=cloud.device)
 
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
         """Take the head of a random permutation of each cloud."""

@@ -278,6 +278,7 @@ def changed_values(value: Any) -> list[Any]:
             "hallucinated",
             "nearest",
             "mean",
+            "floor",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]
