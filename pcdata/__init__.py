@@ -77,6 +77,7 @@ _HOMES = {
         "write_ply",
     ],
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
+    "pcdata.models": ["ModelBatch", "ModelContract", "check", "preset", "to_frame", "to_source"],
     "pcdata.build": ["build_dataset", "load_config"],
     "pcdata.validation": ["validate_frame", "validate_source"],
 }
@@ -88,6 +89,7 @@ _SUBMODULES = [
     "errors",
     "functional",
     "io",
+    "models",
     "report",
     "sensors",
     "structures",

@@ -68,7 +68,7 @@ def test_every_public_name_resolves():
 
 @pytest.mark.parametrize(
     "package",
-    ["calibration", "functional", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"],
+    ["calibration", "functional", "models", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"],
 )
 def test_every_public_name_of_a_package_resolves(package):
     module = getattr(pcdata, package)

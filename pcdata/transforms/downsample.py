@@ -142,22 +142,24 @@ class RandomSample(_Sample):
     with_replacement: bool = False  # draw every row anew: about a third of the points of a full cloud come twice
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
-        """Draw with replacement, or sample as the base class does."""
-        if not self.with_replacement or 0 in cloud.counts.tolist():
+        """Draw short clouds too with replacement, unless they are to get zero rows or to stay short."""
+        if not self.with_replacement or self.if_short in ("zeros", "keep") or 0 in cloud.counts.tolist():
             return super().pick(cloud, streams)
         assert streams is not None
         wanted = self.wanted_counts(cloud, streams)
-        cases = zip(cloud.ptr.tolist(), cloud.counts.tolist(), wanted, streams.seeds().tolist(), strict=False)
-        rows = [start + torch.randint(have, (want,), generator=seeded(seed)) for start, have, want, seed in cases]
-        return torch.cat(rows).to(cloud.device), ptr_from_counts(wanted, device=cloud.device)
+        rows = self.sample(cloud, wanted, streams.seeds().tolist())
+        return torch.cat(rows), ptr_from_counts(wanted, device=cloud.device)
 
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
-        """Take the head of a random permutation of each cloud."""
-        starts, available = cloud.ptr.tolist(), cloud.counts.tolist()
-        return [
-            start + torch.randperm(have, generator=seeded(seed))[:count].to(cloud.device)
-            for start, have, count, seed in zip(starts, available, counts, seeds, strict=False)
-        ]
+        """Take the head of a random permutation of each cloud, or draw each row anew."""
+        rows = []
+        for start, have, count, seed in zip(cloud.ptr.tolist(), cloud.counts.tolist(), counts, seeds, strict=False):
+            if self.with_replacement and have != count:  # all that a short cloud has, once
+                drawn = torch.randint(have, (count,), generator=seeded(seed))
+            else:
+                drawn = torch.randperm(have, generator=seeded(seed))[:count]
+            rows.append(start + drawn.to(cloud.device))
+        return rows
 
 
 class RandomPointCount(RandomSample):
