@@ -2,7 +2,7 @@
 
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import CONTRACTS, contract
-from pcdata.models.check import check, require
+from pcdata.models.check import check, check_files, require
 from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
 from pcdata.models.predictions import Predictions, to_frame, to_source
 from pcdata.models.preset import Preset, preset
@@ -17,6 +17,7 @@ __all__ = [
     "Preset",
     "Role",
     "check",
+    "check_files",
     "contract",
     "preset",
     "require",

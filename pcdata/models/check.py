@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from pcdata.errors import ContractError, DTypeError, PcdataError
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import contract as contract_named
 from pcdata.models.contract import ModelContract
+from pcdata.models.foreign import read_samples
 from pcdata.models.preset import batch_of
 from pcdata.models.rules import cheap_checks
 from pcdata.models.value_rules import value_checks
@@ -56,6 +59,39 @@ def check(
             break
         declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
         summary.add(SampleReport(name, tuple(_checks(sample, model, choices, declared, cheap))))
+    return summary
+
+
+def check_files(
+    path: str | Path,
+    model: str,
+    keys: Mapping[str, str],
+    *,
+    frame_id: str = "",
+    unit: str = "",
+    limit: int | None = None,
+    **choices: Any,
+) -> Summary:
+    """Judge every sample of an npz, npy, HDF5 or zarr v2 file that anybody wrote.
+
+    Args:
+        path: the file, or the zarr directory.
+        model: the contract's name.
+        keys: from a tensor of the model, or points, colors, normals, to the array's name in the file.
+        frame_id: the frame of the data, unless unknown.
+        unit: "m" or "normalized", unless unknown.
+        limit: only so many samples.
+        choices: what the contract leaves open.
+
+    Raises:
+        CacheError: the file cannot be read, or has no such array.
+        ConfigError: an unknown model, choice or key.
+    """
+    contract = contract_named(model, **choices)
+    summary = Summary()
+    for name, arrays, channels in itertools.islice(read_samples(path, contract, keys), limit):
+        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
+        summary.add(SampleReport(name, tuple(_checks(arrays, model, choices, declared, False))))
     return summary
 
 

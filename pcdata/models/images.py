@@ -38,7 +38,7 @@ def _check_frame(frame: DepthFrame, contract: ModelContract) -> None:
     if holes > 0:
         raise NoReadingError(
             f"{contract.name}: {holes:.1%} of the depth of {frame.sample_id!r} is holes, which would count as surface "
-            "at the lens; put CompleteDepth(completion='smooth', reach=...) before ResizeDepth"
+            "at the lens; put FillHoles(rule='nearest') before ResizeDepth"
         )
 
 

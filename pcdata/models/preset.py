@@ -46,12 +46,12 @@ class Preset:
         Raises:
             ContractError: the clouds are in another frame or unit, or of another count than the model takes.
         """
-        wrong = next((sample for sample in samples if not isinstance(sample, self._sample_type())), None)
-        if wrong is not None or not samples:
-            raise DTypeError(
-                f"preset {self.contract.name!r}: collate takes a list of {self._sample_type().__name__}, got "
-                f"{type(samples).__name__ if wrong is None else type(wrong).__name__}"
-            )
+        kind = self._sample_type()
+        if not isinstance(samples, (list, tuple)) or not samples:
+            raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got {type(samples).__name__}")
+        wrong = [type(sample).__name__ for sample in samples if not isinstance(sample, kind)]
+        if wrong:
+            raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got a {wrong[0]} in it")
         from pcdata.models.check import require  # it builds batches of clouds by this module
 
         batch = batch_of(samples, self.contract, self.choices)
@@ -132,7 +132,10 @@ def batch_of(
             unit=METRE,
             meta=[{"sample_id": frame.sample_id} for frame in frames],
         )
-    clouds = PointCloud.cat([sample for sample in samples if isinstance(sample, PointCloud)])
+    parts = [sample for sample in samples if isinstance(sample, PointCloud)]
+    clouds = PointCloud.cat(parts).with_meta(
+        [{"sample": number} for number, part in enumerate(parts) for _ in range(part.num_clouds)]
+    )
     if "category" in choices:
         clouds = clouds.with_meta([{"category": choices["category"]}] * clouds.num_clouds)
     return ModelBatch(

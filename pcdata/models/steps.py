@@ -7,12 +7,12 @@ from pcdata.models.contract import ModelContract
 from pcdata.structures import CAMERA_FRAME
 from pcdata.transforms import (
     Center,
-    CompleteDepth,
     Compose,
     CropWorkspace,
     Deproject,
     EstimateNormals,
     FarthestPointSample,
+    FillHoles,
     MergeViews,
     NormalizeUnitSphere,
     Pipeline,
@@ -44,15 +44,14 @@ def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Pipeline | Com
 
 def _image_steps(contract: ModelContract) -> list[Transform]:
     assert contract.image_size is not None
-    # As far as any hole goes: what is left afterwards is refused when the images are stacked.
-    return [CompleteDepth(completion="smooth", reach=1000), ResizeDepth(size=contract.image_size)]
+    return [FillHoles(rule="nearest"), ResizeDepth(size=contract.image_size)]
 
 
 def _cloud_steps(contract: ModelContract, merge_views: bool) -> list[Transform]:
     steps: list[Transform] = []
     if not is_camera(contract):
         steps.append(ToFrame(frame=contract.frame))
-        if merge_views:
+        if merge_views and contract.main.content != "organised":
             steps.append(MergeViews())
     if contract.main.content == "organised":  # a crop would be holes; the model keeps every pixel
         return steps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 import torch
@@ -101,14 +102,13 @@ def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor)
             "steps that sample, merge or average points"
         )
     height, width = clouds.layout.size
-    captures = [(entry.get("sample_id"), entry.get("capture_index")) for entry in clouds.meta]
-    num_captures = len(dict.fromkeys(captures)) if any(captures[0]) else clouds.num_clouds
-    if clouds.num_clouds % num_captures:
-        raise ShapeError(f"{contract.name}: every capture must have as many views, got {captures}")
+    views = list(Counter(entry.get("sample", number) for number, entry in enumerate(clouds.meta)).values())
+    if min(views) != max(views):
+        raise ShapeError(f"{contract.name}: every capture of a batch must have as many views, got {views}")
     images = clouds.points.new_zeros((clouds.num_clouds * height * width, tensor.width))
     pixel = clouds.source_index % (height * width) + cloud_of_rows(clouds.ptr) * height * width
     images[pixel] = columns(clouds, contract, tensor)
-    images = images.reshape(num_captures, clouds.num_clouds // num_captures, height, width, tensor.width)
+    images = images.reshape(len(views), views[0], height, width, tensor.width)
     return images.permute(0, 1, 4, 2, 3).contiguous()
 
 

@@ -14,6 +14,7 @@ from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
 from pcdata.models.rules import layout_fault, verdict
 from pcdata.structures import METRE
 from pcdata.validation import Check
+from pcdata.validation.check import graded
 
 # The longest side of a cloud in metres. Below: a cloud in kilometres or a lone point; above: millimetres, where a cup
 # is 80 and a table 800.
@@ -252,8 +253,14 @@ def _image_scale(images: Tensor, contract: ModelContract) -> Check:
     depth = channel_values(images, contract.main, contract.main.channels[0])
     if contract.main.channels[0].name == "depth_relative":
         clipped = float((depth.abs() >= 1).float().mean())
-        fault = f"{clipped:.0%} of the image is clipped at 1 m from the mean depth" if clipped > 0.2 else ""
-        return verdict("scale", fault, "in millimetres? the clip takes metres", found=f"{clipped:.0%} is clipped")
+        return graded(
+            "scale",
+            clipped,
+            threshold=0.2,
+            fails_at=0.6,
+            found=f"{clipped:.0%} of the image is clipped, 1 m from the mean depth",
+            advice="in millimetres? the clip takes metres; a far background? mask it before the holes are filled",
+        )
     middle = float(depth.median())
     fault = f"the median depth is {middle:.3g}" if not 0.05 <= middle <= 10 else ""
     return verdict("scale", fault, "the model takes metres", found=f"the median depth is {middle:.3g} m")
@@ -263,10 +270,14 @@ def _image_normalisation(images: Tensor, contract: ModelContract) -> Check:
     channel = contract.main.channels[0]
     depth = channel_values(images, contract.main, channel)
     if channel.name == "depth_relative":
-        per_image = depth.reshape(len(images), -1).mean(dim=1).abs().max()
-        fault = f"the mean of an image is {float(per_image):.3g}, not 0" if float(per_image) > 0.1 else ""
-        return verdict(
-            "normalisation", fault, "subtract the image's mean, then clip to [-1, 1]", found="mean 0, clipped"
+        offset = float(depth.reshape(len(images), -1).mean(dim=1).abs().max())
+        return graded(
+            "normalisation",
+            offset,
+            threshold=0.1,
+            fails_at=0.5,
+            found=f"the mean of an image is at most {offset:.3g} from 0",
+            advice="subtract the image's mean, then clip to [-1, 1]; a far background shifts the mean",
         )
     fault = "there are depths of 0 or less" if float(depth.min()) <= 0 else ""
     return verdict("normalisation", fault, "give plain metres: the network subtracts by itself", found="plain metres")

@@ -16,7 +16,7 @@ from pcdata.synthetic import BASE_FRAME, tabletop
 # What each open choice is answered with; the box holds the table of the synthetic world and what stands on it.
 ANSWERS: dict[str, Any] = {
     "frame": BASE_FRAME,
-    "crop": ((-0.5, -0.5, -0.05), (0.5, 0.5, 0.6)),
+    "crop": ((-0.3, -0.3, -0.05), (0.3, 0.3, 0.6)),
     "category": 3,
 }
 

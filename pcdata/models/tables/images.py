@@ -22,7 +22,8 @@ GGCNN = ModelContract(
     image_size=(300, 300),
     traps=(
         _NO_CLOUD,
-        "Holes are filled before anything else: a 0 left in would drag the mean and be clipped to the closest surface.",
+        "Holes are filled before anything else, here with the nearest reading, by the authors with OpenCV's "
+        "Navier-Stokes inpainting: a 0 left in would drag the mean and be clipped to the closest surface.",
         "In millimetres the clip to [-1, 1] turns the image into two values.",
         'Cornell\'s "depth" is the distance along the ray, not z.',
         "The predicted width is in pixels, divided by 150.",
