@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pcdata.models.catalogue import CONTRACTS, possible_choices
 from pcdata.models.contract import Channel, ModelContract
 
 # Answers that make an example of every open choice.
 _EXAMPLE = {"frame": '"base"', "crop": "((0.2, -0.4, 0.0), (0.9, 0.4, 0.6))", "category": "3"}
+
+
+def write_pages(folder: str | Path) -> None:
+    """Write the pages of all models, and the list of them as README.md: ``write_pages("docs/models")``."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "README.md").write_text(index_page(), encoding="utf-8")
+    for one in CONTRACTS.values():
+        (folder / f"{one.name}.md").write_text(contract_page(one), encoding="utf-8")
 
 
 def contract_page(contract: ModelContract) -> str:
@@ -30,7 +41,8 @@ def contract_page(contract: ModelContract) -> str:
 def index_page() -> str:
     """Return the list of all models as Markdown."""
     rows = [
-        f"| [{one.name}]({one.name}.md) | {one.title} | {one.frame or 'to choose'} | {_count(one)} | {_normalised(one)} |"
+        f"| [{one.name}]({one.name}.md) | {one.title} | {one.frame or 'to choose'} | {_count(one)} | "
+        f"{_normalised(one)} |"
         for one in CONTRACTS.values()
     ]
     head = "| preset | model | frame | points | normalisation |\n|---|---|---|---|---|"
