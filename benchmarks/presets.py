@@ -35,7 +35,6 @@ ANSWERS: dict[str, Any] = {
     "frame": BASE_FRAME,
     "crop": ((-0.3, -0.3, -0.05), (0.3, 0.3, 0.6)),
     "category": 3,
-    "voxel_size": 0.01,
 }
 
 
@@ -47,8 +46,6 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 
 def measure(name: str, frame: DepthFrame, repeats: int) -> dict[str, Any]:
     choices = {choice: ANSWERS[choice] for choice in CONTRACTS[name].required_choices}
-    if CONTRACTS[name].count_range is not None:  # as many voxels as the guide's range holds
-        choices["voxel_size"] = ANSWERS["voxel_size"]
     made = preset(name, **choices)
 
     def run() -> Any:

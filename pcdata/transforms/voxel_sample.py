@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -25,8 +27,7 @@ class VoxelSample(SelectTransform):
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the row with the lowest rank in each voxel; rows of the result are in their old order."""
         owner = cloud_of_rows(cloud.ptr)
-        cells = torch.cat([owner[:, None], voxel_cells(cloud.points, self.voxel_size)], dim=1)
-        _, voxel = torch.unique(cells, dim=0, return_inverse=True)
+        voxel = _numbered(torch.cat([owner[:, None], voxel_cells(cloud.points, self.voxel_size)], dim=1))
         rank = self.ranks(cloud, streams)
         count = int(voxel.max()) + 1 if len(voxel) else 0
         best = torch.full((count,), cloud.num_points, device=cloud.device)
@@ -53,3 +54,17 @@ class RandomVoxelSample(VoxelSample):
             torch.randperm(count, generator=seeded(seed)) for count, seed in zip(counts, streams.seeds().tolist())
         ]
         return torch.cat(orders).to(cloud.device)
+
+
+def _numbered(cells: Tensor) -> Tensor:
+    """Number the different rows of (N, 4) from 0: (N,) int64."""
+    if len(cells) == 0:
+        return cells[:, 0]
+    cells = cells - cells.amin(dim=0)
+    sizes = (cells.amax(dim=0) + 1).tolist()
+    if math.prod(sizes) >= 2**62:  # a grid too large to number its cells: compare the rows themselves
+        return torch.unique(cells, dim=0, return_inverse=True)[1]
+    key = cells[:, 0]
+    for column, size in zip(cells[:, 1:].unbind(1), sizes[1:]):
+        key = key * size + column
+    return torch.unique(key, return_inverse=True)[1]
