@@ -79,6 +79,7 @@ _HOMES = {
     "pcdata.datasets": ["CachedCloudDataset", "CloudDataset", "collate_fixed", "collate_packed", "collate_padded"],
     "pcdata.models": ["ModelBatch", "ModelContract", "check", "preset", "to_frame", "to_source"],
     "pcdata.build": ["build_dataset", "load_config"],
+    "pcdata.exports": ["export_dataset"],
     "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
@@ -87,6 +88,7 @@ _SUBMODULES = [
     "calibration",
     "datasets",
     "errors",
+    "exports",
     "functional",
     "io",
     "models",

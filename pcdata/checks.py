@@ -113,7 +113,7 @@ def check_tensors(
     return sizes
 
 
-# On the CPU these read values through NumPy, on one thread: the OpenMP threads that torch would wake spin for ten
+# On the CPU these work through NumPy, on one thread: the OpenMP threads that torch would wake spin for ten
 # milliseconds after every operation, and would take the cores from the kernel that is about to start.
 
 
@@ -134,6 +134,11 @@ def any_negative(values: Tensor) -> bool:
 def count_true(mask: Tensor) -> int:
     """Count the true values of a mask."""
     return int(np.count_nonzero(mask.numpy())) if mask.device.type == "cpu" else int(mask.sum())
+
+
+def negated(mask: Tensor) -> Tensor:
+    """Return the mask that is true where this one is false."""
+    return torch.from_numpy(~mask.numpy()) if mask.device.type == "cpu" else ~mask
 
 
 def equal_values(a: Tensor, b: Tensor) -> bool:

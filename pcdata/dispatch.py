@@ -4,6 +4,9 @@
 faster body beside it under a backend name; it receives arguments that already passed the contract, and must give the
 same result. ``backend="auto"`` takes the fastest live backend for the device, and the reference where a gradient is
 wanted; naming an absent backend raises with the reason.
+
+``@inner`` marks what only pcdata itself calls, with tensors that it has checked already (picking rows, moving points):
+kernels register beside it in the same way, but there is no contract to check and no ``backend`` to choose.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
@@ -45,6 +48,7 @@ class Operation:
 
 
 OPERATIONS: dict[str, Operation] = {}
+INNER: dict[str, Operation] = {}
 
 
 def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -88,11 +92,34 @@ def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return decorate
 
 
+def inner(reference: Callable[P, R]) -> Callable[P, R]:
+    """Register the decorated reference as a function without a contract: its callers pass what they have checked.
+
+    The first tensor among its arguments, or inside mappings and sequences among them, says the device.
+    """
+    name = reference.__name__
+
+    @functools.wraps(reference)
+    def function(*args: P.args, **kwargs: P.kwargs) -> R:
+        tensors = list(_tensors_in((*args, *kwargs.values())))
+        if not tensors or _wants_gradient(tensors):
+            return reference(*args, **kwargs)
+        body: Callable[P, R] = _choose(operation, "auto", tensors[0].device)
+        return body(*args, **kwargs)
+
+    operation = INNER[name] = Operation(name, {}, reference, function)
+    return function
+
+
 def kernel(name: str, backend: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Register a faster body of operation ``name``; it is called with keyword arguments and no ``backend``."""
+    """Register a faster body of operation ``name``; it is called with keyword arguments and no ``backend``.
+
+    The body of an inner function is called as the function was.
+    """
 
     def decorate(body: Callable[P, R]) -> Callable[P, R]:
-        OPERATIONS[name].kernels[backend] = body
+        registry = OPERATIONS if name in OPERATIONS else INNER
+        registry[name].kernels[backend] = body
         return body
 
     return decorate
@@ -130,6 +157,16 @@ def _wants_gradient(arguments: Iterable[Any]) -> bool:
     return torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in arguments)
 
 
+def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
+    for one in arguments:
+        if isinstance(one, Tensor):
+            yield one
+        elif isinstance(one, Mapping):
+            yield from _tensors_in(one.values())
+        elif isinstance(one, (list, tuple)):
+            yield from _tensors_in(one)
+
+
 def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:
     if backend == "auto":
         candidates = AUTO_ORDER.get(device.type, (REFERENCE,))
@@ -153,5 +190,5 @@ def _choose(operation: Operation, backend: str, device: torch.device) -> Callabl
     return operation.kernels[backend]
 
 
-def _call_reference(reference: Callable[..., Any], **arguments: Any) -> Any:
-    return reference(**arguments)
+def _call_reference(reference: Callable[..., Any], *args: Any, **arguments: Any) -> Any:
+    return reference(*args, **arguments)

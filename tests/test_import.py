@@ -68,7 +68,19 @@ def test_every_public_name_resolves():
 
 @pytest.mark.parametrize(
     "package",
-    ["calibration", "functional", "models", "structures", "transforms", "io", "datasets", "build", "report", "synthetic"],
+    [
+        "calibration",
+        "exports",
+        "functional",
+        "models",
+        "structures",
+        "transforms",
+        "io",
+        "datasets",
+        "build",
+        "report",
+        "synthetic",
+    ],
 )
 def test_every_public_name_of_a_package_resolves(package):
     module = getattr(pcdata, package)

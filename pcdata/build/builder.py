@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
 import time
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +21,7 @@ from pcdata.io.manifest import FILE_NAME, Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
 from pcdata.io.record import record_from_cloud
 from pcdata.io.stores import STORES
+from pcdata.io.whole_folders import complete_or_nothing
 from pcdata.structures import DepthFrame, PointCloud
 
 _OWN = {FILE_NAME, "pipeline.yaml", "load.py", "clouds", "clouds.h5", "raw"}
@@ -91,7 +89,7 @@ def build_dataset(
     folder = Path(os.path.realpath(Path(folder).expanduser()))
     _check_target(folder, overwrite)
     report = BuildReport(folder)
-    with _complete_or_nothing(folder) as partial:
+    with complete_or_nothing(folder) as partial:
         samples = _write_samples(config, source, partial, report, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -211,34 +209,3 @@ def _check_target(folder: Path, overwrite: bool) -> None:
             f"{folder} is a dataset but also holds {', '.join(foreign[:5])}, which overwriting would delete; move that "
             "out first, or choose another folder"
         )
-
-
-@contextmanager
-def _complete_or_nothing(folder: Path) -> Iterator[Path]:
-    """Give a hidden neighbour to write into; rename it into place at the end, remove it on any failure."""
-    unique = f"{platform.node()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    partial = folder.with_name(f".{folder.name}.partial-{unique}")
-    retired = folder.with_name(f".{folder.name}.retired-{unique}")
-    created = [parent for parent in folder.parents if not parent.exists()]
-    try:
-        try:
-            partial.mkdir(parents=True)
-        except OSError as error:
-            raise CacheError(f"{folder}: cannot write there: {error}") from error
-        yield partial
-        try:
-            if folder.exists():
-                os.replace(folder, retired)
-            os.replace(partial, folder)
-        except OSError as error:
-            raise CacheError(f"{folder}: cannot be put into place: {error}") from error
-    except BaseException:
-        if retired.exists() and not folder.exists():  # stopped between the two renames
-            os.replace(retired, folder)
-        shutil.rmtree(partial, ignore_errors=True)
-        with suppress(OSError):  # not empty: somebody else uses it
-            for parent in created:
-                parent.rmdir()
-        raise
-    finally:
-        shutil.rmtree(retired, ignore_errors=True)

@@ -145,7 +145,7 @@ def refine_extrinsics(
         CalibrationError: a camera would move beyond the limits, the scene leaves a direction undetermined, the surfaces
             do not meet afterwards or meet no better than before, or it is ambiguous which camera is wrong and none is
             fixed.
-        ConfigError: an unknown method or camera.
+        ConfigError: no capture, or an unknown method or camera.
         ShapeError, FrameError: the captures are not of one rig with poses.
         MissingExtraError: the method's library is not installed.
     """
@@ -156,6 +156,8 @@ def refine_extrinsics(
     if fixed is not None and fixed not in names:
         raise ConfigError(f"{where}: no camera {fixed!r}; there are {', '.join(names)}{near_matches(fixed, names)}")
     limits = OverlapLimits() if limits is None else limits
+    if not captures:
+        raise ConfigError(f"{where}: give at least one capture")
     surfaces, poses = zip(*(surfaces_of(where, capture, max_samples=4000) for capture in captures))
     if any(other.shape != poses[0].shape or not torch.equal(other, poses[0]) for other in poses):
         raise CalibrationError(f"{where}: the captures have different poses; refine one rig whose cameras stand still")
@@ -185,7 +187,7 @@ def refine_extrinsics(
     refined = tuple(
         CameraRefinement(
             name=camera.name,
-            world_from_camera=correction.to(poses[0].device) @ poses[0][view],
+            world_from_camera=poses[0][view] if view == stays else correction.to(poses[0].device) @ poses[0][view],
             shift=float((correction @ poses[0][view].cpu() - poses[0][view].cpu())[:3, 3].norm()),
             rotation_degrees=camera.rotation_degrees,
             shift_sigma=camera.shift_sigma,

@@ -10,12 +10,14 @@ from pcdata.structures import PaddedClouds, PointCloud
 
 def collate_packed(clouds: Sequence[PointCloud]) -> PointCloud:
     """Pack clouds of any lengths into one batch, cut by ``ptr``; nothing is padded or lost."""
-    return _batch("collate_packed", clouds)
+    _check("collate_packed", clouds)
+    return PointCloud.cat(clouds)
 
 
 def collate_padded(clouds: Sequence[PointCloud]) -> PaddedClouds:
     """Pad clouds to the longest of the batch; ``mask`` says which rows are real."""
-    return _batch("collate_padded", clouds).padded()
+    _check("collate_padded", clouds)
+    return PointCloud.cat_padded(clouds)
 
 
 def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
@@ -24,21 +26,21 @@ def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
     Raises:
         ShapeError: the counts differ.
     """
-    batch = _batch("collate_fixed", clouds)
-    counts = batch.counts.tolist()
-    if min(counts) != max(counts):
+    _check("collate_fixed", clouds)
+    batch = PointCloud.cat_padded(clouds)
+    if not bool(batch.mask.all()):
+        counts = batch.mask.sum(dim=1).tolist()
         raise ShapeError(
             f"collate_fixed: clouds must have one count, got {min(counts)} to {max(counts)} points; end the pipeline "
             "with FarthestPointSample or RandomSample, or use collate_padded or collate_packed"
         )
-    return batch.padded()
+    return batch
 
 
-def _batch(where: str, clouds: Sequence[PointCloud]) -> PointCloud:
+def _check(where: str, clouds: Sequence[PointCloud]) -> None:
     for cloud in clouds:
         if not isinstance(cloud, PointCloud):
             raise DTypeError(
                 f"{where}: takes a list of PointCloud, got a {type(cloud).__name__} in it; give the dataset a "
                 "transform that ends in points, and call the function on samples, not on a batch"
             )
-    return PointCloud.cat(clouds)

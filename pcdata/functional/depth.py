@@ -6,14 +6,19 @@ OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel ce
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from pcdata.checks import any_negative, check_tensors
-from pcdata.dispatch import op
+from pcdata.dispatch import inner, op
 from pcdata.errors import CaptureError
+from pcdata.functional.boxes import inside_box
 from pcdata.functional.lens import check_distortion, distort_normalized, fold_radius, undistort_normalized
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, pick_rows, ptr_after_mask, ptr_from_counts
+from pcdata.functional.rigid import transform_points
 
 
 @op(depth="V H W", intrinsics="V 3 3 : float", distortion="V D : float")
@@ -46,6 +51,80 @@ def deproject_depth(
     points = torch.cat([rays[valid] * z[:, None], z[:, None]], dim=1)
     pixel_index = valid.reshape(len(depth), height * width).nonzero()[:, 1]
     return points, ptr_from_counts(valid.sum(dim=(1, 2))), pixel_index
+
+
+@inner
+def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tensor | None) -> Tensor:
+    """Return the depth (V, H, W) where it lies within [near, far] and inside the mask (V, H, W); 0 elsewhere."""
+    keep = depth > 0
+    if near is not None:
+        keep &= depth >= near
+    if far is not None:
+        keep &= depth <= far
+    if mask is not None:
+        keep &= mask
+    return torch.where(keep, depth, 0.0)
+
+
+@dataclass(frozen=True)
+class Deprojected:
+    """Points of depth images with what other images say about the same pixels."""
+
+    points: Tensor  # (M, 3) float32
+    ptr: Tensor  # (V+1,)
+    source_index: Tensor  # (M,) int64, the pixel counted over all views
+    colors: Tensor | None  # (M, 3) float32 in [0, 1]
+    rows: dict[str, Tensor]  # image name -> (M, ...)
+
+
+@inner
+def deproject_images(
+    depth: Tensor,  # (V, H, W) float32
+    intrinsics: Tensor,  # (V, 3, 3)
+    distortion: Tensor | None,  # (V, D)
+    colors: Tensor | None,  # (V, H, W, 3) uint8
+    images: Mapping[str, Tensor],  # each (V, H, W, ...)
+) -> Deprojected:
+    """Run :func:`deproject_depth` and look up the same pixels in other images."""
+    points, ptr, pixel_index = deproject_depth(depth, intrinsics, distortion=distortion)
+    source_index = cloud_of_rows(ptr) * depth[0].numel() + pixel_index
+    rgb = None if colors is None else colors.reshape(-1, 3)[source_index].float() / 255
+    rows = {name: image.flatten(0, 2)[source_index] for name, image in images.items()}
+    return Deprojected(points, ptr, source_index, rgb, rows)
+
+
+@inner
+def deproject_into_box(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+    *,
+    matrix: Tensor | None,  # (V, 4, 4) float64, moves the points of each view; None = they stay
+    lower: Sequence[float],
+    upper: Sequence[float],
+    near: float | None,
+    far: float | None,
+    mask: Tensor | None,
+) -> tuple[Deprojected, Tensor] | None:
+    """Run :func:`mask_depth`, :func:`deproject_images`, a motion and a box as one step; None if a point is not finite.
+
+    Returns:
+        What is inside the box, moved, and how many points each view had before the box, (V,) int64.
+    """
+    whole = deproject_images(mask_depth(depth, near, far, mask), intrinsics, distortion, colors, images)
+    points = whole.points if matrix is None else transform_points(whole.points, whole.ptr, matrix)
+    inside = inside_box(points, lower, upper)
+    if inside is None:
+        return None
+    fields = {"points": points, "source_index": whole.source_index}
+    kept = pick_rows(fields if whole.colors is None else fields | {"colors": whole.colors}, inside)
+    ptr = ptr_after_mask(inside, whole.ptr)
+    inner_part = Deprojected(
+        kept["points"], ptr, kept["source_index"], kept.get("colors"), pick_rows(whole.rows, inside)
+    )
+    return inner_part, counts_from_ptr(whole.ptr)
 
 
 def pixel_rays(

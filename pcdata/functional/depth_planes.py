@@ -1,4 +1,4 @@
-"""Small planes fitted to the windows of a depth image: surface points and normals with most of the noise averaged out."""
+"""Small planes fitted to the windows of a depth image: surface points and normals, the noise averaged out."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from pcdata.functional.cells import Cells
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 from pcdata.functional.parameters import check_grid, require_count, require_length, require_positive
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask, segment_sum
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 
 
 @op(points="N 3", ptr="ptr N B")
@@ -52,11 +52,25 @@ def statistical_outlier_mask(
         distance = torch.where(near.found, near.squared.double().sqrt(), 0.0)
         mean[near.query] = distance.sum(1) / near.found.sum(1)
     cloud, counts = cloud_of_rows(ptr), counts_from_ptr(ptr).double()
-    average = segment_sum(mean, ptr) / counts
+    average = _interleaved_sum(mean, ptr) / counts
     spread = torch.where(mean > 0, (mean - average[cloud]) ** 2, 0.0)
-    deviation = (segment_sum(spread, ptr) / (counts - 1)).sqrt()  # NaN for one point: every comparison is then false
+    deviation = (_interleaved_sum(spread, ptr) / (counts - 1)).sqrt()  # NaN for one point: every comparison is then false
     threshold = average + std_ratio * deviation
     return ~((mean > 0) & (mean < threshold[cloud]))
+
+
+def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
+    """Sum each cloud's values in eight interleaved runs, then these in order: every backend rounds alike.
+
+    The mask hangs on the last bit where all means are equal.
+    """
+    cloud = cloud_of_rows(ptr)
+    run = cloud * 8 + (torch.arange(len(values), device=values.device) - ptr[cloud]) % 8
+    runs = values.new_zeros(8 * (len(ptr) - 1)).index_add(0, run, values).reshape(-1, 8)
+    total = torch.zeros_like(runs[:, 0])
+    for part in runs.unbind(1):
+        total = total + part
+    return total
 
 
 @op(points="N 3", ptr="ptr N B")

@@ -94,7 +94,7 @@ def search_planes(
     seeds = _seed_per_cloud(seed, num_clouds)
     ups = _up_per_cloud(up, num_clouds)
     planes = torch.zeros((num_clouds, 4), dtype=torch.float64)
-    inlier_mask = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    inlier_masks = []
     bounds = ptr.tolist()
     for cloud, (start, stop) in enumerate(pairwise(bounds)):
         if stop - start < 3:
@@ -104,9 +104,10 @@ def search_planes(
         hypotheses = _draw_planes(own, num_hypotheses, seeds[cloud])
         where = f"ransac_plane: cloud {cloud}"
         winner = _best_plane(own, hypotheses, allowed(hypotheses), distance, where, work)
-        plane, inlier_mask[start:stop] = _refine(own, winner, distance, allowed, work)
+        plane, inlier_mask = _refine(own, winner, distance, allowed, work)
         planes[cloud] = _face(plane, ups[cloud])
-    return planes.to(points.device), inlier_mask
+        inlier_masks.append(inlier_mask)
+    return planes.to(points.device), inlier_masks[0] if num_clouds == 1 else torch.cat(inlier_masks)
 
 
 def plane_distance(

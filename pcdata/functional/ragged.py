@@ -5,10 +5,14 @@ Cloud b of a batch is rows ``ptr[b]:ptr[b+1]``; any cloud may be empty.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
+
+from pcdata.checks import count_true
+from pcdata.dispatch import inner
 
 
 def counts_from_ptr(ptr: Tensor) -> Tensor:
@@ -30,8 +34,40 @@ def cloud_of_rows(ptr: Tensor) -> Tensor:
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
+    if mask.device.type == "cpu":
+        return ptr_from_counts([count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())])
     kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return kept[ptr]
+
+
+@inner
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask."""
+    index = torch.nonzero(rows).squeeze(1) if rows.dtype is torch.bool else rows
+    return {name: field[index] for name, field in fields.items()}
+
+
+@inner
+def join_rows(parts: Mapping[str, Sequence[Tensor]]) -> dict[str, Tensor]:
+    """Put the parts of every field one after another."""
+    return {name: torch.cat(list(values)) for name, values in parts.items()}
+
+
+@inner
+def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Tensor]:
+    """Put B parts of at most ``width`` rows of every field into (B, width, ...); the rest is 0, or -1 for integers."""
+    padded = {}
+    for name, values in parts.items():
+        shape = (len(values), width, *values[0].shape[1:])
+        padded[name] = values[0].new_full(shape, padding_of(values[0].dtype))
+        for row, value in zip(padded[name], values):
+            row[: len(value)] = value
+    return padded
+
+
+def padding_of(dtype: torch.dtype) -> int:
+    """What stands for no value: -1 where that is a signed integer, else 0."""
+    return -1 if dtype in (torch.int16, torch.int32, torch.int64) else 0
 
 
 def segment_sum(values: Tensor, ptr: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from pcdata.functional.neighbors import knn
 from pcdata.functional.normals import estimate_normals
 from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.ragged import ptr_from_counts
-from pcdata.functional.robust import KERNELS, robust_scale, robust_weights
+from pcdata.functional.robust import KERNELS, TUKEY_CUT, robust_weights
 from pcdata.functional.small_motions import PlaneSystem, motion_from_twist, plane_system, solve_observable
 
 _MIN_MATCHES = 20  # fewer cannot carry six unknowns and a robust scale
@@ -117,8 +117,9 @@ def icp_point_to_plane(
         initial: where to start.
         max_distances: the largest distance of partners at each scale, coarse to fine, in the points' unit.
         kernel: "tukey", "huber", "trimmed" (the smaller 80 per cent) or "none".
-        scale: standard deviation of a good residual, for Tukey and Huber; None = 1.4826 times each round's median
-            absolute residual.
+        scale: standard deviation of a good residual, for Tukey and Huber; None = each scale's distance / 4.685, where
+            Tukey's weight reaches 0. The spread of the residuals would be no good guide: on a table most of them are
+            small however far the cloud slid along it, and would have the sides of the objects thrown out.
         max_normal_angle: in radians.
         normal_radius: neighbourhood of the estimated normals, in the points' unit.
         max_iterations: per scale.
@@ -156,7 +157,7 @@ def icp_point_to_plane(
         points = moved[found.source_index].double()
         normals = target_normals[found.target_index].double()
         pivot = points.mean(0)
-        sigma = robust_scale(found.residual) if scale is None else found.residual.new_tensor(scale)
+        sigma = found.residual.new_tensor(distance / TUKEY_CUT if scale is None else scale)
         noise = _normal_noise(turned[found.source_index], normals)
         weights = robust_weights(found.residual, sigma, kernel)
         system = plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)

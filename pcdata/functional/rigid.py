@@ -7,13 +7,16 @@ import math
 import torch
 from torch import Tensor
 
+from pcdata.dispatch import inner
 from pcdata.errors import PoseError, ShapeError
 from pcdata.functional.ragged import cloud_of_rows
 
 
 def from_rotation_translation(rotation: Tensor, translation: Tensor) -> Tensor:
     """Assemble (..., 4, 4) float64 from (..., 3, 3) and (..., 3)."""
-    shape = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    shape = rotation.shape[:-2]
+    if translation.shape[:-1] != shape:
+        shape = torch.broadcast_shapes(shape, translation.shape[:-1])
     matrix = torch.zeros((*shape, 4, 4), dtype=torch.float64, device=rotation.device)
     matrix[..., :3, :3] = rotation
     matrix[..., :3, 3] = translation
@@ -58,6 +61,7 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*quaternion.shape[:-1], 3, 3)
 
 
+@inner
 def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Map (N,3) points by one affine (B,4,4) matrix per cloud, computed in float64, returned in the points' dtype."""
     matrix = matrix.double()
@@ -72,11 +76,14 @@ def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     return torch.stack(moved, dim=1).to(points.dtype)
 
 
+@inner
 def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Map (N,3) surface normals: inverse transpose of the linear part, then unit length; zero vectors stay zero."""
     linear = torch.linalg.inv(matrix[:, :3, :3].double()).mT
     moved = transform_points(directions.double(), ptr, from_rotation_translation(linear, linear.new_zeros(3)))
-    return torch.nn.functional.normalize(moved, dim=-1).to(directions.dtype)
+    x, y, z = moved.unbind(1)
+    length = ((x * x + y * y) + z * z).sqrt().clamp(min=1e-12)
+    return (moved / length[:, None]).to(directions.dtype)
 
 
 def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:

@@ -176,7 +176,7 @@ def _measure(
         normals = samples.normals @ rotation.T
         found = capture[target].match(points, normals, max_distance=max_distance, max_angle=max_angle)
         sigma = (samples.sigma[found.row].square() + found.sigma.square()).sqrt()
-        # The mean of both normals, each as heavy as it is certain: flat ground keeps the noisier one from feigning relief.
+        # The mean of both normals, each as heavy as it is certain, so that a noisy one feigns no relief.
         own, other = samples.normal_sigma[found.row] ** -2, found.normal_sigma**-2
         normal = torch.nn.functional.normalize(
             own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1

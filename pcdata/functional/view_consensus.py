@@ -42,9 +42,6 @@ def find_consensus(
         reference: the view to measure against; None = of those that agree, the one that makes the rest most certain.
     """
     num_views = len(alignment.twists)
-    apart = _apart(alignment.twists, max_shift, max_angle)
-    wrong, candidates = _named(apart)
-    agreeing = [view for view in range(num_views) if view not in wrong]
     covariance = alignment.covariance + _UNKNOWN**2 * alignment.unobservable.T @ alignment.unobservable
     blocks = covariance.reshape(num_views, 6, num_views, 6).permute(0, 2, 1, 3)
 
@@ -52,6 +49,15 @@ def find_consensus(
         own, other = blocks[range(num_views), range(num_views)], blocks[reference, reference]
         return own + other - blocks[:, reference] - blocks[reference]
 
+    apart = torch.zeros(num_views, num_views, dtype=torch.float64)
+    for view in range(num_views):
+        for other, uncertain in enumerate(relative(view)):
+            twist = alignment.twists[view] - alignment.twists[other]
+            shift = measured_part(twist[3:], uncertain[3:, 3:], max_shift / 2)
+            turn = measured_part(twist[:3], uncertain[:3, :3], max_angle / 2)
+            apart[view, other] = max(float(shift.norm()) / max_shift, float(turn.norm()) / max_angle)
+    wrong, candidates = _named(apart)
+    agreeing = [view for view in range(num_views) if view not in wrong]
     if reference is None:
         reference = min(agreeing, key=lambda view: float(relative(view).diagonal(dim1=1, dim2=2).sum()))
     return Consensus(
@@ -63,9 +69,11 @@ def find_consensus(
     )
 
 
-def _apart(twists: Tensor, max_shift: float, max_angle: float) -> Tensor:  # (V, V), 1 = just within the limits
-    difference = twists[:, None] - twists[None]
-    return torch.maximum(difference[..., 3:].norm(dim=-1) / max_shift, difference[..., :3].norm(dim=-1) / max_angle)
+def measured_part(vector: Tensor, covariance: Tensor, max_sigma: float) -> Tensor:
+    """Drop what a (3,) vector says along directions whose standard deviation is more than ``max_sigma``."""
+    variances, directions = torch.linalg.eigh((covariance + covariance.T) / 2)
+    known = directions[:, variances <= max_sigma**2]
+    return known @ (known.T @ vector)
 
 
 def _named(apart: Tensor) -> tuple[tuple[int, ...], tuple[int, ...]]:

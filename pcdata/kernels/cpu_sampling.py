@@ -1,8 +1,7 @@
-"""Sampling kernels: deprojection, planes, voxels, farthest points."""
+"""Sampling kernels: planes, voxels, farthest points."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor
 
 from pcdata.dispatch import OPERATIONS, kernel
-from pcdata.functional.depth import check_intrinsics, check_rays, pixel_rays
 from pcdata.functional.parameters import require_count
 from pcdata.functional.planes import PlaneWork, plane_of_moments, search_planes
 from pcdata.functional.ragged import counts_from_ptr, ptr_from_counts
@@ -107,70 +105,16 @@ def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
 
 
 def _fit(points: Tensor, chosen: Tensor) -> Tensor | None:
-    sums, centre = torch.empty(11, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    call("pc_plane_sums", points, chosen, len(points), centre, sums)
-    count, largest = float(sums[0]), sums[1].clone()
+    # Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
+    sums, origin = torch.empty(11, dtype=torch.float64), points[int(chosen.numpy().argmax())].double()
+    call("pc_moments", points, chosen, len(points), origin, sums)
+    count, largest = float(sums[0]), sums[1]
     if count < 3:
         return None
-    centre += sums[2:5] / count
-    # Again about the centre: squares of the offsets from afar would lose most of their digits.
-    call("pc_plane_sums", points, chosen, len(points), centre, sums)
-    left = sums[2:5] / count  # of rounding; next to nothing
+    mean = sums[2:5] / count
     xx, xy, xz, yy, yz, zz = (sums[5:] / count).unbind()
-    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(left, left)
-    return plane_of_moments(centre, covariance, largest)
-
-
-@kernel("deproject_depth", "cpu")
-def deproject_depth(depth: Tensor, intrinsics: Tensor, *, distortion: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Count the readings of every image row, then write every row's points at once."""
-    check_intrinsics("deproject_depth", intrinsics)
-    depth = depth.contiguous()
-    views, height, width = depth.shape
-    starts, possible = torch.empty(views * height + 1, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
-    call("pc_count_readings", depth, views, height, width, starts, possible)
-    if not possible:
-        return _reference("deproject_depth", depth, intrinsics, distortion=distortion)  # knows what to say
-    points = torch.empty((int(starts[-1]), 3))
-    pixel_index = torch.empty(len(points), dtype=torch.int64)
-    sizes, output = (views, height, width), (starts, points, pixel_index)
-    crossed = None if distortion is not None else _crossed_rays(intrinsics, (height, width))
-    if crossed is not None:
-        call("pc_deproject_pinhole", depth, *sizes, *crossed, *output)
-    else:
-        rays = _cached_rays(_Key(intrinsics), (height, width), None if distortion is None else _Key(distortion))
-        check_rays("deproject_depth", rays, depth > 0)
-        call("pc_deproject_rays", depth, *sizes, rays, *output)
-    return points, starts[torch.arange(views + 1) * height], pixel_index
-
-
-def _crossed_rays(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-    """Return x/z of every column (V, W) and y/z of every row (V, H); None if a skew makes x depend on the row."""
-    if bool((intrinsics[:, 0, 1] != 0).any()):
-        return None
-    top = pixel_rays(intrinsics, (1, size[1]))[:, 0, :, 0]
-    left = pixel_rays(intrinsics, (size[0], 1))[:, :, 0, 1]
-    # An infinite y would make x NaN in the reference.
-    return (top.float(), left.float()) if bool(left.isfinite().all()) else None
-
-
-class _Key:
-    """A small tensor that a cache can look up by value."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.tensor = tensor.detach().clone()
-        self.value = tensor.dtype, tuple(tensor.shape), tuple(tensor.flatten().tolist())
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.value == other.value
-
-    def __hash__(self) -> int:
-        return hash(self.value)
-
-
-@functools.lru_cache(maxsize=4)  # 7 MB each at 1280x720: one per camera of a usual rig
-def _cached_rays(intrinsics: _Key, size: tuple[int, int], distortion: _Key | None) -> Tensor:
-    return pixel_rays(intrinsics.tensor, size, None if distortion is None else distortion.tensor).float().contiguous()
+    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(mean, mean)
+    return plane_of_moments(origin + mean, covariance, largest)
 
 
 def _too_long(ptr: Tensor) -> bool:

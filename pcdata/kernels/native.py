@@ -10,18 +10,20 @@ import ctypes
 import functools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-INTERFACE_VERSION = 1
+INTERFACE_VERSION = 2
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.
 FORCE_VARIABLE = "PCDATA_INSTRUCTION_SET"
+
+_LARGE = 4 << 20  # bytes: holds a huge page (2 MB) wherever it starts
 
 _OK, _OUT_OF_MEMORY, _INTERRUPTED = 0, 1, 2
 
@@ -81,6 +83,21 @@ def call(function: str, *arguments: Any) -> None:
         raise KeyboardInterrupt
     if status != _OK:
         raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
+
+
+def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
+    """Return uninitialised memory for results of these shapes; if large, in huge pages where the system has them."""
+    room = [torch.empty(tuple(shape), dtype=dtype) for shape, dtype in results]
+    if sum(one.nbytes for one in room) >= _LARGE:
+        call("pc_advise_huge_pages", len(room), addresses(room), torch.tensor([one.nbytes for one in room]))
+    return room
+
+
+def addresses(tensors: Iterable[Tensor]) -> Tensor:
+    """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
+    given = list(tensors)
+    assert all(one.is_contiguous() and one.device.type == "cpu" for one in given)
+    return torch.tensor([one.data_ptr() for one in given], dtype=torch.int64)
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:

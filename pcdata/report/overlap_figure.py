@@ -52,7 +52,7 @@ def save_overlap_figure(
     names = [camera.name for camera in result.cameras]
     _draw(above, points, view, (0, 1), "from above", names)
     _draw(side, points, view, (0, 2), "from the side", names)
-    thin = (points[:, 1] - center[1]).abs() < _SLICE / 2
+    thin = ((points[:, 1] - center[1]).abs() < _SLICE / 2) & ((points[:, 0] - center[0]).abs() < _REACH / 3)
     _draw(cut, points[thin], view[thin], (0, 2), f"cut of {1e3 * _SLICE:.0f} mm through the middle", names)
     _draw_gaps(gaps, result)
     figure.savefig(path, format="png")

@@ -12,10 +12,13 @@ from torch import Tensor
 from pcdata.checks import any_negative, check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
+from pcdata.functional.depth import mask_depth
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.confidence import Confidence
+from pcdata.structures.derive import derived
 
 CAMERA_FRAME = "camera"
+_MASKED = {"depth": "V H W", "mask": "V H W : bool"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,6 +111,15 @@ class DepthFrame:
         keep = slice(index, index + 1)
         images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
         return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]
+
+    def masked(self, *, near: float | None = None, far: float | None = None, mask: Tensor | None = None) -> DepthFrame:
+        """Return the frame with "no reading" wherever depth is not in [near, far] or ``mask`` (V, H, W) is False."""
+        check_tensors("DepthFrame.masked", {"depth": self.depth, "mask": mask}, _MASKED, check_values=False)
+        return derived(self, depth=mask_depth(self.depth, near, far, mask))
+
+    def with_provenance(self, entries: Mapping[str, Any]) -> DepthFrame:
+        """Merge JSON-able facts into the provenance."""
+        return derived(self, provenance={**self.provenance, **entries})
 
     def to(self, device: torch.device | str) -> DepthFrame:
         """Move all tensors to a device."""

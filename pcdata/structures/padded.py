@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+
+from pcdata.structures.fields import CORE_KINDS
+
+if TYPE_CHECKING:
+    from pcdata.structures.point_cloud import PointCloud
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,9 +49,15 @@ class PaddedClouds:
         return f"PaddedClouds({batch} x {width} in {self.frame_id!r} [{self.unit}])"
 
 
-def pad_rows(values: Tensor, mask: Tensor) -> Tensor:
-    """Spread packed (N, ...) rows over the True places of (B, M); the rest is 0, or -1 for integers."""
-    filler = -1 if values.dtype in (torch.int16, torch.int32, torch.int64) else 0
-    padded = torch.full((*mask.shape, *values.shape[1:]), filler, dtype=values.dtype, device=values.device)
-    padded[mask] = values
-    return padded
+def padded_clouds(clouds: Sequence[PointCloud], rows: Mapping[str, Tensor], counts: Sequence[int]) -> PaddedClouds:
+    """Put together fields (B, M, ...) and what the clouds know about themselves."""
+    device, width = rows["points"].device, rows["points"].shape[1]
+    return PaddedClouds(
+        mask=torch.arange(width, device=device) < torch.tensor(counts, device=device)[:, None],
+        frame_id=clouds[0].frame_id,
+        unit=clouds[0].unit,
+        source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
+        meta=tuple(entry for cloud in clouds for entry in cloud.meta),
+        **{name: rows[name] for name in CORE_KINDS if name in rows},
+        extra={name: value for name, value in rows.items() if name not in CORE_KINDS},
+    )

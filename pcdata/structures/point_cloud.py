@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,14 +14,18 @@ from pcdata.checks import check_ptr_values, check_tensors
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
 from pcdata.functional import rigid
 from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.structures.derive import derived
 from pcdata.structures.fields import CORE_KINDS, Kind
-from pcdata.structures.padded import PaddedClouds, pad_rows
+from pcdata.structures.joining import joinable_parts, rows_per_cloud
+from pcdata.structures.padded import PaddedClouds, padded_clouds
 
 METRE = "m"
 NORMALIZED = "normalized"
 
 Step = dict[str, Any]
+
+_SELECTED = {"points": "N 3", "ptr": "ptr N B"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,6 +122,9 @@ class PointCloud:
                 raise ShapeError(
                     f"PointCloud: {name} needs an entry per cloud, {self.num_clouds}, got {len(getattr(self, name))}"
                 )
+        self._check_names()
+
+    def _check_names(self) -> None:
         if not self.frame_id:
             raise FrameError("PointCloud: frame_id must name the coordinate frame, it is empty")
         if self.unit not in (METRE, NORMALIZED):
@@ -185,8 +193,12 @@ class PointCloud:
         if self.layout is None or self.source_index is None:
             return None
         height, width = self.layout.size
-        pixel_index = self.source_index % (height * width)
-        return ImageGrid(pixel_index, self.layout.size, self.layout.intrinsics, self.source_from_cloud)
+        return ImageGrid(
+            _within_image(self.source_index, self.ptr, height * width),
+            self.layout.size,
+            self.layout.intrinsics,
+            self.source_from_cloud,
+        )
 
     def viewpoint_per_point(self) -> Tensor | None:
         """(N, 3): where the sensor stood that saw each point, or None when unknown."""
@@ -218,22 +230,31 @@ class PointCloud:
 
     def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
         """Merge one mapping of JSON-able findings into the meta of each cloud."""
-        return replace(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+        return derived(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+
+    def with_steps(self, steps: Sequence[Step]) -> PointCloud:
+        """Add one JSON-able step to the history of each cloud."""
+        return derived(self, history=tuple((*old, new) for old, new in zip(self.history, steps, strict=True)))
 
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
 
         Rows of a cloud must stay within that cloud. A mask keeps their order, and so the image they lie on.
         """
+        rows = pick_rows(self.fields(), index)
+        sizes = check_tensors("PointCloud", {**rows, "ptr": ptr}, _SELECTED, check_values=False)
+        if sizes["B"] != self.num_clouds:
+            raise ShapeError(f"PointCloud.select: ptr cuts {sizes['B']} clouds out of {self.num_clouds}")
+        if ptr.device.type == "cpu":
+            check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
         layout = self.layout if index.dtype is torch.bool else None
-        rows = torch.nonzero(index).squeeze(1) if index.dtype is torch.bool else index
-        return self._rebuilt({name: value[rows] for name, value in self.fields().items()}, ptr=ptr, layout=layout)
+        return self._with_rows(rows, ptr=ptr, layout=layout)
 
-    def _rebuilt(self, rows: Mapping[str, Tensor], *, layout: ImageLayout | None, **others: Any) -> PointCloud:
-        """Replace all per-point fields at once, and any other attributes."""
+    def _with_rows(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
+        """Replace all per-point fields at once, and any other attributes, by ones that are known to fit."""
         core = {name: value for name, value in rows.items() if name in CORE_KINDS}
         extra = {name: value for name, value in rows.items() if name not in CORE_KINDS}
-        return replace(self, **core, extra=extra, layout=layout, **others)  # type: ignore[arg-type]
+        return derived(self, **core, extra=extra, **others)
 
     def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:
         """Move every positional and directional field by one affine (B, 4, 4) matrix per cloud.
@@ -261,7 +282,7 @@ class PointCloud:
             per_cloud = torch.arange(self.num_clouds + 1, device=self.device)
             viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
         source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
-        return self._rebuilt(
+        result = self._with_rows(
             moved,
             layout=self.layout if self.layout is not None and rigid.is_rigid(source_from_cloud) else None,
             viewpoint=viewpoint,
@@ -269,6 +290,8 @@ class PointCloud:
             frame_id=self.frame_id if frame_id is None else frame_id,
             unit=self.unit if unit is None else unit,
         )
+        result._check_names()
+        return result
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""
@@ -283,7 +306,7 @@ class PointCloud:
 
     def _slice(self, b: int, start: int, stop: int) -> PointCloud:
         rows = {name: value[start:stop] for name, value in self.fields().items()}
-        return self._rebuilt(
+        return self._with_rows(
             rows,
             layout=_layout_of([self.layout], slice(b, b + 1)),
             ptr=torch.tensor([0, stop - start], device=self.device),
@@ -303,16 +326,12 @@ class PointCloud:
             ShapeError: the clouds carry different fields, or there are none.
             DeviceError: the clouds lie on different devices.
         """
-        if not clouds:
-            raise ShapeError("PointCloud.cat: needs at least one cloud")
-        first = clouds[0]
-        for position, other in enumerate(clouds[1:], start=1):
-            _check_joinable(first, other, position)
-        rows = {name: torch.cat([cloud.fields()[name] for cloud in clouds]) for name in first.fields()}
+        parts = joinable_parts(clouds)
         viewpoints = [cloud.viewpoint for cloud in clouds]
+        first = clouds[0]
         known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
-        return first._rebuilt(
-            rows,
+        return first._with_rows(
+            join_rows(parts),
             layout=_layout_of([cloud.layout for cloud in clouds]),
             ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
             viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
@@ -325,28 +344,36 @@ class PointCloud:
     def padded(self, num_points: int | None = None) -> PaddedClouds:
         """Return (B, num_points, ...) tensors and the mask of real rows; padding is zero, and -1 for integers.
 
+        Clouds of ``num_points`` each need no padding: then the tensors share the memory of this batch.
+
         Args:
             num_points: None = the largest count of the batch.
 
         Raises:
             ShapeError: a cloud is longer than ``num_points``.
         """
-        counts = self.counts
-        longest = int(counts.max())
-        width = longest if num_points is None else num_points
-        if longest > width:
-            raise ShapeError(f"PointCloud.padded: a cloud has {longest} points, more than num_points={width}")
-        mask = torch.arange(width, device=self.device)[None, :] < counts[:, None]
-        rows = {name: pad_rows(value, mask) for name, value in self.fields().items()}
-        return PaddedClouds(
-            mask=mask,
-            frame_id=self.frame_id,
-            unit=self.unit,
-            source_from_cloud=self.source_from_cloud,
-            meta=self.meta,
-            **{name: rows.pop(name) for name in CORE_KINDS if name in rows},
-            extra=rows,
-        )
+        counts = self.counts.tolist()
+        if self.num_points == 0 or {*counts} != {counts[0] if num_points is None else num_points}:
+            return self.cat_padded([self], num_points)
+        shape = len(counts), counts[0]
+        rows = {name: value.reshape(*shape, *value.shape[1:]) for name, value in self.fields().items()}
+        return padded_clouds([self], rows, counts)
+
+    @staticmethod
+    def cat_padded(clouds: Sequence[PointCloud], num_points: int | None = None) -> PaddedClouds:
+        """Return ``PointCloud.cat(clouds).padded(num_points)`` with every row copied once.
+
+        Raises:
+            FrameError, UnitError, ShapeError, DeviceError: as :meth:`cat` and :meth:`padded`.
+        """
+        parts = joinable_parts(clouds)
+        counts = [[stop - start for start, stop in itertools.pairwise(cloud.ptr.tolist())] for cloud in clouds]
+        flat = list(itertools.chain.from_iterable(counts))
+        width = max(flat) if num_points is None else num_points
+        if max(flat) > width:
+            raise ShapeError(f"PointCloud.padded: a cloud has {max(flat)} points, more than num_points={width}")
+        rows = pad_rows({name: rows_per_cloud(value, counts) for name, value in parts.items()}, width)
+        return padded_clouds(clouds, rows, flat)
 
     # -- moving between devices and processes ----------------------------------------------------------------------
 
@@ -360,7 +387,7 @@ class PointCloud:
 
     def _map(self, move: Any) -> PointCloud:
         rows = {name: move(value) for name, value in self.fields().items()}
-        return self._rebuilt(
+        return self._with_rows(
             rows,
             layout=None if self.layout is None else replace(self.layout, intrinsics=move(self.layout.intrinsics)),
             ptr=move(self.ptr),
@@ -379,33 +406,18 @@ class PointCloud:
         return f"PointCloud({sizes} in {self.frame_id!r} [{self.unit}]{': ' + carried if carried else ''})"
 
 
+def _within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:
+    """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
+    if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
+        last = ptr[1:][ptr[1:] > ptr[:-1]] - 1
+        if bool((source_index[last] < num_pixels).all()):
+            return source_index
+    return source_index % num_pixels
+
+
 def _layout_of(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None)) -> ImageLayout | None:
     """Join the layouts of batches, or take part of one; None when one has none or the images differ in size."""
     known = [layout for layout in layouts if layout is not None]
     if len(known) < len(layouts) or len({layout.size for layout in known}) > 1:
         return None
     return ImageLayout(size=known[0].size, intrinsics=torch.cat([layout.intrinsics for layout in known])[clouds])
-
-
-def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:
-    for name in ("frame_id", "source_frame"):
-        if getattr(first, name) != getattr(other, name):
-            raise FrameError(
-                f"PointCloud.cat: cloud {position} has {name} {getattr(other, name)!r} but cloud 0 has "
-                f"{getattr(first, name)!r}; bring both to one frame (ToFrame) first"
-            )
-    if first.unit != other.unit:
-        raise UnitError(
-            f"PointCloud.cat: cloud {position} has unit {other.unit!r} but cloud 0 has {first.unit!r}; "
-            "normalise both or neither"
-        )
-    if first.device != other.device:
-        raise DeviceError(
-            f"PointCloud.cat: cloud {position} is on {other.device} but cloud 0 is on {first.device}; "
-            "move one with .to()"
-        )
-    if set(first.fields()) != set(other.fields()) or first.kinds != other.kinds:
-        different = set(first.fields()) ^ set(other.fields()) or "kinds"
-        raise ShapeError(f"PointCloud.cat: cloud {position} and cloud 0 carry different fields: {different}")
-    if (first.viewpoint is None) != (other.viewpoint is None):
-        raise ShapeError(f"PointCloud.cat: only one of cloud 0 and cloud {position} has a viewpoint")

@@ -104,11 +104,11 @@ class Transform(nn.Module):
             generator: required by random steps: one CPU generator, or one per cloud.
         """
         try:
-            self._check_input(data)
+            self.check_input(data)
             streams = Streams.of(self._generator(generator), num_clouds(data)) if self.is_random else None
             params = self.make_params(data, streams)
             result = self.apply(data, params)
-            return self._record(data, result, params)
+            return self.recorded(data, result, params)
         except Exception as error:
             add_note(error, f"in {self!r} on {data!r}")
             raise
@@ -145,7 +145,8 @@ class Transform(nn.Module):
             )
         return generator
 
-    def _check_input(self, data: Any) -> None:
+    def check_input(self, data: Any) -> None:
+        """Require what the step takes, in the frame and the unit that its fields are written in."""
         name = type(self).__name__
         if not isinstance(data, self.takes):
             hint = "; put Deproject before it" if isinstance(data, DepthFrame) else ""
@@ -163,13 +164,23 @@ class Transform(nn.Module):
                 f"{name}: its fields are lengths in metres but the cloud is {data.unit}; put it before normalising"
             )
 
-    def _record(self, data: Any, result: Any, params: Params) -> Any:
+    def recorded(self, data: Any, result: Any, params: Params) -> Any:
+        """Return the result of this step on the data with the step in its history."""
         if isinstance(result, DepthFrame):
-            steps = [*result.provenance.get("history", ()), self._step({}, {})]
-            return dataclasses.replace(result, provenance={**result.provenance, "history": steps})
+            steps = [*result.provenance.get("history", ()), {**self._step(), "params": {}}]
+            return result.with_provenance({"history": steps})
         before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
-        after = result.counts.tolist()
-        history = []
+        return self.recorded_counts(result, before, result.counts.tolist(), params)
+
+    def recorded_counts(
+        self, result: PointCloud, before: list[int] | None, after: list[int], params: Params
+    ) -> PointCloud:
+        """Return the result with the step in its history, given the points per cloud before and after it.
+
+        Raises:
+            TooFewPointsError: a cloud has lost its last point, or never had one.
+        """
+        steps = []
         for b, count in enumerate(after):
             facts: dict[str, Any] = {"points": count}
             if before is not None and len(before) == len(after):
@@ -181,12 +192,12 @@ class Transform(nn.Module):
                     )
             elif count == 0:
                 raise TooFewPointsError(f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points")
-            history.append((*result.history[b], self._step(facts, _small(params, b, len(after)))))
-        return dataclasses.replace(result, history=tuple(history))
+            steps.append({**self._step(), "params": _small(params, b, len(after)), **facts})
+        return result.with_steps(steps)
 
-    def _step(self, facts: dict[str, Any], params: dict[str, Any]) -> dict[str, Any]:
+    def _step(self) -> dict[str, Any]:
         (name, fields), *_ = self.to_config().items()
-        return {"step": name, "version": self.version, "fields": fields, "params": params, **facts}
+        return {"step": name, "version": self.version, "fields": fields}
 
 
 class SpatialTransform(Transform, abstract=True):

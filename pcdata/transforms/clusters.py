@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.clusters import dbscan
-from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask
+from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
@@ -40,19 +40,16 @@ class ClusterObjects(Transform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
         raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=data.image_grid())
-        cloud = cloud_of_rows(data.ptr)
-        member = raw >= 0
-        # One id per (cloud, cluster), ascending by cloud then label, as unique sorts them.
-        pairs = torch.stack([cloud[member], raw[member]], dim=1)
-        unique, inverse, counts = torch.unique(pairs, dim=0, return_inverse=True, return_counts=True)
-        accepted = (counts >= self.min_size) & (counts <= self.max_size)
-        running = accepted.cumsum(0)
-        before_cloud = torch.searchsorted(unique[:, 0].contiguous(), unique[:, 0].contiguous())
-        taken_before = torch.cat([running.new_zeros(1), running])[before_cloud]
-        number = torch.where(accepted, running - 1 - taken_before, -1)
-        labels = torch.full_like(raw, -1)
-        labels[member] = number[inverse]
-        return {"labels": labels}
+        parts = torch.tensor_split(raw, data.ptr[1:-1].cpu())
+        return {"labels": torch.cat([self._numbered(part) for part in parts])}
+
+    def _numbered(self, raw: Tensor) -> Tensor:
+        """Number the clusters of plausible size in one cloud by 0, 1, ... and call all else -1."""
+        size = torch.bincount(raw + 1)  # noise first
+        accepted = (size >= self.min_size) & (size <= self.max_size)
+        accepted[:1] = False
+        number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
+        return number[raw + 1]
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Write the labels and drop the rest unless the whole scene is kept."""
@@ -60,7 +57,8 @@ class ClusterObjects(Transform):
         labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data))
         if self.keep == "all":
             return labelled
-        return labelled.select(labels >= 0, ptr_after_mask(labels >= 0, data.ptr))
+        member = labels >= 0
+        return labelled.select(member, ptr_after_mask(member, data.ptr))
 
 
 class SplitObjects(Transform):
@@ -88,12 +86,9 @@ class SplitObjects(Transform):
         return PointCloud.cat(parts)
 
 
-def _objects(labels: torch.Tensor, data: PointCloud) -> list[dict[str, Any]]:
+def _objects(labels: Tensor, data: PointCloud) -> list[dict[str, Any]]:
     entries = []
-    bounds = data.ptr.tolist()
-    for start, stop in itertools.pairwise(bounds):
-        own = labels[start:stop]
-        unique, counts = torch.unique(own[own >= 0], return_counts=True)
-        found = [{"label": label, "points": count} for label, count in zip(unique.tolist(), counts.tolist())]
-        entries.append({"objects": found})
+    for own in torch.tensor_split(labels, data.ptr[1:-1].cpu()):
+        sizes = torch.bincount(own + 1)[1:].tolist()
+        entries.append({"objects": [{"label": label, "points": count} for label, count in enumerate(sizes)]})
     return entries

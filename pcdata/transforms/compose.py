@@ -14,6 +14,7 @@ from pcdata.errors import ConfigError
 from pcdata.rng import Streams, seeded
 from pcdata.structures import METRE, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds
+from pcdata.transforms.capture import find_capture, run_capture
 from pcdata.transforms.fields import Fraction
 
 
@@ -40,6 +41,7 @@ class Compose(Transform):
         _check_chain(flat)
         _warn_statistics_before_crop(flat)
         steps = self.__dict__.pop("steps")
+        self._capture = find_capture(steps)
         self.steps = nn.ModuleList(steps)  # type: ignore[assignment]
         self.is_random = any(step.is_random for step in steps)  # type: ignore[misc]
         self.keeps_clouds = all(step.keeps_clouds for step in steps)  # type: ignore[misc]
@@ -60,22 +62,38 @@ class Compose(Transform):
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
         """Run every step; the steps record themselves, the chain adds nothing."""
         result = data
-        for _, result in self.step_through(data, generator=generator):  # noqa: B007 - the last one counts
+        for _, result in self._run(data, generator, self._capture):  # noqa: B007 - the last one counts
             pass
         return result
 
     def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
         """Yield ``(step, data)`` after every step, for looking inside."""
+        return self._run(data, generator, None)
+
+    def _run(
+        self, data: Data, generator: GeneratorLike | None, capture: slice | None
+    ) -> Iterator[tuple[Transform, Any]]:
+        """Yield after every step, with those of ``capture`` run as one where that is possible."""
         if self.is_random:
             generator = self._generator(generator)
             if not isinstance(generator, Generator):
                 generator = Streams.of(generator, num_clouds(data)).generators
-        for step in self.steps:
+        steps = list(self.steps)
+        position = 0
+        while position < len(steps):
+            step = steps[position]
+            if capture is not None and position == capture.start:
+                cloud = run_capture(steps[capture], data)
+                if cloud is not None:
+                    data, position = cloud, capture.stop
+                    yield steps[position - 1], data
+                    continue
             if step.is_random:
                 # One stream per cloud, split off once: random steps in a row draw from the same streams, so that
                 # running only the random suffix on a cached prefix gives the same draws.
                 generator = _streams_for(generator, num_clouds(data))
             data = step(data, generator=generator if step.is_random else None)
+            position += 1
             yield step, data
 
     def split(self) -> tuple[Compose, Compose]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.checks import all_finite
 from pcdata.errors import ConfigError, NonFiniteError, PcdataError
 from pcdata.functional import rigid
+from pcdata.functional.boxes import inside_box
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
@@ -46,12 +46,11 @@ class CropWorkspace(SelectTransform):
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the rows inside."""
         points = cloud.points
-        if not all_finite(points):  # a comparison would drop them without a word
-            raise NonFiniteError("CropWorkspace: the cloud has NaN or infinite coordinates; drop those points first")
         if self.frame_from_box is not None:
             pose = torch.tensor(self.frame_from_box, dtype=torch.float64, device=cloud.device)
             box_from_frame = rigid.invert_rigid(pose).repeat(cloud.num_clouds, 1, 1)
             points = rigid.transform_points(points, cloud.ptr, box_from_frame)
-        lower, upper = points.new_tensor(self.lower), points.new_tensor(self.upper)
-        inside = ((points >= lower) & (points <= upper)).all(dim=1)
+        inside = inside_box(points, self.lower, self.upper)
+        if inside is None:
+            raise NonFiniteError("CropWorkspace: the cloud has NaN or infinite coordinates; drop those points first")
         return inside, ptr_after_mask(inside, cloud.ptr)

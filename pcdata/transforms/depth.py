@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Annotated, Any
 
 import torch
+from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.depth import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -38,27 +37,27 @@ class MaskDepth(Transform):
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Return the frame with the dropped pixels at 0."""
-        keep = data.depth > 0
-        if self.near is not None:
-            keep &= data.depth >= self.near
-        if self.far is not None:
-            keep &= data.depth <= self.far
+        return data.masked(near=self.near, far=self.far, mask=self.mask_of(data))
+
+    def mask_of(self, data: DepthFrame) -> Tensor | None:
+        """Return the (V, H, W) bool mask that the capture's mask, labels and confidence make; None without any."""
         if data.mask is None and self.require_mask:
             raise CaptureError(f"MaskDepth: capture {data.sample_id!r} has no mask; add one or set require_mask: false")
-        if data.mask is not None and self.use_mask:
-            keep &= data.mask
+        mask = data.mask if self.use_mask else None
         if self.drop_labels:
             if data.labels is None:
                 raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
-            keep &= ~torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+            unwanted = torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+            mask = ~unwanted if mask is None else mask & ~unwanted
         if self.min_confidence is not None:
             if data.confidence is None:
                 raise CaptureError(
                     f"MaskDepth: min_confidence is set but the capture {data.sample_id!r} has no confidence; put "
                     "MarkUnreliableDepth or CompleteDepth before it"
                 )
-            keep &= data.confidence >= confidence_named(self.min_confidence)
-        return replace(data, depth=torch.where(keep, data.depth, 0.0))
+            trusted = data.confidence >= confidence_named(self.min_confidence)
+            mask = trusted if mask is None else mask & trusted
+        return mask
 
 
 class Deproject(Transform):
@@ -81,25 +80,38 @@ class Deproject(Transform):
 
     def apply(self, data: DepthFrame, params: Params) -> PointCloud:
         """Deproject all views in one call."""
+        made = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
+        return self.cloud_of(data, made)
+
+    def cameras_of(self, data: DepthFrame) -> tuple[Tensor, Tensor | None]:
+        """Return the intrinsics (V, 3, 3) and distortion (V, D) where the depth lies."""
         camera = data.camera.to(data.device)
-        points, ptr, pixel_index = deproject_depth(data.depth, camera.intrinsics, distortion=camera.distortion)
-        source_index = cloud_of_rows(ptr) * (data.size[0] * data.size[1]) + pixel_index
+        return camera.intrinsics, camera.distortion
+
+    def images_of(self, data: DepthFrame) -> dict[str, Tensor]:
+        """Return the images that become per-point fields as they are."""
+        images = {"labels": data.labels, "confidence": data.confidence}
+        return {name: image for name, image in images.items() if image is not None}
+
+    def cloud_of(self, data: DepthFrame, made: Deprojected) -> PointCloud:
+        """Return the points with all that the capture knows about them."""
+        intrinsics, distortion = self.cameras_of(data)
         identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
         frames = {CAMERA_FRAME: identity}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
-        extra = {} if data.confidence is None else {"confidence": data.confidence.flatten()[source_index]}
         history = tuple(data.provenance.get("history", ()))
+        extra = {name: rows for name, rows in made.rows.items() if name != "labels"}
         return PointCloud(
-            points=points,
-            ptr=ptr,
+            points=made.points,
+            ptr=made.ptr,
             frame_id=CAMERA_FRAME,
-            colors=None if data.colors is None else data.colors.reshape(-1, 3)[source_index].float() / 255,
-            labels=None if data.labels is None else data.labels.flatten()[source_index],
-            source_index=source_index,
+            colors=made.colors,
+            labels=made.rows.get("labels"),
+            source_index=made.source_index,
             extra=extra,
             kinds=dict.fromkeys(extra, Kind.MINIMUM),
-            layout=None if camera.distortion is not None else ImageLayout(size=data.size, intrinsics=camera.intrinsics),
+            layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, device=data.device),
             frames=frames,
             meta=[_view_meta(data, view) for view in range(data.num_views)],

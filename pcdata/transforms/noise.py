@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform
@@ -29,14 +29,13 @@ class RandomJitter(Transform):
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Add the noise that belongs to the seeds."""
-        drawn = [
-            torch.randn((count, 3), generator=seeded(seed))
-            for count, seed in zip(data.counts.tolist(), params["seed"].tolist(), strict=True)
-        ]
-        noise = torch.cat(drawn) * self.sigma
+        noise = torch.empty((data.num_points, 3), dtype=torch.float32)
+        for rows, seed in zip(noise.split(data.counts.tolist()), params["seed"].tolist(), strict=True):
+            torch.randn(rows.shape, generator=seeded(seed), out=rows)
+        noise *= self.sigma
         if self.clip is not None:
-            noise = noise.clamp(-self.clip, self.clip)
-        return data.with_fields(points=data.points + noise.to(data.device))
+            noise.clamp_(-self.clip, self.clip)
+        return data.with_fields(points=noise.to(data.device).add_(data.points))
 
 
 class RandomPointDropout(SelectTransform):
@@ -56,15 +55,13 @@ class RandomPointDropout(SelectTransform):
         """Draw the fraction, then which points."""
         assert streams is not None
         fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
-        bounds = cloud.ptr.tolist()
-        kept = []
-        for b, (start, stop) in enumerate(itertools.pairwise(bounds)):
-            count = stop - start
-            num_kept = max(count - round(count * fractions[b]), min(count, 1))
-            order = torch.randperm(count, generator=seeded(seeds[b]))[:num_kept]
-            kept.append(start + order.sort().values)
-        index = torch.cat(kept).to(cloud.device)
-        return index, ptr_from_counts([len(rows) for rows in kept], device=cloud.device)
+        keep = torch.zeros(cloud.num_points, dtype=torch.bool)
+        counts = cloud.counts.tolist()
+        for rows, fraction, seed in zip(keep.split(counts), fractions, seeds, strict=True):
+            num_kept = max(len(rows) - round(len(rows) * fraction), min(len(rows), 1))
+            rows.index_fill_(0, torch.randperm(len(rows), generator=seeded(seed))[:num_kept], True)
+        keep = keep.to(cloud.device)
+        return keep, ptr_after_mask(keep, cloud.ptr)
 
 
 class RandomColorJitter(Transform):

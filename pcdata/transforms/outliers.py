@@ -6,6 +6,7 @@ from typing import Annotated
 
 from torch import Tensor
 
+from pcdata.checks import negated
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
@@ -28,7 +29,8 @@ class RemoveStatisticalOutliers(SelectTransform):
         outlier = statistical_outlier_mask(
             cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
         )
-        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)
+        keep = negated(outlier)
+        return keep, ptr_after_mask(keep, cloud.ptr)
 
 
 class RemoveRadiusOutliers(SelectTransform):
@@ -45,4 +47,5 @@ class RemoveRadiusOutliers(SelectTransform):
         outlier = radius_outlier_mask(
             cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
         )
-        return ~outlier, ptr_after_mask(~outlier, cloud.ptr)
+        keep = negated(outlier)
+        return keep, ptr_after_mask(keep, cloud.ptr)

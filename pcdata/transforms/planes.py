@@ -9,10 +9,11 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from pcdata.checks import negated
 from pcdata.errors import ConfigError
 from pcdata.functional import rigid
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, segment_sum
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform
@@ -59,7 +60,7 @@ class RemovePlane(SelectTransform):
             up=self.up,
             max_tilt=self.max_tilt,
         )
-        keep = ~inlier
+        keep = negated(inlier)
         if self.keep == "above":
             plane = planes.double()[cloud_of_rows(data.ptr)]
             keep &= (plane[:, :3] * data.points).sum(1) + plane[:, 3] > 0
@@ -67,7 +68,7 @@ class RemovePlane(SelectTransform):
             "index": keep,
             "ptr": ptr_after_mask(keep, data.ptr),
             "planes": planes,
-            "num_inliers": segment_sum(inlier.long(), data.ptr),
+            "num_inliers": counts_from_ptr(ptr_after_mask(inlier, data.ptr)),
         }
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:

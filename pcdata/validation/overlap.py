@@ -11,7 +11,7 @@ from torch import Tensor
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.small_motions import motion_from_twist
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
-from pcdata.functional.view_consensus import Consensus, find_consensus
+from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.surfaces import surfaces_of
@@ -45,10 +45,12 @@ def verify_overlap(
         ShapeError: fewer than two views, or captures with different numbers of them.
         FrameError: the views are not in a common frame, or their poses are unknown or differ between the captures.
         UnitError: a cloud is not in metres.
-        ConfigError: not one name per camera.
+        ConfigError: no capture, or not one name per camera.
     """
     where = "verify_overlap"
     limits = OverlapLimits() if limits is None else limits
+    if not captures:
+        raise ConfigError(f"{where}: give at least one capture")
     surfaces, poses = zip(*(surfaces_of(where, capture, max_samples=max_samples) for capture in captures))
     num_views = len(poses[0])
     for position, pose in enumerate(poses):
@@ -138,16 +140,20 @@ def _camera(
     points = torch.cat(seen)
     center = points.median(0).values if len(points) else alignment.pivot
     motion = motion_from_twist(consensus.twists[view], alignment.pivot)
-    shift = motion[:3, :3] @ center + motion[:3, 3] - center
-    angle = float(consensus.twists[view, :3].norm())
     covariance = _at(center - alignment.pivot, consensus.covariance[view])
     shift_sigma, unknown_shifts = _spread(covariance[3:, 3:], limits.max_shift_sigma)
-    angle_sigma, unknown_turns = _spread(covariance[:3, :3], math.radians(limits.max_rotation_sigma_degrees))
-    degrees = math.degrees(angle)
+    turn_sigma, unknown_turns = _spread(covariance[:3, :3], math.radians(limits.max_rotation_sigma_degrees))
     unknown = (
         *(f"shift along {_words(direction)}" for direction in unknown_shifts),
         *(f"turn about {_words(direction)}" for direction in unknown_turns),
     )
+    # What the surfaces do not determine may be anything, and must not accuse a camera.
+    shift = motion[:3, :3] @ center + motion[:3, 3] - center
+    shift = measured_part(shift, covariance[3:, 3:], limits.max_shift_sigma)
+    turn = measured_part(
+        consensus.twists[view, :3], covariance[:3, :3], math.radians(limits.max_rotation_sigma_degrees)
+    )
+    degrees = math.degrees(float(turn.norm()))
     verdict = limits.worse(
         limits.verdict(float(shift.norm()), limits.shift), limits.verdict(degrees, limits.rotation_degrees)
     )
@@ -161,7 +167,7 @@ def _camera(
         shift_vector=tuple(shift.tolist()),
         shift_sigma=shift_sigma,
         rotation_degrees=degrees,
-        rotation_sigma_degrees=math.degrees(angle_sigma),
+        rotation_sigma_degrees=math.degrees(turn_sigma),
         center=tuple(center.tolist()),
         correction=motion.tolist(),
         unmeasurable=unknown,

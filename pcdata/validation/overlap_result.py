@@ -65,7 +65,7 @@ class PairOverlap:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOverlap:
-    """How far one camera is out of place, against the reference camera."""
+    """How far one camera is out of place, against the reference camera, along the directions that are measurable."""
 
     name: str
     shift: float  # metres, at ``center``
@@ -116,22 +116,23 @@ class OverlapResult:
                 "check both mounts, add a third camera, or recalibrate them"
             )
         for pair in self.pairs:
-            if pair.meeting is not None and pair.verdict == "fail" and not pair.median <= self.limits.residual[1]:
-                yield (
-                    (
-                        f"{pair.first} and {pair.second}: only {100 * pair.meeting:.0f} % of what both could see lies "
-                        "within reach of the other's surface; check that the poses are world_from_camera, in metres, and "
-                        "that nothing moved between the views"
-                    )
-                    if pair.meeting < 0.3
-                    else (f"{pair.first} and {pair.second}: their surfaces lie {1e3 * pair.median:.1f} mm apart")
-                )
+            if pair.verdict == "fail":
+                yield f"{pair.first} and {pair.second}: {self._why_failed(pair)}"
         for camera in self.cameras:
             if camera.unmeasurable:
                 yield (
                     f"{camera.name}: not measurable here: {'; '.join(camera.unmeasurable)}; put objects with upright "
                     "sides where the cameras overlap, or give several captures"
                 )
+
+    def _why_failed(self, pair: PairOverlap) -> str:
+        if pair.median > self.limits.residual[1]:
+            return f"their surfaces lie {1e3 * pair.median:.1f} mm apart"
+        assert pair.meeting is not None  # otherwise nothing else fails a pair
+        return (
+            f"only {100 * pair.meeting:.0f} % of what both could see lies within reach of the other's surface; check "
+            "that the poses are world_from_camera, in metres, and that nothing moved between the views"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON; numbers that are not finite become None."""

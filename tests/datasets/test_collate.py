@@ -7,6 +7,7 @@ import torch
 
 from pcdata import PointCloud, collate_fixed, collate_packed, collate_padded
 from pcdata.errors import DTypeError, FrameError, ShapeError
+from tests.factories import assert_same
 
 ALL = [collate_packed, collate_padded, collate_fixed]
 
@@ -42,6 +43,25 @@ def test_fixed_is_a_plain_stack():
     batch = collate_fixed([cloud(4), cloud(4, 7.0)])
     assert torch.equal(batch.points, torch.stack([cloud(4).points, cloud(4, 7.0).points]))
     assert batch.mask.all()
+
+
+@pytest.mark.parametrize("counts", [[4, 4, 4], [3, 0, 5], [20_000, 31_000]], ids=str)
+def test_padding_samples_equals_padding_their_batch(counts):
+    clouds = [cloud(count, float(count)) for count in counts]
+    assert_same(collate_padded(clouds), PointCloud.cat(clouds).padded())
+    assert_same(PointCloud.cat_padded(clouds, 31_007), PointCloud.cat(clouds).padded(31_007))
+    batches = [PointCloud.cat(clouds), clouds[0]]
+    assert_same(PointCloud.cat_padded(batches), PointCloud.cat(batches).padded())
+
+
+def test_a_padded_batch_shares_nothing_with_its_samples():
+    samples = [cloud(4), cloud(4, 7.0)]
+    for collate in ALL:
+        batch = collate(samples)
+        batch.points.zero_()
+    assert float(samples[1].points.min()) == 7.0
+    assert float(collate_fixed(samples[:1]).points.zero_().sum()) == 0.0
+    assert float(samples[0].points.sum()) == 66.0
 
 
 def test_fixed_refuses_other_counts_and_says_what_to_do():

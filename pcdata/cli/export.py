@@ -1,0 +1,78 @@
+"""The command that writes what other projects' loaders open: export."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.progress import Progress
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    export = commands.add_parser("export", help="write a dataset or captures in the layout of a model's own loader")
+    export.add_argument("path", metavar="PATH", help="dataset that 'pcdata build' wrote, or captures for image targets")
+    export.add_argument("--to", required=True, metavar="NAME", help="target, such as dp3; an unknown name lists them")
+    export.add_argument("--out", required=True, metavar="DIR", help="folder of the export")
+    export.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="OPTION=VALUE",
+        type=_pair,
+        help="option of the target; repeatable",
+    )
+    add_capture_options(export)
+    export.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    again = export.add_mutually_exclusive_group()
+    again.add_argument(
+        "--continue",
+        dest="resume",
+        action="store_true",
+        help="keep what is finished, and go on where a run was stopped",
+    )
+    again.add_argument("--overwrite", action="store_true", help="replace the export that is in DIR")
+    export.set_defaults(run=_export)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from pcdata.errors import ConfigError
+    from pcdata.exports import export_dataset
+    from pcdata.exports.registry import target_named
+    from pcdata.exports.sources import is_built
+
+    options = dict(arguments.set)
+    if len(options) != len(arguments.set):
+        raise ConfigError("export: an option is set twice; set it once")
+    target_named(arguments.to, options)  # a wrong name must not wait for a folder to be listed
+    source = arguments.path
+    if not is_built(source):
+        source = open_captures(source, arguments, limit=arguments.limit)
+    elif given := [name for name in _CAPTURE_OPTIONS if getattr(arguments, name) is not None]:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ConfigError(f"export: {source} is a built dataset, which {flags} cannot change; leave that out")
+    with Progress("export") as progress:
+        report = export_dataset(
+            source,
+            arguments.to,
+            arguments.out,
+            overwrite=arguments.overwrite,
+            resume=arguments.resume,
+            progress=progress,
+            **options,
+        )
+    kept = f", {report.kept} were there" if report.kept else ""
+    print(f"export  {report.folder}  ({report.target}: {report.written} samples written{kept})")
+    for note in report.notes:
+        print(f"note    {note}")
+
+
+_CAPTURE_OPTIONS = ("kind", "metres_per_unit", "calibration", "camera", "frame", "limit")
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not sign or not name:
+        raise argparse.ArgumentTypeError(f"must be OPTION=VALUE, got {text!r}")
+    return name, value

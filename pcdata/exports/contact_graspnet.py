@@ -1,0 +1,65 @@
+"""Contact-GraspNet: one ``.npz`` per view.
+
+Source: NVlabs/contact_graspnet, ``contact_graspnet/data.py`` (load_available_input_data), ``inference.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.exports.checks import object_ids, one_view
+from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.io.manifest import key_of
+
+_NEAR, _FAR = 0.2, 1.8  # metres; the default --z_range of inference.py
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactGraspNet(Target):
+    """A folder of ``<sample>.npz``; give it to the loader as ``--np_path=DIR/*.npz``.
+
+    Never a cloud: of a file with ``xyz`` alone the loader leaves the intrinsics unset and stops.
+
+    Args:
+        view: which view, of captures with several.
+        label_offset: added to the labels, so that objects count from 1.
+    """
+
+    name: ClassVar[str] = "contact_graspnet"
+    takes: ClassVar[Literal["captures"]] = "captures"
+    layout: ClassVar[str] = "one npz per capture: depth (metres), K, and segmap and rgb where the capture has them"
+
+    view: int | None = None
+    label_offset: int = 0
+
+    def items(self, ids: Sequence[str]) -> list[Item]:
+        """One file per sample."""
+        return [Item((sample_id,), (f"{key_of(sample_id)}.npz",)) for sample_id in ids]
+
+    def write(self, item: Item, samples: Samples, folder: Path, note: Note) -> None:
+        """Write one file."""
+        for sample_id, data in samples:
+            where = f"contact_graspnet: sample {sample_id!r}"
+            frame = one_view(where, data, self.view)
+            depth = frame.depth[0].numpy()
+            arrays: dict[str, NDArray] = {"depth": depth, "K": frame.camera.intrinsics[0].numpy()}
+            if frame.labels is not None:
+                arrays["segmap"] = object_ids(where, frame, self.label_offset, 2**31 - 1).astype(np.int32)
+            else:
+                note(
+                    "captures without labels have no segmap: run inference.py without --local_regions, --filter_grasps"
+                )
+            if frame.colors is not None:
+                # The loader swaps the channels before it shows the image.
+                arrays["rgb"] = np.ascontiguousarray(frame.colors[0].numpy()[..., ::-1])
+            if not ((depth > _NEAR) & (depth < _FAR)).any():
+                note(
+                    f"some captures have no depth within {_NEAR}..{_FAR} m, which inference.py crops to; use --z_range"
+                )
+            np.savez(folder / item.paths[0], allow_pickle=False, **arrays)

@@ -1,0 +1,107 @@
+"""Robot states and actions beside the clouds: one ``.npz`` per episode, or a mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.errors import ConfigError, near_matches
+from pcdata.io.files import existing_file
+
+ARRAYS = ("samples", "state", "action")
+_MAX_BYTES = 1 << 32
+
+Given = Path | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """T timesteps in order."""
+
+    name: str
+    samples: tuple[str, ...]  # T ids of clouds
+    state: NDArray[np.float32]  # (T, Ds)
+    action: NDArray[np.float32]  # (T, Da)
+
+
+def episode_names(where: str, given: Given | None) -> list[str]:
+    """Return the names of the episodes, sorted.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    if given is None:
+        raise ConfigError(
+            f"{where}: needs the option episodes, since clouds know no actions: a folder with one .npz per episode "
+            "that has samples (T,), the sample ids in order, state (T, Ds) and action (T, Da); in Python also a "
+            "mapping from name to such arrays"
+        )
+    if isinstance(given, Mapping):
+        names = sorted(given)
+    elif given.is_dir():
+        names = sorted(path.name for path in given.glob("*.npz") if not path.name.startswith("."))
+    else:
+        raise ConfigError(f"{where}: episodes must be a folder of .npz files, but {given} is none")
+    if not names:
+        raise ConfigError(f"{where}: {given if isinstance(given, Path) else 'the mapping'} has no episode")
+    return names
+
+
+def read_episodes(where: str, given: Given, names: Sequence[str]) -> Iterator[Episode]:
+    """Yield the episodes of these names, one in memory at a time; all have states and actions of one width.
+
+    Raises:
+        ConfigError: an array is missing, has another shape, or is not finite.
+    """
+    widths: dict[str, int] = {}
+    for name in names:
+        place = f"{where}: episode {name!r}"
+        arrays = given[name] if isinstance(given, Mapping) else _read_npz(place, given / name)
+        if not isinstance(arrays, Mapping) or set(arrays) != set(ARRAYS):
+            found = sorted(arrays) if isinstance(arrays, Mapping) else [type(arrays).__name__]
+            hint = "".join(near_matches(str(word), ARRAYS) for word in found if word not in ARRAYS)
+            raise ConfigError(f"{place}: must have {', '.join(ARRAYS)} and nothing else, got {', '.join(found)}{hint}")
+        samples = np.asarray(arrays["samples"])
+        if samples.ndim != 1 or samples.dtype.kind != "U" or not len(samples):
+            raise ConfigError(
+                f"{place}: samples must be texts (T,) with T >= 1, got {samples.dtype} {samples.shape}; "
+                "np.array([...]) of the sample ids, in order"
+            )
+        numbers = {}
+        for key in ("state", "action"):
+            numbers[key] = _numbers(place, key, arrays[key], len(samples))
+            width = widths.setdefault(key, numbers[key].shape[1])
+            if numbers[key].shape[1] != width:
+                raise ConfigError(
+                    f"{place}: {key} has {numbers[key].shape[1]} columns, the episodes before have {width}"
+                )
+        yield Episode(name, tuple(samples.tolist()), **numbers)
+
+
+def _numbers(place: str, key: str, value: Any, count: int) -> NDArray[np.float32]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" or array.ndim != 2 or len(array) != count or array.shape[1] < 1:
+        raise ConfigError(
+            f"{place}: {key} must be numbers ({count}, D), a row per sample, got {array.dtype} {array.shape}"
+        )
+    with np.errstate(over="ignore"):
+        narrow = array.astype(np.float32)
+    if not np.isfinite(narrow).all():
+        raise ConfigError(f"{place}: {key} has values that are not finite float32 numbers; repair the recording")
+    return narrow
+
+
+def _read_npz(place: str, path: Path) -> dict[str, NDArray[Any]]:
+    existing_file(place, path, max_bytes=_MAX_BYTES)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile and numpy raise many types on damaged bytes
+        raise ConfigError(
+            f"{place}: {path} cannot be read: {error}; save it with np.savez, texts as np.array"
+        ) from error

@@ -1,0 +1,93 @@
+"""Pointcept: a folder of ``.npy`` files per scene, below a folder per split.
+
+Source: Pointcept/Pointcept, ``pointcept/datasets/defaults.py`` (DefaultDataset).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pcdata.errors import CaptureError
+from pcdata.exports.checks import SameFrame, check_channels, check_metres, one_cloud
+from pcdata.exports.table import Given, read_table
+from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.io.manifest import key_of
+from pcdata.structures import PointCloud
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pointcept(Target):
+    """``<split>/<sample>/{coord,color,normal,segment,instance}.npy``; give the folder to the loader as ``data_root``.
+
+    Args:
+        table: split of every sample, any name; None = all in ``train``. See :func:`pcdata.exports.table.read_table`.
+        segment: the per-point field of semantic classes, -1 = ignored; None = do without.
+        instance: the per-point field of objects, -1 = none; None = do without.
+        frame: the frame that the clouds must be in; None = any.
+    """
+
+    name: ClassVar[str] = "pointcept"
+    takes: ClassVar[Literal["clouds"]] = "clouds"
+    layout: ClassVar[str] = "a folder per scene: coord, color, normal, segment, instance .npy"
+
+    table: Given | None = None
+    segment: str | None = None
+    instance: str | None = None
+    frame: str | None = None
+
+    def items(self, ids: Sequence[str]) -> list[Item]:
+        """One folder per sample."""
+        splits = dict.fromkeys(ids, "train")
+        if self.table is not None:
+            splits = {
+                name: row.split or "train" for name, row in read_table(self.name, self.table, ids, needs=[]).items()
+            }
+        return [Item((sample_id,), (f"{splits[sample_id]}/{key_of(sample_id)}",)) for sample_id in ids]
+
+    def write(self, item: Item, samples: Samples, folder: Path, note: Note) -> None:
+        """Write one folder."""
+        for sample_id, data in samples:
+            where = f"pointcept: sample {sample_id!r}"
+            cloud = one_cloud(where, data)
+            check_metres(where, cloud, "its grids and crops are in metres")
+            if self.frame is not None:
+                SameFrame(self.frame).check(where, cloud)
+            arrays = {"coord": cloud.points.numpy()}
+            if cloud.colors is not None:
+                arrays["color"] = (cloud.colors * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+            if cloud.normals is not None:
+                arrays["normal"] = cloud.normals.numpy()
+            for key, name in (("segment", self.segment), ("instance", self.instance)):
+                if name is not None:
+                    arrays[key] = _integers(where, key, cloud, name)
+            missing = [key for key in ("color", "normal", "segment") if key not in arrays]
+            if missing:
+                note(f"some scenes have no {', '.join(missing)}: leave it out of feat_keys, or build it in")
+            scene = folder / item.paths[0]
+            scene.mkdir(parents=True)
+            for key, array in arrays.items():
+                np.save(scene / f"{key}.npy", array, allow_pickle=False)
+
+
+def _integers(where: str, key: str, cloud: PointCloud, name: str) -> NDArray[np.int32]:
+    check_channels(where, cloud, [name], f"; or leave out {key}={name}")
+    values = cloud.fields()[name]
+    values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+    if values.is_floating_point() or values.ndim != 1:
+        raise CaptureError(
+            f"{where}: {key} must be whole numbers (N,), but {name} is {values.dtype} {tuple(values.shape)}"
+        )
+    limits = np.iinfo(np.int32)
+    if bool((values < limits.min).any()) or bool((values > limits.max).any()):
+        raise CaptureError(
+            f"{where}: {key} is int32, but {name} reaches {int(values.min())}..{int(values.max())}; renumber it"
+        )
+    integers: NDArray[np.int32] = values.numpy().astype(np.int32)
+    return integers

@@ -1,0 +1,139 @@
+"""PointNet classification: HDF5 files of 2048 shapes, and their lists.
+
+Source: charlesq34/pointnet, ``provider.py`` (getDataFiles, loadDataFile), ``train.py``, ``utils/data_prep_util.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from pcdata.errors import ConfigError
+from pcdata.exports.checks import check_count, check_unit_sphere, one_cloud
+from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.structures import PointCloud
+
+NUM_POINTS = 2048
+_FILE_ROWS = 2048  # shapes in one file, as in the original
+_MAX_CLASSES = 256  # labels are uint8
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointNet(Target):
+    """``ply_data_<split><n>.h5``, ``<split>_files.txt`` and ``shape_names.txt``.
+
+    Args:
+        table: class and split (train or test) of every sample; see :func:`pcdata.exports.table.read_table`.
+        prefix: put before the file names in the lists. ``train.py`` opens those names as they are, from the
+            repository's folder; the default is the folder in which it looks for the lists.
+    """
+
+    name: ClassVar[str] = "pointnet"
+    takes: ClassVar[Literal["clouds"]] = "clouds"
+    layout: ClassVar[str] = "HDF5: data (B, 2048, 3), label (B, 1); train_files.txt, test_files.txt, shape_names.txt"
+    splits: ClassVar[tuple[str, ...]] = ("train", "test")
+
+    table: Given | None = None
+    prefix: str = "data/modelnet40_ply_hdf5_2048"
+
+    def rows(self, ids: Sequence[str]) -> dict[str, Row]:
+        """Return class and split of every sample."""
+        rows = read_table(self.name, self.table, ids, needs=["class"])
+        if len(classes_of(rows)) > _MAX_CLASSES:
+            raise ConfigError(
+                f"{self.name}: labels are 8-bit, so {_MAX_CLASSES} classes at most, got {len(classes_of(rows))}"
+            )
+        return rows
+
+    def items(self, ids: Sequence[str]) -> list[Item]:
+        """One item: the lists name all files."""
+        files = self._files(ids)
+        order = tuple(sample_id for chunk in files.values() for sample_id in chunk)
+        return [Item(order, (*files, *self.other_files(), *map(self.list_name, self.splits)))]
+
+    def write(self, item: Item, samples: Samples, folder: Path, note: Note) -> None:
+        """Write file after file."""
+        ids = item.ids
+        rows, files = self.rows(ids), self._files(ids)
+        classes = classes_of(rows)
+        class_of_part: dict[int, str] = {}
+        for split in self.splits:
+            names = [name for name in files if name.startswith(f"ply_data_{split}")]
+            if not names:
+                note(f"no sample is in the split {split}, so {self.list_name(split)} is empty")
+            lines = "".join(f"{self.listed(name)}\n" for name in names)
+            (folder / self.list_name(split)).write_text(lines, encoding="utf-8")
+        for name, chunk in files.items():
+            with _open(folder / name, len(chunk), self.arrays()) as file:
+                for number, (sample_id, data) in enumerate(islice(samples, len(chunk))):
+                    where = f"{self.name}: sample {sample_id!r}"
+                    cloud = one_cloud(where, data)
+                    check_count(where, cloud, exactly=NUM_POINTS)
+                    check_unit_sphere(where, cloud)
+                    class_name = rows[sample_id].class_name
+                    assert class_name is not None
+                    file["data"][number] = cloud.points.numpy()
+                    file["label"][number] = classes.index(class_name)
+                    self.add_shape(where, cloud, class_name, file, number, class_of_part)
+        next(samples, None)  # at its end the last sample is counted
+        self.write_names(folder, classes, class_of_part)
+
+    # -- what the part segmentation has otherwise ------------------------------------------------------------------
+
+    def arrays(self) -> Mapping[str, tuple[tuple[int, ...], str, int]]:
+        """Return name -> shape of a row, dtype, level of gzip."""
+        return {"data": ((NUM_POINTS, 3), "<f4", 4), "label": ((1,), "|u1", 1)}
+
+    def list_name(self, split: str) -> str:
+        """Return the name of the list of files."""
+        return f"{split}_files.txt"
+
+    def listed(self, name: str) -> str:
+        """Return a file as the list names it."""
+        return f"{self.prefix}/{name}" if self.prefix else name
+
+    def other_files(self) -> tuple[str, ...]:
+        """Return the files beside data and lists."""
+        return ("shape_names.txt",)
+
+    def add_shape(
+        self, where: str, cloud: PointCloud, class_name: str, file: Any, number: int, class_of_part: dict[int, str]
+    ) -> None:
+        """Add what else there is to a shape."""
+
+    def write_names(self, folder: Path, classes: Sequence[str], class_of_part: Mapping[int, str]) -> None:
+        """Write the names that belong to the numbers."""
+        (folder / "shape_names.txt").write_text("".join(f"{name}\n" for name in classes), encoding="utf-8")
+
+    def _files(self, ids: Sequence[str]) -> dict[str, list[str]]:
+        files: dict[str, list[str]] = {}
+        for split, members in in_splits(self.name, self.rows(ids), self.splits).items():
+            for number, start in enumerate(range(0, len(members), _FILE_ROWS)):
+                files[f"ply_data_{split}{number}.h5"] = members[start : start + _FILE_ROWS]
+        return files
+
+
+def _open(path: Path, num_rows: int, arrays: Mapping[str, tuple[tuple[int, ...], str, int]]) -> Any:
+    """Create a file with its arrays; a chunk is a row, so that rows are written one by one."""
+    import h5py
+
+    file = h5py.File(path, "x")
+    for name, (shape, dtype, level) in arrays.items():
+        # Many labels in a chunk, where a row is a few bytes.
+        rows_per_chunk = 1 if int(np.prod(shape)) > 1 else min(num_rows, 1024)
+        file.create_dataset(
+            name,
+            (num_rows, *shape),
+            dtype,
+            chunks=(rows_per_chunk, *shape),
+            compression="gzip",
+            compression_opts=level,
+            track_times=False,
+        )
+    return file

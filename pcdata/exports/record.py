@@ -1,0 +1,105 @@
+"""``pcdata_export.json``: which samples an export holds, what made it, and whether it is complete."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import CacheError
+from pcdata.io.files import replacing
+from pcdata.io.record import parse_info
+
+FILE_NAME = "pcdata_export.json"
+SCHEMA = "pcdata.export/1"
+
+_LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
+
+
+@dataclass(frozen=True)
+class ExportRecord:
+    """The contents of the file."""
+
+    target: str
+    options: Mapping[str, Any]
+    source: str  # fingerprint of a built dataset, or the layout of the captures
+    samples: Sequence[str]  # in the order in which they were numbered
+    complete: bool
+    files: Sequence[str] = ()  # all there was when it was completed
+    schema: str = SCHEMA
+
+    def write(self, folder: Path) -> None:
+        """Write the file; it appears whole."""
+        with replacing("export", folder / FILE_NAME) as temporary:
+            temporary.write_text(json.dumps(asdict(self), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, folder: Path) -> ExportRecord:
+        """Read the file.
+
+        Raises:
+            CacheError: missing, or not one.
+        """
+        path = folder / FILE_NAME
+        if not path.is_file():
+            raise CacheError(
+                f"{folder} is not a pcdata export (it has no {FILE_NAME}), so it is left alone; choose another"
+            )
+        try:
+            content = parse_info(path.read_bytes())
+            if content.get("schema") != SCHEMA:
+                raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}")
+            return cls(**content)
+        except (CacheError, OSError, TypeError) as error:
+            raise CacheError(f"{path}: cannot be read: {error}; choose another folder") from error
+
+    def difference(self, other: ExportRecord) -> str | None:
+        """Say in what the plan of another export differs from this one, or None."""
+        for name in ("target", "options", "source", "samples"):
+            mine, theirs = _as_json(getattr(self, name)), _as_json(getattr(other, name))
+            if mine != theirs:
+                return (
+                    "its samples are others"
+                    if name == "samples"
+                    else f"its {name} is {theirs!r:.200}, not {mine!r:.200}"
+                )
+        return None
+
+
+def check_replaceable(folder: Path, overwrite: bool) -> None:
+    """Require that nothing is at a folder, or an export that may be replaced without a loss.
+
+    Raises:
+        CacheError: something is there that must stay.
+    """
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        if not overwrite:
+            raise CacheError(
+                f"{folder} exists already; choose another folder, finish an interrupted export (--continue), or "
+                "replace it (--overwrite)"
+            )
+        record = ExportRecord.read(folder)
+        if not record.complete:
+            raise CacheError(f"{folder} holds an unfinished export; finish it (--continue), or remove it yourself")
+        foreign = sorted(set(files_of(folder)) - set(record.files))
+    except OSError as error:
+        raise CacheError(f"{folder}: cannot be examined: {error}") from error
+    if foreign:
+        raise CacheError(
+            f"{folder} also holds {', '.join(foreign[:5])}, which the export did not write and overwriting would "
+            "delete; move that out first, or choose another folder"
+        )
+
+
+def files_of(folder: Path) -> list[str]:
+    """Return the files below an export, without its record and what desktops leave behind."""
+    relative = (path.relative_to(folder) for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(p.as_posix() for p in relative if p.as_posix() != FILE_NAME and not _LITTER & set(p.parts))
+
+
+def _as_json(value: Any) -> Any:
+    return json.loads(json.dumps(value))

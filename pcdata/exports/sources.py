@@ -1,0 +1,76 @@
+"""What is exported: a path or an object, opened as the samples that a target takes."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from pcdata.datasets import CachedCloudDataset
+from pcdata.errors import CaptureError, ConfigError, DTypeError
+from pcdata.exports.target import Target
+from pcdata.io import open_source
+from pcdata.io.manifest import FILE_NAME
+from pcdata.io.source import CaptureSource, absolute
+from pcdata.structures import PointCloud
+
+
+class BuiltClouds:
+    """The stored clouds of a built dataset by id; nothing random runs on them."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self._dataset = CachedCloudDataset(absolute(folder), augment=None)
+        self._position = {sample_id: position for position, sample_id in enumerate(self._dataset.ids)}
+        self.fingerprint = self._dataset.manifest.fingerprint
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids."""
+        return list(self._dataset.ids)
+
+    def load(self, sample_id: str) -> PointCloud:
+        """Read one cloud."""
+        return self._dataset[self._position[sample_id]]
+
+    def __repr__(self) -> str:
+        return repr(self._dataset)
+
+
+def is_built(path: str | os.PathLike[str]) -> bool:
+    """Say whether a path is a dataset that ``pcdata build`` wrote."""
+    return (absolute(path) / FILE_NAME).is_file()
+
+
+def open_for(target: Target, source: Any) -> CaptureSource:
+    """Return the samples for a target; paths are opened.
+
+    Raises:
+        ConfigError: captures were given where clouds are exported, or the other way round.
+        CaptureError: there are no samples, or two have one id.
+        DTypeError: neither a path nor something with ids and load.
+    """
+    if isinstance(source, str | os.PathLike):
+        built = is_built(source)
+        if built and target.takes == "captures":
+            raise ConfigError(
+                f"export: {target.name} is made of depth images, but {source} is a built dataset of clouds; give the "
+                "captures that it was built from"
+            )
+        source = BuiltClouds(source) if built else open_source(source)
+    elif isinstance(source, CachedCloudDataset):
+        source = BuiltClouds(source.folder)
+    if not hasattr(source, "ids") or not hasattr(source, "load"):
+        raise DTypeError(f"export: source must be a path or have ids and load(id), got {type(source).__name__}")
+    ids = list(source.ids)
+    if not ids:
+        raise CaptureError(f"export: {source!r} has no samples")
+    if len(set(ids)) != len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise CaptureError(f"export: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    opened: CaptureSource = source
+    return opened
+
+
+def identity_of(source: CaptureSource) -> str:
+    """Return what a continued export must find unchanged: the fingerprint of a dataset, else the kind of source."""
+    fingerprint = getattr(source, "fingerprint", None)
+    return fingerprint if isinstance(fingerprint, str) else str(getattr(source, "kind", type(source).__name__))

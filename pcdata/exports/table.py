@@ -1,0 +1,115 @@
+"""Facts of samples that no cloud holds: their class and their split, from a CSV file or a mapping."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import ConfigError, near_matches
+from pcdata.io.files import read_bytes
+
+Given = Path | Mapping[str, Any]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_MAX_BYTES = 1 << 28
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of one sample; None = the table has no such column."""
+
+    class_name: str | None
+    split: str | None
+
+
+def read_table(where: str, given: Given | None, ids: Sequence[str], *, needs: Sequence[str]) -> dict[str, Row]:
+    """Return the row of every sample id.
+
+    A file has a header ``sample,class,split`` (in any order; which columns must be there, the target says); a mapping
+    goes from sample id to ``{"class": ..., "split": ...}``. Rows of other samples do not matter.
+
+    Raises:
+        ConfigError: nothing was given, a sample or a column is missing, or a name cannot become a file name.
+    """
+    columns = ",".join(["sample", *needs])
+    if given is None:
+        raise ConfigError(
+            f"{where}: needs the option table, a CSV file with the header {columns} and a row for each of the "
+            f"{len(ids)} samples (in Python also a mapping from sample id)"
+        )
+    rows = dict(given) if isinstance(given, Mapping) else _read_csv(where, given)
+    known: dict[str, Row] = {}
+    for sample_id in ids:
+        if sample_id not in rows:
+            raise ConfigError(f"{where}: the table has no row for sample {sample_id!r}{near_matches(sample_id, rows)}")
+        row = rows[sample_id]
+        if not isinstance(row, Mapping):
+            raise ConfigError(
+                f"{where}: sample {sample_id!r} must map to {{'class': ..., 'split': ...}}, got {row!r:.100}"
+            )
+        values = {column: _name(where, sample_id, column, row.get(column)) for column in ("class", "split")}
+        for column in needs:
+            if values[column] is None:
+                raise ConfigError(
+                    f"{where}: the table has no {column} for sample {sample_id!r}; add the column {column}"
+                )
+        known[sample_id] = Row(values["class"], values["split"])
+    return known
+
+
+def _read_csv(where: str, path: Path) -> dict[str, Mapping[str, Any]]:
+    try:
+        text = read_bytes(where, path, max_bytes=_MAX_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{where}: {path}: must be UTF-8 text: {error}") from error
+    reader = csv.DictReader(text.splitlines(), strict=True)
+    if "sample" not in (reader.fieldnames or ()):
+        raise ConfigError(
+            f"{where}: {path}: the first line must name the columns, sample among them, got {reader.fieldnames}"
+        )
+    rows: dict[str, Mapping[str, Any]] = {}
+    try:
+        for row in reader:
+            if row["sample"] in rows:
+                raise ConfigError(f"{where}: {path}:{reader.line_num}: sample {row['sample']!r} comes twice")
+            rows[row["sample"]] = row
+    except csv.Error as error:
+        raise ConfigError(f"{where}: {path}:{reader.line_num}: {error}") from error
+    return rows
+
+
+def _name(where: str, sample_id: str, column: str, value: Any) -> str | None:
+    if value is None or value == "":
+        return None
+    if not isinstance(value, str) or not _NAME.fullmatch(value):
+        raise ConfigError(
+            f"{where}: the {column} of sample {sample_id!r} must be of letters, digits, '_', '-' and '.', since it "
+            f"becomes a file name, got {value!r:.100}"
+        )
+    return value
+
+
+def in_splits(where: str, rows: Mapping[str, Row], allowed: Sequence[str]) -> dict[str, list[str]]:
+    """Return the sample ids of each split in their order; without a split a sample is in the first.
+
+    Raises:
+        ConfigError: a split that the loader does not know.
+    """
+    splits: dict[str, list[str]] = {name: [] for name in allowed}
+    for sample_id, row in rows.items():
+        split = row.split or allowed[0]
+        if split not in splits:
+            raise ConfigError(
+                f"{where}: sample {sample_id!r} is in split {split!r}, but the loader has {', '.join(allowed)}"
+            )
+        splits[split].append(sample_id)
+    return splits
+
+
+def classes_of(rows: Mapping[str, Row]) -> list[str]:
+    """Return the class names in alphabetical order, which numbers them."""
+    return sorted({row.class_name for row in rows.values() if row.class_name is not None})

@@ -1,0 +1,79 @@
+// Sums over chosen points, for the least-squares plane through them.
+#include "pc/plane_sums.hpp"
+
+namespace pc {
+namespace {
+
+constexpr int64_t kPiece = 8192;  // points summed on their own; pieces are added in order
+constexpr int kBlock = 512;       // points with one array per coordinate at a time
+
+typedef float Float8 __attribute__((vector_size(32)));
+typedef int64_t Long8 __attribute__((vector_size(64)));
+
+struct Sums {
+  PlaneMoments moments;
+  int32_t largest = 0;  // absolute coordinate; as bits, which order like the numbers while none is negative
+  int64_t count = 0;
+};
+
+// Add the chosen points of [begin, end), at most kBlock.
+void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t end, const double* centre, Sums& sums) {
+  alignas(64) float axes[3][kBlock];
+  alignas(64) int64_t taken[kBlock];  // all ones where chosen
+  const int count = static_cast<int>(end - begin);
+  for (int i = 0; i < count; ++i)
+    for (int axis = 0; axis < 3; ++axis) axes[axis][i] = points[3 * (begin + i) + axis];
+  for (int i = 0; i < count; ++i) taken[i] = -static_cast<int64_t>(mask[begin + i]);
+  for (int i = 0; i < count; ++i) sums.count += mask[begin + i];
+  for (const auto& values : axes) {
+    int32_t largest = 0;
+    for (int i = 0; i < count; ++i) {
+      int32_t bits;
+      std::memcpy(&bits, values + i, 4);
+      largest = std::max(largest, bits & 0x7FFFFFFF & static_cast<int32_t>(taken[i]));
+    }
+    sums.largest = std::max(sums.largest, largest);
+  }
+  const int whole = (count + 7) / 8 * 8;
+  for (int i = count; i < whole; ++i) axes[0][i] = axes[1][i] = axes[2][i] = 0, taken[i] = 0;
+  for (int i = 0; i < whole; i += 8) {
+    const auto mine = load<Long8>(taken + i);
+    Double8 offset[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const Double8 value = __builtin_convertvector(load<Float8>(axes[axis] + i), Double8) - centre[axis];
+      offset[axis] = reinterpret_cast<Double8>(reinterpret_cast<Long8>(value) & mine);
+    }
+    sums.moments.add(offset[0], offset[1], offset[2]);
+  }
+}
+
+}  // namespace
+}  // namespace pc
+
+// points (N, 3), mask (N,) of 0 and 1, centre (3,) -> sums (11,) over the chosen points, with p their offsets from the
+// centre: count, largest absolute coordinate, x, y, z, xx, xy, xz, yy, yz, zz. The same bits for any number of threads
+// and any instruction set: eight lanes each add every eighth point of a piece, and pieces are added in order.
+PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const uint8_t* mask, int64_t count,
+                             const double* centre, double* sums) {
+  return pc::guarded([&] {
+    const int64_t pieces = (count + pc::kPiece - 1) / pc::kPiece;
+    std::vector<pc::Sums> found(static_cast<size_t>(pieces));
+    pc::parallel_for(*context, count, pc::kPiece, [&](int64_t begin, int64_t end, int64_t) {
+      pc::Sums own;
+      for (int64_t first = begin; first < end; first += pc::kBlock)
+        pc::add_block(points, mask, first, std::min<int64_t>(end, first + pc::kBlock), centre, own);
+      found[static_cast<size_t>(begin / pc::kPiece)] = own;
+    });
+    std::fill_n(sums, 11, 0.0);
+    for (const pc::Sums& piece : found) {
+      const pc::PlaneMoments& m = piece.moments;
+      const pc::Double8 lanes[9] = {m.x, m.y, m.z, m.xx, m.xy, m.xz, m.yy, m.yz, m.zz};
+      float largest;
+      std::memcpy(&largest, &piece.largest, 4);
+      sums[0] += static_cast<double>(piece.count);
+      sums[1] = std::max(sums[1], static_cast<double>(largest));
+      for (int k = 0; k < 9; ++k)
+        for (int lane = 0; lane < 8; ++lane) sums[2 + k] += lanes[k][lane];
+    }
+  });
+}

@@ -1,0 +1,133 @@
+// Picking rows of many fields at once: by index, or by a mask that keeps their order.
+#include <type_traits>
+
+#include "pc/common.hpp"
+#include "pc/runs.hpp"
+
+namespace pc {
+namespace {
+
+constexpr int64_t kRowsPerPiece = 16384;
+
+// Fields of N rows and their picked rows. Rows are copied as bytes, so any dtype and shape will do.
+struct Fields {
+  int64_t count;
+  const int64_t* sources;  // addresses
+  const int64_t* row_bytes;
+  const int64_t* picked;   // addresses
+
+  template <class Body>
+  void each(const Body& body) const {
+    for (int64_t f = 0; f < count; ++f)
+      body(reinterpret_cast<const char*>(sources[f]), row_bytes[f], reinterpret_cast<char*>(picked[f]));
+  }
+};
+
+// Call body with the row size as a compile-time constant where it is a usual one: then a copy is a load and a store.
+template <class Body>
+void with_row_size(int64_t bytes, const Body& body) {
+  switch (bytes) {
+    case 1: return body(std::integral_constant<int64_t, 1>());
+    case 4: return body(std::integral_constant<int64_t, 4>());
+    case 8: return body(std::integral_constant<int64_t, 8>());
+    case 12: return body(std::integral_constant<int64_t, 12>());
+    default: return body(bytes);
+  }
+}
+
+// Copy runs of rows one after another.
+template <class Bytes>
+void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_runs, char* picked) {
+  constexpr int64_t kShort = 8;  // below it, calling memcpy costs more than the copy
+  for (int64_t r = 0; r < num_runs; ++r) {
+    const char* from = source + runs[r].start * bytes;
+    const int64_t length = runs[r].length;
+    if (length < kShort)
+      for (int64_t i = 0; i < length; ++i) std::memcpy(picked + i * bytes, from + i * bytes, static_cast<size_t>(bytes));
+    else
+      std::memcpy(picked, from, static_cast<size_t>(length * bytes));
+    picked += length * bytes;
+  }
+}
+
+}  // namespace
+}  // namespace pc
+
+// mask (rows,) of zeros and ones -> starts (pieces + 1,): the ones before each piece of 16384 rows, and their number.
+PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts) {
+  return pc::guarded([&] {
+    starts[0] = 0;
+    pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      int64_t kept = 0;
+      for (int64_t row = first; row < last; ++row) kept += mask[row];
+      starts[first / pc::kRowsPerPiece + 1] = kept;
+    });
+    const int64_t pieces = (rows + pc::kRowsPerPiece - 1) / pc::kRowsPerPiece;
+    for (int64_t piece = 0; piece < pieces; ++piece) starts[piece + 1] += starts[piece];
+  });
+}
+
+// Copy the rows where the mask is one; starts are those of pc_count_kept.
+PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
+                               int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
+                               const int64_t* picked) {
+  return pc::guarded([&] {
+    const pc::Fields fields{num_fields, sources, row_bytes, picked};
+    pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      pc::Run runs[pc::kRowsPerPiece / 2];
+      const int64_t num_runs = pc::find_runs(mask, first, last, runs);
+      const int64_t start = starts[first / pc::kRowsPerPiece];
+      fields.each([&](const char* source, int64_t row_size, char* to) {
+        pc::with_row_size(row_size, [&](auto bytes) { pc::copy_runs(source, bytes, runs, num_runs, to + start * bytes); });
+      });
+    });
+  });
+}
+
+// Copy the rows index (num_picked,) of `rows`; *possible becomes 0, and nothing is certain, if one lies outside.
+PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, int64_t num_picked, int64_t rows,
+                               int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
+                               const int64_t* picked, int64_t* possible) {
+  return pc::guarded([&] {
+    const pc::Fields fields{num_fields, sources, row_bytes, picked};
+    std::atomic<bool> inside{true};
+    pc::parallel_for(*context, num_picked, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      bool wrong = false;
+      for (int64_t i = first; i < last; ++i) wrong |= index[i] < 0 || index[i] >= rows;
+      if (wrong) {
+        inside.store(false, std::memory_order_relaxed);
+        return;
+      }
+      fields.each([&](const char* source, int64_t row_size, char* to) {
+        pc::with_row_size(row_size, [&](auto bytes) {
+          for (int64_t i = first; i < last; ++i)
+            std::memcpy(to + i * bytes, source + index[i] * bytes, static_cast<size_t>(bytes));
+        });
+      });
+    });
+    *possible = inside;
+  });
+}
+
+// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1] of
+// the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
+PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, const int64_t* counts,
+                                const int64_t* starts, int64_t num_fields, const int64_t* sources,
+                                const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks) {
+  return pc::guarded([&] {
+    const int64_t rows = std::max<int64_t>(1, starts[num_parts] / std::max<int64_t>(1, num_parts));
+    const int64_t parts_per_piece = std::max<int64_t>(1, pc::kRowsPerPiece / rows);
+    pc::parallel_for(*context, num_parts, parts_per_piece, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t part = first; part < last; ++part) {
+        for (int64_t field = 0; field < num_fields; ++field) {
+          const int64_t bytes = row_bytes[field];
+          const auto filled = static_cast<size_t>(counts[part] * bytes);
+          const auto all = static_cast<size_t>((starts[part + 1] - starts[part]) * bytes);
+          char* to = reinterpret_cast<char*>(blocks[field]) + starts[part] * bytes;
+          if (filled != 0) std::memcpy(to, reinterpret_cast<const char*>(sources[field * num_parts + part]), filled);
+          if (all != filled) std::memset(to + filled, static_cast<int>(fillers[field]), all - filled);
+        }
+      }
+    });
+  });
+}

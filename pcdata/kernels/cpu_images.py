@@ -1,0 +1,202 @@
+"""Image kernels: from depth images to points.
+
+Deprojection takes two passes over the pixels: the first decides which become points, so that the second can write them,
+and all that goes along with them, where they belong.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import INNER, OPERATIONS, kernel
+from pcdata.functional.depth import Deprojected, check_intrinsics, pixel_rays
+from pcdata.kernels.native import addresses, call, room_for
+
+
+@kernel("mask_depth", "cpu")
+def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tensor | None) -> Tensor:
+    """Decide and write in one pass."""
+    if mask is not None and mask.shape != depth.shape:
+        return INNER["mask_depth"].reference(depth, near, far, mask)
+    masked = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    limits = _limits(near, far)
+    call("pc_mask_depth", depth.contiguous(), depth.numel(), *limits, _contiguous(mask), masked)
+    return masked
+
+
+@kernel("deproject_depth", "cpu")
+def deproject_depth(depth: Tensor, intrinsics: Tensor, *, distortion: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Write the points and their pixels."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return OPERATIONS["deproject_depth"].reference(depth, intrinsics, distortion=distortion)
+    made = cameras.deproject(chosen, over_all_views=False)
+    return made.points, made.ptr, made.source_index
+
+
+@kernel("deproject_images", "cpu")
+def deproject_images(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+) -> Deprojected:
+    """Write the points and all that goes along with them."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
+    return cameras.deproject(chosen, colors=colors, images=images)
+
+
+@kernel("deproject_into_box", "cpu")
+def deproject_into_box(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+    *,
+    matrix: Tensor | None,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    near: float | None,
+    far: float | None,
+    mask: Tensor | None,
+) -> tuple[Deprojected, Tensor] | None:
+    """Write only what is inside the box."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    matrix = None if matrix is None else matrix.double().contiguous()
+    corners = depth.new_tensor(lower), depth.new_tensor(upper)
+    chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
+    if chosen is None:
+        region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
+        return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
+    return cameras.deproject(chosen, matrix=matrix, colors=colors, images=images), chosen.readings
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Which pixels become points."""
+
+    keep: Tensor  # (V, H, W) bool
+    readings: Tensor  # (V,) int64: those that the box decided about
+    starts: Tensor  # (V * H + 1,) int64: where the points of each image row start
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """Depth images and the directions in which their pixels look."""
+
+    depth: Tensor  # (V, H, W)
+    rays: tuple[Tensor | None, Tensor | None, Tensor | None]  # of columns and rows, or of every pixel
+
+    @classmethod
+    def of(cls, depth: Tensor, intrinsics: Tensor, distortion: Tensor | None) -> _Cameras:
+        check_intrinsics("deproject_depth", intrinsics)
+        size = depth.shape[1], depth.shape[2]
+        crossed = None if distortion is not None else _crossed_rays(intrinsics, size)
+        if crossed is not None:
+            return cls(depth.contiguous(), (*crossed, None))
+        rays = _cached_rays(_Key(intrinsics), size, None if distortion is None else _Key(distortion))
+        return cls(depth.contiguous(), (None, None, rays))
+
+    def choose(
+        self,
+        limits: tuple[float, float] = (0.0, math.inf),
+        mask: Tensor | None = None,
+        matrix: Tensor | None = None,
+        lower: Tensor | None = None,
+        upper: Tensor | None = None,
+    ) -> _Chosen | None:
+        """Decide about every pixel; None where there is none, or something wrong that the reference says best."""
+        if self.depth.numel() == 0:
+            return None
+        views, height, width = self.depth.shape
+        keep = torch.empty(self.depth.shape, dtype=torch.bool)
+        readings, possible = torch.empty(views, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
+        starts = torch.empty(views * height + 1, dtype=torch.int64)
+        call(
+            "pc_choose_pixels",
+            *(self.depth, views, height, width, *self.rays),
+            *(*limits, _contiguous(mask), matrix, lower, upper),
+            *(keep, readings, starts, possible),
+        )
+        return _Chosen(keep, readings, starts) if possible else None
+
+    def deproject(
+        self,
+        chosen: _Chosen,
+        *,
+        over_all_views: bool = True,
+        matrix: Tensor | None = None,
+        colors: Tensor | None = None,
+        images: Mapping[str, Tensor] | None = None,
+    ) -> Deprojected:
+        """Write the chosen points, moved by the matrix."""
+        views, height, width = self.depth.shape
+        count = int(chosen.starts[-1])
+        sources = {name: image.contiguous() for name, image in (images or {}).items()}
+        core = [
+            ((count, 3), torch.float32),
+            ((count,), torch.int64),
+            ((count if colors is not None else 0, 3), torch.float32),
+        ]
+        copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
+        points, pixel_index, rgb, *rows = room_for(*core, *copied)
+        pixel_bytes = torch.tensor(
+            [image.nbytes // self.depth.numel() for image in sources.values()], dtype=torch.int64
+        )
+        call(
+            "pc_deproject",
+            *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
+            *(points, pixel_index, over_all_views, _contiguous(colors), rgb),
+            *(len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)),
+        )
+        ptr = chosen.starts[torch.arange(views + 1) * height]
+        return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+
+
+def _limits(near: float | None, far: float | None) -> tuple[float, float]:
+    return 0.0 if near is None else float(near), math.inf if far is None else float(far)
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()
+
+
+def _crossed_rays(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
+    """Return x/z of every column (V, W) and y/z of every row (V, H); None if a skew makes x depend on the row."""
+    if bool((intrinsics[:, 0, 1] != 0).any()):
+        return None
+    top = pixel_rays(intrinsics, (1, size[1]))[:, 0, :, 0]
+    left = pixel_rays(intrinsics, (size[0], 1))[:, :, 0, 1]
+    # An infinite y would make x NaN in the reference.
+    return (top.float(), left.float()) if bool(left.isfinite().all()) else None
+
+
+class _Key:
+    """A small tensor that a cache can look up by value."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor.detach().clone()
+        self.value = tensor.dtype, tuple(tensor.shape), tuple(tensor.flatten().tolist())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.value == other.value
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+
+@functools.lru_cache(maxsize=4)  # 7 MB each at 1280x720: one per camera of a usual rig
+def _cached_rays(intrinsics: _Key, size: tuple[int, int], distortion: _Key | None) -> Tensor:
+    return pixel_rays(intrinsics.tensor, size, None if distortion is None else distortion.tensor).float().contiguous()

@@ -1,0 +1,111 @@
+"""The usual beginning of a chain as one pass over the pixels: MaskDepth, Deproject, ToFrame, CropWorkspace.
+
+Between these steps lie two clouds of every pixel, and filling fresh memory with them takes longer than all arithmetic.
+:class:`Compose` therefore runs them together when nobody looks in between. The cloud, its history and its provenance
+are those of the single steps, bit for bit; and whatever they would refuse is left to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from pcdata.errors import PcdataError
+from pcdata.functional.depth import Deprojected, deproject_into_box
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms.base import Data, Params, Transform
+from pcdata.transforms.crop import CropWorkspace
+from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.frames import ToFrame
+
+
+def find_capture(steps: Sequence[Transform]) -> slice | None:
+    """Return where [MaskDepth,] Deproject, [ToFrame,] CropWorkspace stand in a chain; None if they do not."""
+    # Exact types: a subclass may do something else.
+    kinds = [type(step) for step in steps]
+    if Deproject not in kinds:
+        return None
+    start = kinds.index(Deproject)
+    stop = start + 1
+    if kinds[stop : stop + 1] == [ToFrame]:
+        stop += 1
+    if kinds[stop : stop + 1] != [CropWorkspace] or steps[stop].frame_from_box is not None:
+        return None
+    if kinds[start - 1 : start] == [MaskDepth]:
+        start -= 1
+    return slice(start, stop + 1)
+
+
+def run_capture(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
+    """Run the steps that :func:`find_capture` found; None where they must be run one by one."""
+    watched = any(step._forward_hooks or step._forward_pre_hooks for step in steps)
+    if watched or not isinstance(frame, DepthFrame):
+        return None
+    try:
+        return _run(steps, frame)
+    except PcdataError:
+        return None  # the step that refuses says why
+
+
+def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
+    by_type = {type(step): step for step in steps}
+    mask, deproject, move, crop = (by_type.get(kind) for kind in (MaskDepth, Deproject, ToFrame, CropWorkspace))
+    assert isinstance(deproject, Deproject)
+    assert isinstance(crop, CropWorkspace)
+    near = far = region = None
+    if isinstance(mask, MaskDepth):
+        near, far, region = mask.near, mask.far, mask.mask_of(frame)
+        frame = mask.recorded(frame, frame, {})
+    images = deproject.images_of(frame)
+    # Without rows, the steps do all that they do but for the rows.
+    bare = deproject.cloud_of(frame, _nothing(frame, images))
+    moved, moves = bare, Params()
+    if isinstance(move, ToFrame):
+        move.check_input(bare)
+        moves = move.make_params(bare, None)
+        moved = move.apply(bare, moves)
+    crop.check_input(moved)
+    matrix = moves.get("matrix")
+    done = deproject_into_box(
+        frame.depth,
+        *deproject.cameras_of(frame),
+        frame.colors,
+        images,
+        matrix=None if matrix is None else matrix.to(frame.device),
+        lower=crop.lower,
+        upper=crop.upper,
+        near=near,
+        far=far,
+        mask=region,
+    )
+    if done is None:
+        return None
+    made, readings = done
+    cloud = replace(
+        moved,
+        points=made.points,
+        ptr=made.ptr,
+        colors=made.colors,
+        labels=made.rows.get("labels"),
+        source_index=made.source_index,
+        extra={name: made.rows[name] for name in moved.extra},
+    )
+    before, after = readings.tolist(), cloud.counts.tolist()
+    cloud = deproject.recorded_counts(cloud, None, before, {})
+    if isinstance(move, ToFrame):
+        cloud = move.recorded_counts(cloud, before, before, moves)
+    return crop.recorded_counts(cloud, before, after, {})
+
+
+def _nothing(frame: DepthFrame, images: dict[str, torch.Tensor]) -> Deprojected:
+    """Return what no reading at all gives."""
+    depth, views = frame.depth, frame.num_views
+    return Deprojected(
+        points=depth.new_empty((0, 3)),
+        ptr=torch.zeros(views + 1, dtype=torch.int64, device=depth.device),
+        source_index=torch.empty(0, dtype=torch.int64, device=depth.device),
+        colors=None if frame.colors is None else depth.new_empty((0, 3)),
+        rows={name: image.new_empty((0, *image.shape[3:])) for name, image in images.items()},
+    )

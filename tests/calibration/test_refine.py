@@ -1,0 +1,199 @@
+import functools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pcdata.calibration import Calibration, Evidence, refine_extrinsics
+from pcdata.cli import main
+from pcdata.errors import CalibrationError, ConfigError
+from pcdata.functional import rigid
+from pcdata.functional.pose_graph import PairMotion, average_motions
+from pcdata.functional.small_motions import motion_from_twist, twist_from_motion
+from pcdata.io.capture_camera import CaptureCamera, write_capture_camera
+from pcdata.io.images import write_depth
+from pcdata.structures import DepthFrame
+from pcdata.synthetic import Miscalibration, Tabletop, tabletop
+
+NAMES = ["left", "right", "top"]
+
+
+@functools.cache
+def scene(seed: int) -> Tabletop:
+    return tabletop(seed, 12, 3, noise="stereo")
+
+
+def rig(seed: int, *, millimetres: float = 10.0, degrees: float = 1.0, wrong: int = 1) -> DepthFrame:
+    error = Miscalibration(
+        translation=[1e-3 * millimetres * (view == wrong) for view in range(3)],
+        rotation_degrees=[degrees * (view == wrong) for view in range(3)],
+    )
+    true = scene(seed)
+    return replace(true.frame, world_from_camera=error.apply(true.truth.world_from_camera, seed))
+
+
+def errors_at_scene(poses: torch.Tensor, seed: int, center: tuple[float, ...]) -> torch.Tensor:
+    """(V, 2): millimetres at the middle of the overlap, and degrees."""
+    wrong = poses @ rigid.invert_rigid(scene(seed).truth.world_from_camera)
+    twist = twist_from_motion(wrong, torch.tensor(center, dtype=torch.float64))
+    return torch.stack([twist[:, 3:].norm(dim=1) * 1e3, torch.rad2deg(twist[:, :3].norm(dim=1))], dim=1)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_camera_off_by_10_mm_and_1_degree_is_brought_back(seed):
+    found = refine_extrinsics([rig(seed)], names=NAMES)
+    poses = torch.stack([camera.world_from_camera for camera in found.cameras])
+    left = errors_at_scene(poses, seed, found.overlap.cameras[1].center)
+    assert float(left[:, 0].max()) < 1.0
+    assert float(left[:, 1].max()) < 0.1
+    assert found.cameras[1].shift == pytest.approx(0.01, abs=1e-3)
+    assert found.cameras[1].rotation_degrees == pytest.approx(1.0, abs=0.1)
+    assert all(camera.rmse_after < camera.rmse_before / 2 for camera in found.cameras)
+
+
+@pytest.mark.parametrize("fixed", NAMES)
+def test_the_fixed_camera_stays_and_the_others_meet_it(fixed):
+    frame = rig(0)
+    found = refine_extrinsics([frame], names=NAMES, fixed=fixed)
+    stays = NAMES.index(fixed)
+    assert torch.equal(found.cameras[stays].world_from_camera, frame.world_from_camera[stays])
+    refined = torch.stack([camera.world_from_camera for camera in found.cameras])
+    relative = rigid.invert_rigid(refined[:1]) @ refined
+    true = scene(0).truth.world_from_camera
+    apart = twist_from_motion(
+        rigid.invert_rigid(rigid.invert_rigid(true[:1]) @ true) @ relative, torch.tensor([0.0, 0.0, 0.9]).double()
+    )
+    assert float(apart[:, 3:].norm(dim=1).max()) < 0.001
+
+
+def test_the_captures_are_left_as_they_are():
+    frame = rig(0)
+    poses = frame.world_from_camera.clone()
+    refine_extrinsics([frame], names=NAMES)
+    assert torch.equal(frame.world_from_camera, poses)
+
+
+def test_a_camera_knocked_over_is_refused():
+    with pytest.raises(CalibrationError, match=r"right: would move by 2\d\.\d mm .* more than 20 mm"):
+        refine_extrinsics([rig(0, millimetres=28.0, degrees=0.0)], names=NAMES)
+    with pytest.raises(CalibrationError, match="more than 5 mm"):
+        refine_extrinsics([rig(0)], names=NAMES, max_shift=0.005)
+
+
+def test_a_bare_table_is_refused_as_undetermined():
+    bare = tabletop(0, 0, 3, noise="stereo", floor=False, size=(360, 480)).frame
+    depth = torch.zeros_like(bare.depth)
+    depth[:, 120:240, 150:330] = bare.depth[:, 120:240, 150:330]
+    with pytest.raises(CalibrationError, match=r"does not determine its pose: shift along .*upright sides"):
+        refine_extrinsics([replace(bare, depth=depth)], names=NAMES, fixed="left")
+
+
+def test_two_cameras_that_disagree_need_one_said_to_be_right():
+    true = scene(2)
+    frame = replace(
+        true.frame.view(0),
+        depth=true.frame.depth[[0, 2]],
+        colors=None,
+        labels=None,
+        camera=replace(true.frame.camera, intrinsics=true.frame.camera.intrinsics[[0, 2]]),
+        world_from_camera=rig(2, wrong=2).world_from_camera[[0, 2]],
+    )
+    with pytest.raises(CalibrationError, match="nothing tells which"):
+        refine_extrinsics([frame], names=["a", "b"])
+    assert refine_extrinsics([frame], names=["a", "b"], fixed="a").cameras[1].shift == pytest.approx(0.01, abs=1.5e-3)
+
+
+@pytest.mark.parametrize("change", [{"method": "icp"}, {"fixed": "front"}, {"names": ["a"]}])
+def test_unknown_names_are_refused(change):
+    with pytest.raises(ConfigError):
+        refine_extrinsics([rig(0)], **{"names": NAMES, **change})
+
+
+def test_small_gicp_agrees_with_our_own():
+    pytest.importorskip("small_gicp")
+    ours, theirs = (refine_extrinsics([rig(0)], names=NAMES, fixed="left", method=m) for m in ("pcdata", "small_gicp"))
+    center = torch.tensor(ours.overlap.cameras[1].center, dtype=torch.float64)
+    for one, other in zip(ours.cameras, theirs.cameras, strict=True):
+        twist = twist_from_motion(one.world_from_camera @ rigid.invert_rigid(other.world_from_camera), center)
+        assert float(twist[3:].norm()) < 0.002
+        assert math.degrees(float(twist[:3].norm())) < 0.3
+
+
+def test_averaging_consistent_pairs_gives_the_motions_back():
+    generator = torch.Generator().manual_seed(0)
+    pivot = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    twists = 1e-3 * torch.randn(4, 6, generator=generator, dtype=torch.float64)
+    twists[2] = 0
+    motions = motion_from_twist(twists, pivot)
+    identity = torch.eye(6, dtype=torch.float64)
+    pairs = [
+        PairMotion(s, t, rigid.invert_rigid(motions[t]) @ motions[s], identity * (1 + s))
+        for s, t in [(0, 1), (1, 2), (2, 3), (0, 3)]
+    ]
+    torch.testing.assert_close(average_motions(pairs, 4, pivot, fixed=2), motions, atol=5e-6, rtol=0)
+
+
+def calibration_of(frame: DepthFrame) -> Calibration:
+    cameras = {name: frame.camera.view(view) for view, name in enumerate(NAMES)}
+    mount = torch.eye(4, dtype=torch.float64)
+    mount[2, 3] = 0.1
+    left, right, top = frame.world_from_camera
+    return Calibration(
+        cameras=cameras,
+        transforms={
+            "base_from_left": left,
+            "right_from_base": rigid.invert_rigid(right),  # the other way round
+            "base_from_mast": mount,
+            "mast_from_top": rigid.invert_rigid(mount) @ top,
+        },
+        evidence={"right_from_base": Evidence(method="by hand"), "left": Evidence(method="factory")},
+    )
+
+
+def test_a_refined_calibration_gives_the_refined_poses_and_says_how():
+    frame = rig(0)
+    given = calibration_of(frame)
+    found = refine_extrinsics([frame], names=NAMES, fixed="left")
+    new = found.applied_to(given)
+    for camera in found.cameras:
+        torch.testing.assert_close(new.transform("base", camera.name), camera.world_from_camera)
+    assert torch.equal(new.transform("base", "mast"), given.transform("base", "mast"))
+    assert new.evidence["left"] == given.evidence["left"]
+    assert "pcdata calib refine" in new.evidence["base_from_right"].method
+    assert new.evidence["base_from_right"].residuals["shift_mm"] == pytest.approx(10.0, abs=1.0)
+    assert "right_from_base" in given.transforms
+
+
+def write_rig(folder, frame: DepthFrame) -> None:
+    for view, name in enumerate(NAMES):
+        (folder / name / "depth").mkdir(parents=True)
+        write_depth(folder / name / "depth" / "0001.png", frame.depth[view], metres_per_unit=0.001)
+        write_capture_camera(
+            folder / name / "intrinsics.json", CaptureCamera(camera=frame.camera.view(view), metres_per_unit=0.001)
+        )
+
+
+def test_the_commands_judge_and_refine_a_rig_on_disk(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    frame = rig(0)
+    write_rig(tmp_path / "rig", frame)
+    calibration_of(frame).save(tmp_path / "old.yaml")
+    before = (tmp_path / "old.yaml").read_bytes()
+    line = [str(tmp_path / "rig"), "--calibration", str(tmp_path / "old.yaml")]
+    assert (
+        main(["calib", "overlap", *line, "--json", str(tmp_path / "o.json"), "--figure", str(tmp_path / "o.png")]) == 1
+    )
+    assert "recalibrate right" in capsys.readouterr().out
+    assert (tmp_path / "o.png").read_bytes().startswith(b"\x89PNG")
+    new = tmp_path / "new.yaml"
+    assert main(["calib", "refine", *line, "--out", str(new)]) == 0
+    assert (tmp_path / "old.yaml").read_bytes() == before
+    line[-1] = str(new)
+    assert main(["calib", "overlap", *line]) == 0
+    assert "overlap: pass" in capsys.readouterr().out
+    assert main(["calib", "refine", *line, "--out", str(new)]) == 2
+    assert "name a new file" in capsys.readouterr().err
+    (tmp_path / "rig" / "top").rename(tmp_path / "rig" / "ceiling")
+    assert main(["calib", "overlap", *line]) == 1
+    assert "missing: top" in capsys.readouterr().err

@@ -1,0 +1,61 @@
+"""Memory stays flat over frames, and workers started in any way make what the parent makes.
+
+benchmarks/soak.py does the same ten times longer.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pcdata.dispatch import why_unavailable
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu"))),
+    pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc"),
+]
+
+# A process of its own: what other tests have left in memory is not counted, and spawned workers can import it.
+SCRIPT = """
+import sys
+
+import soak
+
+if __name__ == "__main__":
+    what, number = sys.argv[1:]
+    if what == "chain":
+        grown = soak.soak(int(number))["growth_bytes"]
+        assert grown < soak.LIMIT, f"memory grew by {grown} bytes"
+    else:
+        assert soak.run_workers(what, int(number))["batches"] == int(number)
+"""
+
+
+def run(tmp_path: Path, what: str, number: int) -> None:
+    script = tmp_path / "soaked.py"
+    script.write_text(SCRIPT)
+    path = os.pathsep.join([str(BENCHMARKS), *(entry for entry in sys.path if entry)])
+    result = subprocess.run(
+        [sys.executable, str(script), what, str(number)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_resident_memory_is_flat_after_the_first_hundred_frames(tmp_path: Path):
+    run(tmp_path, "chain", 1_000)
+
+
+@pytest.mark.parametrize("start_method", ["fork", "forkserver", "spawn"])
+def test_batches_of_two_workers_are_those_of_the_parent(start_method: str, tmp_path: Path):
+    run(tmp_path, start_method, 100)
