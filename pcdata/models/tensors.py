@@ -10,11 +10,10 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, FrameError, ShapeError
 from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.ragged import cloud_of_rows, pad_rows
 from pcdata.functional.voxels import voxel_mean
 from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import METRE, PointCloud
-from pcdata.structures.padded import pad_rows
 from pcdata.transforms.voxel_sample import voxel_cells
 
 # torchvision's: the colours that ImageNet backbones were trained with.
@@ -43,9 +42,8 @@ def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: Inpu
     rows = columns(clouds, contract, tensor)
     if tensor.layout == "S C":
         return rows
-    counts = clouds.counts
-    mask = torch.arange(int(counts.max()), device=clouds.device)[None, :] < counts[:, None]
-    padded = pad_rows(rows, mask)
+    counts = clouds.counts.tolist()
+    padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
     return padded.transpose(1, 2).contiguous() if tensor.layout == "B C N" else padded
 
 
