@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ModelBatch(Mapping[str, Tensor]):
+class ModelBatch:
     """The tensors that a model takes, by the names of its own code, and what a check or a prediction needs to know.
 
     Empty texts and None mean "not known": tensors from a foreign file come without them.
@@ -29,6 +29,20 @@ class ModelBatch(Mapping[str, Tensor]):
     source_frame: str = ""
     frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) frame_from_source
     meta: Sequence[Mapping[str, Any]] = ()
+
+    # Not a collections Mapping: a DataLoader that pins memory would rebuild that as a plain dict of tensors.
+
+    def keys(self) -> KeysView[str]:
+        """The names of the tensors."""
+        return self.tensors.keys()
+
+    def values(self) -> ValuesView[Tensor]:
+        """The tensors."""
+        return self.tensors.values()
+
+    def items(self) -> ItemsView[str, Tensor]:
+        """Names and tensors."""
+        return self.tensors.items()
 
     def __getitem__(self, key: str) -> Tensor:
         return self.tensors[key]

@@ -176,3 +176,12 @@ def test_there_is_a_page_for_every_model_and_no_other():
     assert (DOCS / "README.md").read_text(encoding="utf-8") == index_page()
     pages = {path.stem for path in DOCS.glob("*.md")} - {"README", "wrong_frame"}
     assert pages == set(CONTRACTS)
+
+
+def test_the_page_on_wrong_frames_quotes_what_was_measured():
+    page = (DOCS / "wrong_frame.md").read_text(encoding="utf-8")
+    measured = json.loads((DOCS.parents[1] / "benchmarks" / "results" / "train_pointnet.json").read_text())
+    for name, row in measured["trainings"].items():
+        assert f"| {name} | {row['accuracy'][-1]:.0%} |".replace("%", " %") in page
+        assert row["refused"] in page
+    assert not measured["trainings"]["base, metres"]["refused"]

@@ -204,3 +204,12 @@ def test_presets_feed_a_data_loader(name):
     made = preset(name)
     (batch,) = DataLoader(made.dataset(source), batch_size=2, collate_fn=made.collate)
     assert len(batch[made.contract.main.key]) == 2
+
+
+def test_a_batch_moves_as_a_whole_and_opens_like_a_dict():
+    batch = correct_batch("graspnet_baseline")
+    moved = batch.to("meta")
+    assert moved["point_clouds"].device.type == moved.source_from_cloud.device.type == "meta"
+    assert dict(batch).keys() == dict(batch.items()).keys() == {"point_clouds"}
+    assert "point_clouds" in batch
+    assert len(batch) == len(batch.values()) == 1
