@@ -16,6 +16,7 @@ import pytest
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import CacheError, ConfigError, MissingExtraError
+from pcdata.exports.zarr_v2 import RowWriter
 from pcdata.io.zarr_arrays import zarr_arrays
 from pcdata.models import CONTRACTS, check_files, preset
 from pcdata.models.pages import contract_page, index_page
@@ -54,6 +55,15 @@ def test_zarr_arrays_are_read_row_by_row_and_whole(tmp_path, packer):
     assert np.array_equal(stored[...], array)
     assert all(np.array_equal(stored[row], array[row]) for row in range(7))
     assert list(zarr_arrays(tmp_path)) == ["data/point_cloud"]
+
+
+@pytest.mark.parametrize("compression", ["zlib", "none"])
+def test_what_our_exports_write_is_read_back(tmp_path, compression):
+    rows = np.random.default_rng(1).normal(size=(7, 4, 6)).astype(np.float32)
+    writer = RowWriter(tmp_path / "a", rows.shape, "<f4", chunk_rows=3, compression=compression)
+    for row in rows:
+        writer.add(row)
+    assert np.array_equal(zarr_arrays(tmp_path)["a"][...], rows)
 
 
 def test_a_zarr_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
