@@ -1,6 +1,7 @@
 """Time every operation against its peers on one 1280x720 frame, in one run, and check that the results are equal.
 
     PCDATA_TEST_DATA=... python benchmarks/operations.py        # prints the table, writes results/operations_*.json
+    python benchmarks/operations.py --kept                      # prints the kept results as in the README
 
 Method: ours and theirs run in turn; each runs once to warm up (the results of that run are compared), then
 ``--repeats`` times, a peer that takes longer than two seconds only once. Before every run there is a (busy) wait in
@@ -65,7 +66,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--only", default="", help="run only operations whose name contains this")
+    parser.add_argument("--kept", action="store_true", help="measure nothing; print the kept results as Markdown")
     arguments = parser.parse_args()
+    if arguments.kept:
+        return print(markdown(json.loads((RESULTS / "operations_graspnet_frame.json").read_text())["rows"]))
     cloud, name = load_cloud()
     rows = []
     for case in cases(cloud):
@@ -307,6 +311,18 @@ def line(row: Row) -> str:
     return (
         f"{row.operation} ({row.points:,}): {row.pcdata_ms:.1f} ms, {row.peer} {row.peer_ms:.1f} ms, {row.ratio:.1f}x"
     )
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The table of the README."""
+    lines = ["| operation | points | pcdata | peer | ratio | results |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        ratio = f"{row['ratio']:,.0f}x" if row["ratio"] >= 100 else f"{row['ratio']:.1f}x"
+        lines.append(
+            f"| {row['operation']} | {row['points']:,} | {row['pcdata_ms']:.1f} ms | {row['peer']} "
+            f"{row['peer_ms']:,.0f} ms | {ratio} | {row['results']} |"
+        )
+    return "\n".join(lines)
 
 
 def write(rows: list[Row], name: str, repeats: int) -> None:

@@ -42,3 +42,10 @@ def test_shipped_configuration_parses_and_can_be_cached(path: Path) -> None:
     config = load_config(path)
     assert config.pipeline.is_random, "the example shows augmentation"
     assert config.pipeline.fingerprint() == load_config(path).pipeline.fingerprint()
+
+
+def test_readme_shows_the_benchmark_table_that_is_kept() -> None:
+    command = [sys.executable, str(ROOT / "benchmarks" / "operations.py"), "--kept"]
+    table = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=True).stdout.strip()
+    assert table.count("\n") > 20
+    assert table in README

@@ -54,7 +54,8 @@ def statistical_outlier_mask(
     cloud, counts = cloud_of_rows(ptr), counts_from_ptr(ptr).double()
     average = _interleaved_sum(mean, ptr) / counts
     spread = torch.where(mean > 0, (mean - average[cloud]) ** 2, 0.0)
-    deviation = (_interleaved_sum(spread, ptr) / (counts - 1)).sqrt()  # NaN for one point: every comparison is then false
+    # NaN for one point: every comparison is then false.
+    deviation = (_interleaved_sum(spread, ptr) / (counts - 1)).sqrt()
     threshold = average + std_ratio * deviation
     return ~((mean > 0) & (mean < threshold[cloud]))
 
