@@ -50,7 +50,8 @@ def index_page() -> str:
         "# Models\n\nWhat each model takes, read from its own code; the pages are made from `pcdata/models/tables`.\n\n"
         "`preset(name, ...)` gives the pipeline and the collate function that end in the model's tensors; what\n"
         "a model leaves open must be chosen. `check(data, name)` holds a batch, a data set or a file against the\n"
-        "contract, also as `pcdata check PATH --model NAME`; with `cheap=True` it reads no values and fits into every training step.\n"
+        "contract, also as `pcdata check PATH --model NAME`; with `cheap=True` it reads no values and fits into every\n"
+        "training step.\n"
         "`to_source` and `to_frame` bring predictions back to the robot. What a wrong frame costs: [measured]"
         "(wrong_frame.md).\n\n" + "\n".join([head, *rows]) + "\n"
     )
