@@ -49,6 +49,10 @@ class NoPlaneError(PcdataError, ValueError):
     """No plane satisfies the constraints."""
 
 
+class ContractError(PcdataError, ValueError):
+    """Data are not what a model takes: wrong frame, unit, count, channels or layout."""
+
+
 class ConfigError(PcdataError, ValueError):
     """A transform's fields or a configuration file are wrong; lists every fault at once."""
 

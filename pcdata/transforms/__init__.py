@@ -3,6 +3,7 @@
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.columns import RandomColumn, ShiftToOrigin
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.confidence import KeepConfidence
@@ -22,6 +23,7 @@ from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.unreliable import MarkUnreliableDepth
+from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
 
 __all__ = [
     "REGISTRY",
@@ -47,6 +49,7 @@ __all__ = [
     "PipelineOrderWarning",
     "RandomApply",
     "RandomColorJitter",
+    "RandomColumn",
     "RandomFlip",
     "RandomJitter",
     "RandomPointCount",
@@ -56,12 +59,14 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RandomVoxelSample",
     "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
     "ResizeDepth",
     "SelectTransform",
+    "ShiftToOrigin",
     "SmoothCompletion",
     "SpatialFilterDepth",
     "SpatialTransform",
@@ -69,5 +74,6 @@ __all__ = [
     "ToFrame",
     "Transform",
     "VoxelDownsample",
+    "VoxelSample",
     "planes_in_cloud",
 ]

@@ -107,6 +107,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.RandomApply(transform=T.RemovePlane(), probability=0.4)),
     ],
     "RandomColorJitter": _of(T.RandomColorJitter(), T.RandomColorJitter(brightness=0.9, hue=0.5)),
+    "RandomColumn": _of(T.RandomColumn(size=0.15, min_points=3)),
     "RandomFlip": _of(T.RandomFlip(), T.RandomFlip(probability=(0.5, 0.5, 0.5), about="centroid")),
     "RandomJitter": [
         Example(T.RandomJitter(), displacement=0.005 * math.sqrt(3)),
@@ -126,6 +127,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomSample": _of(
         T.RandomSample(num_points=32),
         *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+        T.RandomSample(num_points=100, with_replacement=True),
     ),
     "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
     "RandomSensorNoise": _of(
@@ -134,6 +136,7 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RandomVoxelSample": _of(T.RandomVoxelSample(voxel_size=0.05)),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
@@ -150,6 +153,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.ResizeDepth(size=(24, 31), max_jump=0.3),
         make=frame_with_counts,
     ),
+    "ShiftToOrigin": _of(T.ShiftToOrigin(anchor="corner"), T.ShiftToOrigin(anchor="floor")),
     "SpatialFilterDepth": _of(
         T.SpatialFilterDepth(),
         T.SpatialFilterDepth(alpha=0.3, delta=5.0, iterations=1, hole_fill_radius=2, baseline=0.1),
@@ -165,6 +169,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
         Example(T.VoxelDownsample(num_points=40), displacement=0.1 * math.sqrt(3)),
     ],
+    "VoxelSample": _of(T.VoxelSample(voxel_size=0.05)),
 }
 
 ALL = [example for examples in EXAMPLES.values() for example in examples]

@@ -279,6 +279,7 @@ def changed_values(value: Any) -> list[Any]:
             "nearest",
             "mean",
             "angle",
+            "floor",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]
