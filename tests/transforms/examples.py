@@ -80,7 +80,9 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "FuseTSDF": _of(
         T.FuseTSDF(frame="base", voxel_size=0.02),
-        T.FuseTSDF(frame="base", voxel_size=0.02, truncation=0.05, weighting="angle", carve=True, min_confidence="completed"),
+        T.FuseTSDF(
+            frame="base", voxel_size=0.02, truncation=0.05, weighting="angle", carve=True, min_confidence="completed"
+        ),
         make=tabletop_with_counts,
     ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
