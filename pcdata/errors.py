@@ -49,6 +49,10 @@ class NoPlaneError(PcdataError, ValueError):
     """No plane satisfies the constraints."""
 
 
+class ContractError(PcdataError, ValueError):
+    """Data are not what a model takes: wrong frame, unit, count, channels or layout."""
+
+
 class ConfigError(PcdataError, ValueError):
     """A transform's fields or a configuration file are wrong; lists every fault at once."""
 
@@ -71,6 +75,10 @@ class CalibrationError(PcdataError, ValueError):
 
 class CacheError(PcdataError, RuntimeError):
     """A stored dataset is damaged, hostile, incomplete or made by another pipeline."""
+
+
+class VolumeTooLargeError(PcdataError, MemoryError):
+    """A volume would need more memory than it was allowed."""
 
 
 class BackendError(PcdataError, RuntimeError):

@@ -29,6 +29,7 @@ EXTRAS = {
         Extra("matplotlib", "viz", "pictures (pcdata demo, pcdata.report)", 'pip install "pcdata[viz]"'),
         Extra("cv2", "calib", "calibration boards (pcdata calib intrinsics)", 'pip install "pcdata[calib]"'),
         Extra("small_gicp", "calib", "refining camera poses from clouds", 'pip install "pcdata[calib]"'),
+        Extra("numcodecs", "zarr", "zarr chunks packed with Blosc", 'pip install "pcdata[zarr]"'),
         Extra("open3d", "open3d", "viewing and comparing with Open3D", 'pip install "pcdata[open3d]"'),
         Extra(
             "torch_cluster",

@@ -72,6 +72,7 @@ def test_every_public_name_resolves():
         "calibration",
         "exports",
         "functional",
+        "models",
         "structures",
         "transforms",
         "io",

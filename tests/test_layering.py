@@ -25,7 +25,7 @@ LAYERS = [
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
     {"datasets", "validation"},
-    {"build", "calibration", "exports"},
+    {"build", "calibration", "exports", "models"},
     {"report"},
     {"demo", "cli", "__main__"},
 ]

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from pcdata import __version__
-from pcdata.cli import calib, datasets, export, sensors, validate
+from pcdata.cli import calib, datasets, export, models, sensors, validate
 from pcdata.cli.progress import signals_interrupt
 from pcdata.errors import ConfigError, PcdataError
 
@@ -46,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (datasets, export, validate, sensors, calib):
+    for group in (datasets, export, validate, models, sensors, calib):
         group.add_to(commands)
     for command in commands.choices.values():  # also after the command, where one adds it to a line that failed
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)

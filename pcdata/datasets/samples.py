@@ -21,6 +21,8 @@ class SampleDataset(Dataset[PointCloud]):
     So the same sample comes out of the main process, or of any worker of any number of workers.
     """
 
+    gives: type = PointCloud  # what every sample must be in the end
+
     def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int) -> None:
         if transform is not None and not isinstance(transform, Transform):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
@@ -56,9 +58,11 @@ class SampleDataset(Dataset[PointCloud]):
             data = self._load(index)
             if self.transform is not None:
                 data = self.transform(data, generator=generator_for(self.seed, self.epoch, sample_id))
-            if not isinstance(data, PointCloud):
-                raise DTypeError(f"the dataset gives a {type(data).__name__}; its transform must end in a PointCloud")
-            return data
+            if not isinstance(data, self.gives):
+                raise DTypeError(
+                    f"the dataset gives a {type(data).__name__}; its transform must end in a {self.gives.__name__}"
+                )
+            return data  # type: ignore[return-value]
         except Exception as error:
             add_note(error, f"sample {sample_id!r} of {self!r}")
             raise

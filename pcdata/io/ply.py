@@ -17,7 +17,7 @@ from pcdata.io.cloud_arrays import CloudArrays, from_cloud, narrowest_int, to_cl
 from pcdata.io.files import read_bytes, replacing
 from pcdata.io.numbers_as_text import format_rows, parse_words
 from pcdata.io.ply_header import TYPE_NAMES, Element, parse_header
-from pcdata.structures import PointCloud
+from pcdata.structures import PointCloud, SurfaceMesh
 
 _MAX_BYTES = 1 << 32
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
@@ -55,14 +55,14 @@ def read_ply(
     )
 
 
-def write_ply(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
-    """Write one cloud in metres as PLY; colours are rounded to 8 bits.
+def write_ply(path: str | os.PathLike[str], cloud: PointCloud | SurfaceMesh, *, encoding: str = "binary") -> None:
+    """Write one cloud, or a mesh, in metres as PLY; colours are rounded to 8 bits.
 
     Written: points, normals, colours, labels, invariant extra fields (many columns become ``name_0``, ``name_1``, ...).
     Not written, because the format has no place: frame, viewpoint, history, ``source_index``.
 
     Args:
-        cloud: a single cloud.
+        cloud: a single cloud, or a mesh: its triangles become the list ``vertex_indices`` of the element ``face``.
         path: the file; it appears complete or not at all.
         encoding: ``binary`` (little endian), ``binary_big_endian`` or ``ascii``.
 
@@ -72,21 +72,38 @@ def write_ply(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str 
     where = f"write_ply: {path}"
     if encoding not in _ENCODINGS:
         raise CaptureError(f"{where}: encoding must be in {tuple(_ENCODINGS)}{near_matches(encoding, _ENCODINGS)}")
+    faces = cloud.triangles.cpu().numpy() if isinstance(cloud, SurfaceMesh) else None
+    cloud = cloud.vertices if isinstance(cloud, SurfaceMesh) else cloud
     columns = _columns(where, from_cloud(where, cloud))
     lines = ["ply", f"format {_ENCODINGS[encoding]} 1.0", "comment metres; written by pcdata"]
     lines += [f"element vertex {cloud.num_points}"]
     lines += [f"property {TYPE_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     header = "\n".join([*lines, "end_header", ""]).encode("ascii")
+    order = ">" if encoding == "binary_big_endian" else "<"
     if encoding == "ascii":
         body = format_rows(list(columns.values()))
     else:
-        order = ">" if encoding == "binary_big_endian" else "<"
         rows = np.empty(cloud.num_points, [(name, f"{order}{v.dtype.str[1:]}") for name, v in columns.items()])
         for name, values in columns.items():
             rows[name] = values
         body = rows.tobytes()
+    if faces is not None:
+        body += _face_bytes(where, faces, encoding == "ascii", order)
     with replacing(where, path) as temporary:
         temporary.write_bytes(header + body)
+
+
+def _face_bytes(where: str, faces: NDArray[np.int64], is_text: bool, order: str) -> bytes:
+    """Return the rows of the element ``face``: 3 and three vertices."""
+    if len(faces) and int(faces.max()) >= 1 << 31:
+        raise CaptureError(f"{where}: PLY numbers vertices with 32 bits; write fewer, with larger voxels")
+    if is_text:
+        return format_rows([np.full(len(faces), 3), *faces.T]) if len(faces) else b""
+    rows = np.empty(len(faces), [("count", "u1"), ("vertices", f"{order}i4", 3)])
+    rows["count"], rows["vertices"] = 3, faces
+    return rows.tobytes()
 
 
 def _vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> dict[str, NDArray[Any]]:

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from pcdata.kernels import cpu_images, cpu_neighbors, cpu_regions, cpu_registration, cpu_rows, cpu_sampling
+from pcdata.kernels import cpu_fusion, cpu_images, cpu_neighbors, cpu_regions, cpu_registration, cpu_rows, cpu_sampling
 from pcdata.kernels.native import unavailable
 
-__all__ = ["cpu_images", "cpu_neighbors", "cpu_regions", "cpu_registration", "cpu_rows", "cpu_sampling", "unavailable"]
+__all__ = [
+    "cpu_fusion",
+    "cpu_images",
+    "cpu_neighbors",
+    "cpu_regions",
+    "cpu_registration",
+    "cpu_rows",
+    "cpu_sampling",
+    "unavailable",
+]

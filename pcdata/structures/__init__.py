@@ -8,6 +8,8 @@ from pcdata.structures.filled import confidence_of, with_filled_depth
 from pcdata.structures.padded import PaddedClouds
 from pcdata.structures.point_cloud import METRE, NORMALIZED, ImageLayout, PointCloud
 from pcdata.structures.registration import register_to_color
+from pcdata.structures.surface_mesh import SurfaceMesh
+from pcdata.structures.tsdf_volume import TSDFVolume
 
 __all__ = [
     "CAMERA_FRAME",
@@ -20,6 +22,8 @@ __all__ = [
     "Kind",
     "PaddedClouds",
     "PointCloud",
+    "SurfaceMesh",
+    "TSDFVolume",
     "confidence_of",
     "register_to_color",
     "with_filled_depth",

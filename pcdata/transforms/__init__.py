@@ -3,6 +3,7 @@
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
 from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.columns import RandomColumn, ShiftToOrigin
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
 from pcdata.transforms.confidence import KeepConfidence
@@ -12,6 +13,7 @@ from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, Spati
 from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
+from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.inpainting import NearestCompletion, SmoothCompletion
 from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
@@ -21,6 +23,7 @@ from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.unreliable import MarkUnreliableDepth
+from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
 
 __all__ = [
     "REGISTRY",
@@ -34,6 +37,7 @@ __all__ = [
     "EstimateNormals",
     "FarthestPointSample",
     "FillHoles",
+    "FuseTSDF",
     "KeepConfidence",
     "MarkUnreliableDepth",
     "MaskDepth",
@@ -45,6 +49,7 @@ __all__ = [
     "PipelineOrderWarning",
     "RandomApply",
     "RandomColorJitter",
+    "RandomColumn",
     "RandomFlip",
     "RandomJitter",
     "RandomPointCount",
@@ -54,12 +59,14 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RandomVoxelSample",
     "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
     "ResizeDepth",
     "SelectTransform",
+    "ShiftToOrigin",
     "SmoothCompletion",
     "SpatialFilterDepth",
     "SpatialTransform",
@@ -67,5 +74,6 @@ __all__ = [
     "ToFrame",
     "Transform",
     "VoxelDownsample",
+    "VoxelSample",
     "planes_in_cloud",
 ]

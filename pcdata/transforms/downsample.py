@@ -133,18 +133,33 @@ class RandomSample(_Sample):
 
     Cheap, and what several official loaders do; it keeps the density of the sensor, so close surfaces get most points
     and thin or far objects may get none. FarthestPointSample covers evenly. A short cloud is filled up with random
-    duplicates (``if_short: repeat``) or with the same permutation again (``tile``).
+    duplicates (``if_short: repeat``) or with the same permutation again (``tile``). With replacement every row is drawn
+    anew, so no cloud but an empty one is short; some loaders do so even where there are enough points.
     """
 
     is_random = True
 
+    with_replacement: bool = False  # draw every row anew: about a third of the points of a full cloud come twice
+
+    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+        """Draw short clouds too with replacement, unless they are to get zero rows or to stay short."""
+        if not self.with_replacement or self.if_short in ("zeros", "keep") or 0 in cloud.counts.tolist():
+            return super().pick(cloud, streams)
+        assert streams is not None
+        wanted = self.wanted_counts(cloud, streams)
+        rows = self.sample(cloud, wanted, streams.seeds().tolist())
+        return torch.cat(rows), ptr_from_counts(wanted, device=cloud.device)
+
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
-        """Take the head of a random permutation of each cloud."""
-        starts, available = cloud.ptr.tolist(), cloud.counts.tolist()
-        return [
-            start + torch.randperm(have, generator=seeded(seed))[:count].to(cloud.device)
-            for start, have, count, seed in zip(starts, available, counts, seeds, strict=False)
-        ]
+        """Take the head of a random permutation of each cloud, or draw each row anew."""
+        rows = []
+        for start, have, count, seed in zip(cloud.ptr.tolist(), cloud.counts.tolist(), counts, seeds, strict=False):
+            if self.with_replacement and have != count:  # all that a short cloud has, once
+                drawn = torch.randint(have, (count,), generator=seeded(seed))
+            else:
+                drawn = torch.randperm(have, generator=seeded(seed))[:count]
+            rows.append(start + drawn.to(cloud.device))
+        return rows
 
 
 class RandomPointCount(RandomSample):

@@ -8,14 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from pcdata.errors import ConfigError, FrameError, PcdataError
 from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.voxels import voxel_downsample, voxel_majority
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, Transform
-from pcdata.transforms.fields import Matrix4, Name
+from pcdata.transforms.fields import Matrix4, Metres, Name
 
 
 class ToFrame(SpatialTransform):
@@ -78,11 +80,18 @@ class MergeViews(Transform):
 
     Neighbouring clouds of the batch with the same sample id and capture index are one capture, as long as their view
     numbers rise. The frame they share becomes the source frame; every point keeps its ``view`` and the ``viewpoint`` it
-    was seen from.
+    was seen from, and normals are turned to face it.
+
+    Where views overlap the surface is there several times. With a voxel size, each voxel keeps the points of one view
+    alone: of the view that put most points into it, the first of equals; so its points stay readings, none is averaged.
     """
 
     needs_metres = True
     keeps_clouds = False
+    version = 2
+
+    voxel_size: Metres | None = None  # edge of the voxels in which views compete; None = keep every point
+    face_cameras: bool = True  # turn normals towards the camera that saw the point
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""
@@ -108,9 +117,10 @@ class MergeViews(Transform):
         merged = data.with_extra("view", view_of_cloud[cloud_of_rows(data.ptr)], Kind.INVARIANT)
         if seen_from is not None:
             merged = merged.with_extra("viewpoint", seen_from, Kind.POSITION)
+        merged = self._facing(merged, seen_from)
         groups = len(views)
         identity = torch.eye(4, dtype=torch.float64, device=device).repeat(groups, 1, 1)
-        return replace(
+        joined = replace(
             merged,
             layout=None,
             ptr=data.ptr[params["group_ptr"].to(device)],
@@ -122,6 +132,23 @@ class MergeViews(Transform):
             meta=[_merged_meta(data, start, stop) for start, stop in itertools.pairwise(bounds)],
             history=[_merged_history(data, start, stop) for start, stop in itertools.pairwise(bounds)],
         )
+        return joined if self.voxel_size is None else _one_view_per_voxel(joined, self.voxel_size)
+
+    def _facing(self, cloud: PointCloud, seen_from: Tensor | None) -> PointCloud:
+        """Turn the normals that point away from where their point was seen."""
+        if not self.face_cameras or cloud.normals is None or seen_from is None:
+            return cloud
+        away = ((seen_from - cloud.points) * cloud.normals).sum(1) < 0
+        return cloud.with_fields(normals=torch.where(away[:, None], -cloud.normals, cloud.normals))
+
+
+def _one_view_per_voxel(cloud: PointCloud, voxel_size: float) -> PointCloud:
+    """Keep, in every voxel, the points of the view that has most there."""
+    _, _, voxel = voxel_downsample(cloud.points, cloud.ptr, voxel_size=voxel_size)
+    num_voxels = int(voxel.max()) + 1 if len(voxel) else 0
+    keep = cloud.extra["view"] == voxel_majority(cloud.extra["view"], voxel, num_voxels)[voxel]
+    counts = torch.stack([part.sum() for part in torch.tensor_split(keep, cloud.ptr[1:-1].cpu())])
+    return cloud.select(keep, ptr_from_counts(counts))
 
 
 def _same_capture(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
 
 from pcdata import transforms as T
 from pcdata.structures import DepthFrame, PointCloud
-from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts
+from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
 QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
 BOX = {"lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
@@ -24,6 +26,12 @@ class Example:
     transform: T.Transform
     make: Callable[[Sequence[int]], PointCloud | DepthFrame] = cloud_in_base
     displacement: float = 0.0  # metres that a point may move beyond what source_from_cloud undoes (noise, averages)
+
+
+def tabletop_with_counts(counts: Sequence[int]) -> DepthFrame:
+    """A rendered capture with as many views as there are counts, each with confidences."""
+    frame = tabletop_frame(len(counts))
+    return replace(frame, confidence=3 - (frame.depth == 0).to(torch.uint8))
 
 
 def _of(*transforms: T.Transform, **others: object) -> list[Example]:
@@ -70,6 +78,13 @@ EXAMPLES: dict[str, list[Example]] = {
         T.FillHoles(max_size=1),
         make=frame_with_counts,
     ),
+    "FuseTSDF": _of(
+        T.FuseTSDF(frame="base", voxel_size=0.02),
+        T.FuseTSDF(
+            frame="base", voxel_size=0.02, truncation=0.05, weighting="angle", carve=True, min_confidence="completed"
+        ),
+        make=tabletop_with_counts,
+    ),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MarkUnreliableDepth": _of(
         T.MarkUnreliableDepth(sensor="realsense_d435"),
@@ -84,7 +99,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.MaskDepth(min_confidence="completed"),
         make=frame_with_counts,
     ),
-    "MergeViews": _of(T.MergeViews()),
+    "MergeViews": _of(T.MergeViews(), T.MergeViews(face_cameras=False)),
     "NormalizeUnitSphere": _of(T.NormalizeUnitSphere()),
     "NormalizeWorkspace": _of(T.NormalizeWorkspace(frame="base", **BOX)),
     "RandomApply": [
@@ -94,6 +109,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.RandomApply(transform=T.RemovePlane(), probability=0.4)),
     ],
     "RandomColorJitter": _of(T.RandomColorJitter(), T.RandomColorJitter(brightness=0.9, hue=0.5)),
+    "RandomColumn": _of(T.RandomColumn(size=0.15, min_points=3)),
     "RandomFlip": _of(T.RandomFlip(), T.RandomFlip(probability=(0.5, 0.5, 0.5), about="centroid")),
     "RandomJitter": [
         Example(T.RandomJitter(), displacement=0.005 * math.sqrt(3)),
@@ -113,6 +129,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomSample": _of(
         T.RandomSample(num_points=32),
         *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+        T.RandomSample(num_points=100, with_replacement=True),
     ),
     "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
     "RandomSensorNoise": _of(
@@ -121,6 +138,7 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RandomVoxelSample": _of(T.RandomVoxelSample(voxel_size=0.05)),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
@@ -137,6 +155,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.ResizeDepth(size=(24, 31), max_jump=0.3),
         make=frame_with_counts,
     ),
+    "ShiftToOrigin": _of(T.ShiftToOrigin(anchor="corner"), T.ShiftToOrigin(anchor="floor")),
     "SpatialFilterDepth": _of(
         T.SpatialFilterDepth(),
         T.SpatialFilterDepth(alpha=0.3, delta=5.0, iterations=1, hole_fill_radius=2, baseline=0.1),
@@ -152,6 +171,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
         Example(T.VoxelDownsample(num_points=40), displacement=0.1 * math.sqrt(3)),
     ],
+    "VoxelSample": _of(T.VoxelSample(voxel_size=0.05)),
 }
 
 ALL = [example for examples in EXAMPLES.values() for example in examples]

@@ -7,6 +7,7 @@ import torch
 
 from pcdata.errors import ConfigError, FrameError
 from pcdata.functional import rigid
+from pcdata.functional.voxels import voxel_downsample
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import (
@@ -178,3 +179,27 @@ def test_the_history_of_a_merged_cloud_counts_all_its_views():
     assert steps["Deproject"]["points"] == views.num_points
     assert steps["ToFrame"]["points_before"] == steps["ToFrame"]["points"] == views.num_points
     assert len(steps["ToFrame"]["params"]["per_view"]) == 2
+
+
+def test_normals_are_turned_to_the_camera_that_saw_them():
+    views = EstimateNormals(radius=0.05, orient="none")(views_in_base("a", num_views=2))
+    merged, as_given = MergeViews()(views), MergeViews(face_cameras=False)(views)
+    towards = merged.extra["viewpoint"] - merged.points
+    assert bool(((towards * merged.normals).sum(1) >= 0).all())
+    assert not bool(((towards * as_given.normals).sum(1) >= 0).all())
+    assert bool((merged.normals * as_given.normals).sum(1).abs().gt(0.999).all())
+
+
+def test_overlap_is_left_to_one_view_per_voxel():
+    scene = tabletop(1, num_objects=2, num_views=3, size=(60, 80), floor=False)
+    views = ToFrame(frame="base")(Deproject()(scene.frame))
+    whole, thinned = MergeViews()(views), MergeViews(voxel_size=0.05)(views)
+    assert thinned.num_points < 0.7 * whole.num_points
+    _, _, voxel = voxel_downsample(whole.points, voxel_size=0.05)
+    kept = torch.isin(whole.source_index, thinned.source_index)
+    assert torch.equal(whole.points[kept], thinned.points)
+    for one in range(int(voxel.max()) + 1):
+        here = voxel == one
+        (view,) = whole.extra["view"][here & kept].unique().tolist()
+        counts = torch.bincount(whole.extra["view"][here], minlength=3)
+        assert int(counts[view]) == int(counts.max()) == int((here & kept).sum())

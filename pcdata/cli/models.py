@@ -1,0 +1,104 @@
+"""Commands about models: check a data set against a model's contract, print a model's preset."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from pcdata.cli.options import positive
+
+
+def add_to(commands: Any) -> None:
+    """Add the commands to the parser."""
+    check = commands.add_parser("check", help="check a data set against what a model takes")
+    check.add_argument("path", metavar="PATH", help="a built data set, or an npz, HDF5 or zarr v2 file of anyone's")
+    check.add_argument("--model", required=True, metavar="NAME", help="the model (pcdata models lists them)")
+    check.add_argument("--keys", metavar="POINTS=NAME,...", help="which array of a foreign file is what")
+    check.add_argument("--frame", metavar="NAME", help="frame that you train in; of a foreign file also its frame")
+    check.add_argument("--unit", choices=["m", "normalized"], help="unit of a foreign file")
+    check.add_argument("--num-points", type=positive, metavar="N", help="count, where the model is used with several")
+    check.add_argument("--limit", type=positive, metavar="N", help="only the first N samples")
+    check.add_argument("--json", metavar="FILE", help="write the outcome to a new file")
+    check.set_defaults(run=_check)
+    models = commands.add_parser("models", help="list the models with a contract, or show one")
+    models.add_argument("name", nargs="?", metavar="NAME", help="show this one")
+    models.set_defaults(run=_models)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from pcdata.io.files import replacing
+    from pcdata.io.manifest import FILE_NAME
+    from pcdata.report.validation import validation_text
+    from pcdata.validation import Verdict
+
+    is_ours = not arguments.keys and _holds(arguments.path, FILE_NAME)
+    summary = _check_cache(arguments) if is_ours else _check_foreign(arguments)
+    if arguments.json:
+        with replacing("check --json", arguments.json) as temporary, open(temporary, "w", encoding="utf-8") as file:
+            json.dump({"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}, file, indent=1)
+    print(validation_text(summary))
+    return int(summary.verdict is Verdict.FAIL)
+
+
+def _holds(path: str, name: str) -> bool:
+    from pathlib import Path
+
+    return (Path(path) / name).exists()
+
+
+def _choices(arguments: argparse.Namespace) -> dict[str, Any]:
+    from pcdata.models import CONTRACTS, contract
+
+    contract(arguments.model)  # an unknown name is an error here
+    choices = {} if arguments.num_points is None else {"num_points": arguments.num_points}
+    if arguments.frame and not CONTRACTS[arguments.model].frame:
+        choices["frame"] = arguments.frame
+    return choices
+
+
+def _check_cache(arguments: argparse.Namespace) -> Any:
+    from pcdata.datasets import CachedCloudDataset
+    from pcdata.models import check
+
+    choices = _choices(arguments)
+    return check(CachedCloudDataset(arguments.path), arguments.model, limit=arguments.limit, **choices)
+
+
+def _check_foreign(arguments: argparse.Namespace) -> Any:
+    from pcdata.errors import ConfigError
+    from pcdata.models import check_files, contract
+
+    keys = {}
+    for pair in (arguments.keys or "").split(",") if arguments.keys else []:
+        name, equals, stored = pair.partition("=")
+        if not equals:
+            raise ConfigError(f"--keys: {pair!r} must be NAME=ARRAY, such as points=data/point_cloud")
+        keys[name.strip()] = stored.strip()
+    choices = _choices(arguments)
+    made = contract(arguments.model, **choices)
+    return check_files(
+        arguments.path,
+        made.name,
+        keys,
+        frame_id=arguments.frame or "",
+        unit=arguments.unit or "",
+        limit=arguments.limit,
+        **choices,
+    )
+
+
+def _models(arguments: argparse.Namespace) -> int:
+    from pcdata.models import CONTRACTS, contract
+    from pcdata.models.pages import contract_page
+    from pcdata.report.table import text_table
+
+    if arguments.name:
+        print(contract_page(contract(arguments.name)))
+        return 0
+    rows = []
+    for one in CONTRACTS.values():
+        count = "any" if one.count is None else str(one.count)
+        rows.append([one.name, one.frame or "to choose", count, ", ".join(spec.key for spec in one.tensors)])
+    print(text_table(["model", "frame", "points", "tensors"], rows))
+    return 0

@@ -1,0 +1,51 @@
+"""Blocks with a margin from their neighbours, so that a block's edges and gradients are read from one array."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.tsdf.blocks import VoxelBlocks
+from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, EDGE, pack_keys, unpack_keys
+
+SIDE = EDGE + 3  # voxels -1 .. 9 of the block: place p holds voxel p - 1
+# Per step to a neighbour: its voxels, and their places.
+_PART = {
+    -1: (slice(EDGE - 1, EDGE), slice(0, 1)),
+    0: (slice(0, EDGE), slice(1, EDGE + 1)),
+    1: (slice(0, 2), slice(EDGE + 1, SIDE)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbourhood:
+    """Some blocks and the rows of the 27 blocks around each, -1 where there is none."""
+
+    blocks: VoxelBlocks
+    corner: Tensor  # (N, 3) int64: the first voxel of each block, in voxels
+    rows: Tensor  # (N, 27) int64, in the order of (z, y, x) from -1 to 1
+
+    @staticmethod
+    def of(blocks: VoxelBlocks, keys: Tensor) -> Neighbourhood:
+        """Look up the neighbours of the blocks with these keys."""
+        block = unpack_keys(keys)
+        steps = torch.tensor([(x, y, z) for z, y, x in itertools.product((-1, 0, 1), repeat=3)], device=keys.device)
+        around = (block[:, None] + steps).reshape(-1, 3)
+        exists = (around.abs() < BLOCKS_PER_SIDE).all(1)
+        rows = blocks.find(pack_keys(torch.where(exists[:, None], around, 0)))
+        return Neighbourhood(blocks, block * EDGE, torch.where(exists, rows, -1).reshape(-1, 27))
+
+    def plane(self, name: str) -> Tensor:
+        """Return one plane with its margin (N, 11, 11, 11), indexed z, y, x; 0 where there is no block."""
+        padded: Tensor | None = None
+        for place, (z, y, x) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
+            whole = self.blocks.gather(name, self.rows[:, place]).reshape(-1, EDGE, EDGE, EDGE)
+            if padded is None:
+                padded = whole.new_zeros((len(whole), SIDE, SIDE, SIDE))
+            (from_z, to_z), (from_y, to_y), (from_x, to_x) = _PART[z], _PART[y], _PART[x]
+            padded[:, to_z, to_y, to_x] = whole[:, from_z, from_y, from_x]
+        assert padded is not None
+        return padded

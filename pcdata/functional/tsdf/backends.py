@@ -1,0 +1,61 @@
+"""Which body computes a step of fusion: the plain torch reference on any device, or the compiled core on the CPU.
+
+These steps change a volume in place, which an operation of :mod:`pcdata.dispatch` must not; the choice is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.dispatch import AUTO_ORDER, BACKEND_MODULES, REFERENCE, backends, why_unavailable
+from pcdata.errors import BackendError, near_matches
+from pcdata.functional.tsdf import integrate, surface
+from pcdata.functional.tsdf.blocks import VoxelBlocks
+from pcdata.functional.tsdf.grid import VoxelGrid
+from pcdata.functional.tsdf.surface import Crossings
+from pcdata.functional.tsdf.views import FusionView
+
+# (step, backend) -> body; the core's join when it is loaded.
+BODIES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("touched_blocks", REFERENCE): integrate.touched_blocks,
+    ("integrate_view", REFERENCE): integrate.integrate_view,
+    ("find_crossings", REFERENCE): surface.find_crossings,
+}
+
+
+def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") -> Tensor:
+    """See :func:`pcdata.functional.tsdf.integrate.touched_blocks`."""
+    keys: Tensor = _body("touched_blocks", backend, view.depth.device)(view, grid)
+    return keys
+
+
+def integrate_view(
+    blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool, backend: str = "auto"
+) -> None:
+    """See :func:`pcdata.functional.tsdf.integrate.integrate_view`."""
+    _body("integrate_view", backend, blocks.device)(blocks, rows, view, grid, carve=carve)
+
+
+def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, backend: str = "auto") -> Crossings:
+    """See :func:`pcdata.functional.tsdf.surface.find_crossings`."""
+    found: Crossings = _body("find_crossings", backend, blocks.device)(blocks, grid)
+    return found
+
+
+def _body(step: str, backend: str, device: torch.device) -> Callable[..., Any]:
+    if backend == "auto":
+        for name in AUTO_ORDER.get(device.type, (REFERENCE,)):
+            if why_unavailable(name) is None and (step, name) in BODIES:
+                return BODIES[step, name]
+    if backend != REFERENCE and backend not in BACKEND_MODULES:
+        raise BackendError(f"{step}: unknown backend {backend!r}{near_matches(str(backend), ['auto', *backends()])}")
+    reason = why_unavailable(backend)
+    if reason is None and (step, backend) not in BODIES:
+        reason = "it has no kernel for this step"
+    if reason is not None:
+        raise BackendError(f"{step}: backend {backend!r} is not available: {reason}; use backend='auto'")
+    return BODIES[step, backend]

@@ -1,0 +1,126 @@
+"""The stored voxels: compact planes, in chunks so that growing never copies, and the index that finds a block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pcdata.functional.tsdf.grid import VOXELS
+
+CHUNK = 8192  # blocks
+TSDF_SCALE = 32767  # of a stored distance: one truncation. Rounding costs 1e-5 of it, at most, per view
+MAX_WEIGHT = 32767  # a voxel's weight stops here: from then on its average forgets
+COLOR_SCALE = 4  # steps of a stored colour per 8-bit level; three channels of 10 bits fill an int32
+
+
+@dataclass(frozen=True)
+class Planes:
+    """What a voxel holds."""
+
+    colors: bool = False
+    labels: bool = False
+    views: bool = False  # count views apart from weights; without, every view weighs 1 and the weight is the count
+
+    @property
+    def bytes_per_block(self) -> int:
+        """The memory of one block: 4 bytes a voxel, 8 with colour."""
+        return VOXELS * (4 + 4 * self.colors + 6 * self.labels + 2 * self.views)
+
+
+@dataclass(eq=False)
+class Chunk:
+    """The voxels of ``CHUNK`` blocks; all zero = never seen."""
+
+    tsdf: Tensor  # (C, 512) int16: signed distance / truncation * TSDF_SCALE, positive in front of the surface
+    weight: Tensor  # (C, 512) int16
+    color: Tensor | None = None  # (C, 512) int32: r | g << 10 | b << 20
+    views: Tensor | None = None  # (C, 512) int16: in how many views the voxel lay near the surface
+    label: Tensor | None = None  # (C, 512) int32: the candidate of the vote
+    votes: Tensor | None = None  # (C, 512) int16: how far it leads
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the planes that are present, by name."""
+        found = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {name: plane for name, plane in found.items() if plane is not None}
+
+    @staticmethod
+    def empty(planes: Planes, device: torch.device) -> Chunk:
+        """Reserve a chunk of zeros; on the CPU a page takes memory only once it is written."""
+
+        def zeros(dtype: torch.dtype) -> Tensor:
+            if device.type == "cpu":
+                numpy_dtype = {torch.int16: np.int16, torch.int32: np.int32}[dtype]
+                return torch.from_numpy(np.zeros((CHUNK, VOXELS), numpy_dtype))
+            return torch.zeros((CHUNK, VOXELS), dtype=dtype, device=device)
+
+        return Chunk(
+            tsdf=zeros(torch.int16),
+            weight=zeros(torch.int16),
+            color=zeros(torch.int32) if planes.colors else None,
+            views=zeros(torch.int16) if planes.views else None,
+            label=zeros(torch.int32) if planes.labels else None,
+            votes=zeros(torch.int16) if planes.labels else None,
+        )
+
+
+@dataclass(eq=False)
+class VoxelBlocks:
+    """The blocks of a field: block ``keys[row]`` is row ``row % CHUNK`` of chunk ``row // CHUNK``."""
+
+    planes: Planes
+    device: torch.device
+    keys: Tensor = field(init=False)  # (B,) int64 in the order of appearance
+    sorted_keys: Tensor = field(init=False)  # (B,) int64
+    sorted_rows: Tensor = field(init=False)  # (B,) int64: the row of each sorted key
+    chunks: list[Chunk] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.keys = self.sorted_keys = self.sorted_rows = torch.empty(0, dtype=torch.int64, device=self.device)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def missing(self, keys: Tensor) -> Tensor:
+        """Return those of the sorted, distinct keys that have no block yet."""
+        return keys[self.find(keys) < 0]
+
+    def add(self, keys: Tensor) -> None:
+        """Open blocks for sorted, distinct keys that have none."""
+        rows = torch.arange(len(self), len(self) + len(keys), device=self.device)
+        self.keys = torch.cat([self.keys, keys])
+        # Merge the two sorted lists: what is new goes behind the known keys below it.
+        places = torch.searchsorted(self.sorted_keys, keys) + torch.arange(len(keys), device=self.device)
+        is_known = torch.ones(len(self.keys), dtype=torch.bool, device=self.device)
+        is_known[places] = False
+        merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
+        merged_keys[places], merged_rows[places] = keys, rows
+        merged_keys[is_known], merged_rows[is_known] = self.sorted_keys, self.sorted_rows
+        self.sorted_keys, self.sorted_rows = merged_keys, merged_rows
+        while len(self.chunks) * CHUNK < len(self):
+            self.chunks.append(Chunk.empty(self.planes, self.device))
+
+    def find(self, keys: Tensor) -> Tensor:
+        """Return the (N,) row of every key, -1 where there is no block."""
+        if len(self) == 0:
+            return torch.full_like(keys, -1)
+        place = torch.searchsorted(self.sorted_keys, keys).clamp_(max=len(self) - 1)
+        return torch.where(self.sorted_keys[place] == keys, self.sorted_rows[place], -1)
+
+    def in_chunks(self, rows: Tensor) -> Iterator[tuple[Chunk, Tensor, Tensor]]:
+        """Split rows by chunk: the chunk, the rows within it, and where these stood in ``rows``."""
+        for number, chunk in enumerate(self.chunks):
+            where = torch.nonzero((rows >= number * CHUNK) & (rows < (number + 1) * CHUNK)).squeeze(1)
+            if len(where):
+                yield chunk, rows[where] - number * CHUNK, where
+
+    def gather(self, name: str, rows: Tensor) -> Tensor:
+        """Return one plane of some blocks (N, 512); zeros for row -1."""
+        plane: Tensor = getattr(self.chunks[0], name)
+        found = plane.new_zeros((len(rows), VOXELS))
+        for chunk, inside, where in self.in_chunks(rows):
+            found[where] = getattr(chunk, name)[inside]
+        return found

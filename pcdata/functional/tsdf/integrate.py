@@ -1,0 +1,146 @@
+"""Finding the blocks that a view touches, and averaging its signed distances into them.
+
+Source: Curless & Levoy, A Volumetric Method for Building Complex Models from Range Images, 1996; blocks as in Niessner
+et al., Real-time 3D Reconstruction at Scale using Voxel Hashing, 2013; the vote of labels is that of Boyer & Moore,
+MJRTY, 1991.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.tsdf.blocks import COLOR_SCALE, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
+from pcdata.functional.tsdf.grid import VoxelGrid, pack_keys, unpack_keys, voxel_offsets
+from pcdata.functional.tsdf.views import FusionView
+
+_TOGETHER = 2048  # blocks updated in one go: a million voxels
+
+
+def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
+    """Return the sorted keys (N,) of the blocks within the truncation band of a view's readings.
+
+    Along the ray of every reading, blocks are looked up half a block apart, from one truncation in front to one behind.
+    """
+    read = view.depth > 0
+    depth, rays = view.depth[read].double(), view.rays[read]
+    rotation, translation = view.world_from_camera[:3, :3].tolist(), view.world_from_camera[:3, 3].tolist()
+    per_block = 1.0 / grid.block_size
+    found = []
+    for offset in grid.band:
+        z = depth + offset
+        x, y = rays[:, 0] * z, rays[:, 1] * z
+        block = torch.stack(
+            [
+                ((((r[0] * x + r[1] * y) + r[2] * z) + t) * per_block).floor()
+                for r, t in zip(rotation, translation, strict=True)
+            ],
+            dim=-1,
+        )
+        found.append(pack_keys(block[z > 0].long()).unique())
+    return torch.cat(found).unique()
+
+
+def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
+    """Average a view into the given rows of the blocks, in place.
+
+    The signed distance of a voxel is the reading at its nearest pixel less its own depth, along z. Within the
+    truncation it joins the running average; beyond, behind the surface, the view says nothing; in front of it,
+    ``carve`` averages a full truncation into voxels that were seen before.
+    """
+    for chunk, inside, where in blocks.in_chunks(rows):
+        for start in range(0, len(inside), _TOGETHER):
+            some = slice(start, start + _TOGETHER)
+            _update(chunk, inside[some], blocks.keys[rows[where[some]]], view, grid, carve)
+
+
+def _update(chunk: Chunk, rows: Tensor, keys: Tensor, view: FusionView, grid: VoxelGrid, carve: bool) -> None:
+    pixel, distance = _distances(block_corners(keys, view, grid), view, grid)
+    scaled = distance * torch.tensor(TSDF_SCALE / grid.truncation, dtype=torch.float32)
+    near = scaled.abs() <= TSDF_SCALE
+    weight = chunk.weight[rows]
+    seen = near | ((scaled > TSDF_SCALE) & (weight > 0)) if carve else near
+    old = weight.float()
+    more = torch.ones_like(old) if view.weight is None else view.weight.flatten()[pixel].float()
+    share = more / (old + more)
+    tsdf = chunk.tsdf[rows].float()
+    average = (tsdf + (scaled.clamp(max=TSDF_SCALE) - tsdf) * share).round()
+    chunk.tsdf[rows] = torch.where(seen, average, tsdf).short()
+    chunk.weight[rows] = torch.where(seen, (old + more).clamp(max=MAX_WEIGHT), old).short()
+    count = weight if chunk.views is None else chunk.views[rows]
+    if chunk.color is not None and view.color is not None:
+        color = chunk.color[rows]
+        mixed = _mixed_color(color, view.color.flatten()[pixel], share, count)
+        chunk.color[rows] = torch.where(near, mixed, color)
+    if chunk.label is not None and chunk.votes is not None and view.label is not None:
+        _vote(chunk.label, chunk.votes, rows, view.label.flatten()[pixel], near)
+    if chunk.views is not None:
+        chunk.views[rows] = torch.where(near, (count.int() + 1).clamp(max=MAX_WEIGHT), count.int()).short()
+
+
+def block_corners(keys: Tensor, view: FusionView, grid: VoxelGrid) -> Tensor:
+    """Return the first voxel of every block in the camera's frame, (N, 3) float32, rounded once from float64."""
+    pose = view.camera_from_world.tolist()
+    x, y, z = (unpack_keys(keys).double() * grid.block_size).unbind(-1)
+    return torch.stack([((r[0] * x + r[1] * y) + r[2] * z) + r[3] for r in pose[:3]], dim=-1).float()
+
+
+def voxel_steps(view: FusionView, grid: VoxelGrid) -> Tensor:
+    """Return (3, 512) float32: where a block's voxels lie from its first one, in the camera's frame."""
+    steps = (view.camera_from_world[:3, :3] * grid.voxel_size).float()
+    x, y, z = voxel_offsets(steps.device).float().unbind(-1)
+    return torch.stack([(x * s[0] + y * s[1]) + z * s[2] for s in steps])
+
+
+def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tensor, Tensor]:
+    """Return the nearest pixel (N, 512) int64 of every voxel and its signed distance in metres; NaN where unseen."""
+    height, width = view.depth.shape
+    x, y, z = (corner[:, None] + step for corner, step in zip(corners.unbind(-1), voxel_steps(view, grid), strict=True))
+    inverse = 1.0 / z
+    x, y = x * inverse, y * inverse
+    ahead = z > 0
+    if view.distortion is not None:
+        radius = x * x + y * y
+        ahead &= radius < torch.tensor(view.fold, dtype=torch.float32)
+        x, y = bend(x, y, radius, view.distortion.float())
+    fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32).unbind()
+    u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
+    inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixel = torch.where(inside, v, 0.0).long() * width + torch.where(inside, u, 0.0).long()
+    reading = view.depth.flatten()[pixel]
+    return pixel, torch.where(inside & (reading > 0), reading - z, torch.nan)
+
+
+def bend(x: Tensor, y: Tensor, r2: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """Bend normalised coordinates as the lens does, in float32 and in the order of operations that kernels repeat."""
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = c.unbind()
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xy = (2 * x) * y
+    bent_x = ((x * radial + p1 * xy) + p2 * (r2 + (2 * x) * x)) + (s1 + s2 * r2) * r2
+    bent_y = ((y * radial + p1 * (r2 + (2 * y) * y)) + p2 * xy) + (s3 + s4 * r2) * r2
+    return bent_x, bent_y
+
+
+def _mixed_color(old: Tensor, pixel: Tensor, share: Tensor, count: Tensor) -> Tensor:
+    """Average a pixel's colour into the stored one.
+
+    Rounded up or down in turn, by the multiples of the golden ratio: rounding to nearest would ignore small
+    differences for good once the weights are large.
+    """
+    voxel = torch.arange(old.shape[1], dtype=torch.int32, device=old.device)
+    turn = ((count.int() * 159 + voxel * 83) & 255).float() * (1 / 256)
+    mixed = torch.zeros_like(old)
+    for channel in range(3):
+        before = ((old >> 10 * channel) & 1023).float()
+        now = ((pixel >> 8 * channel) & 255).float() * COLOR_SCALE
+        mixed |= ((before + (now - before) * share) + turn).int() << 10 * channel
+    return mixed
+
+
+def _vote(label: Tensor, votes: Tensor, rows: Tensor, seen: Tensor, near: Tensor) -> None:
+    """Count one vote per view: a label that more than half of the views gave is the candidate in the end."""
+    candidate, lead = label[rows], votes[rows].int()
+    agrees, is_open = seen == candidate, lead == 0
+    after = torch.where(agrees | is_open, (lead + 1).clamp(max=MAX_WEIGHT), lead - 1)
+    label[rows] = torch.where(near & is_open, seen, candidate)
+    votes[rows] = torch.where(near, after, lead).short()

@@ -1,0 +1,131 @@
+"""Triangles between zero crossings: marching cubes with tables made from the faces of the cube.
+
+Source: Lorensen & Cline, Marching Cubes, 1987. On a face with two opposite corners inside, those two are kept apart in
+every cube, so that neighbouring cubes agree and the surface has no cracks.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.tsdf.apron import SIDE, Neighbourhood
+from pcdata.functional.tsdf.blocks import VoxelBlocks
+from pcdata.functional.tsdf.grid import EDGE, VOXELS
+from pcdata.functional.tsdf.surface import Crossings
+
+_TOGETHER = 512  # blocks
+Edge = tuple[int, int]  # the corners it joins; corner c lies at (c & 1, c >> 1 & 1, c >> 2)
+
+# The corners of every face, going round so that the face is on the left of one who walks outside the cube.
+_FACES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+
+
+@cache
+def triangle_table() -> list[list[tuple[Edge, Edge, Edge]]]:
+    """Return, for each of the 256 sets of inside corners (bit c: corner c), the triangles as cut edges of the cube.
+
+    Seen from outside the body, corners run counter-clockwise.
+    """
+    return [[triangle for loop in _loops(inside) for triangle in _fan(loop)] for inside in range(256)]
+
+
+def _loops(inside: int) -> list[list[Edge]]:
+    """Trace the closed lines in which the surface cuts the faces of the cube."""
+    follows: dict[Edge, Edge] = {}
+    for face in _FACES:
+        is_in = [bool(inside >> corner & 1) for corner in face]
+        sides = [_edge(face[i], face[(i + 1) % 4]) for i in range(4)]
+        leaves = [i for i in range(4) if is_in[i] and not is_in[(i + 1) % 4]]
+        for i in leaves:
+            # Back to where this run of inside corners began: runs on one face stay apart.
+            begin = i
+            while is_in[(begin - 1) % 4]:
+                begin -= 1
+            follows[sides[i]] = sides[(begin - 1) % 4]
+    loops = []
+    while follows:
+        start, at = next(iter(follows.items()))
+        loop = [start]
+        del follows[start]
+        while at != start:
+            loop.append(at)
+            at = follows.pop(at)
+        loops.append(loop)
+    return loops
+
+
+def _fan(loop: list[Edge]) -> list[tuple[Edge, Edge, Edge]]:
+    return [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
+
+
+def _edge(a: int, b: int) -> Edge:
+    return min(a, b), max(a, b)
+
+
+def find_triangles(blocks: VoxelBlocks, vertices: Crossings, min_weight: int) -> Tensor:
+    """Return (T, 3) int64 rows of ``vertices``: the surface within the cubes whose eight corners were seen enough.
+
+    A triangle with a corner that is not among the vertices is left out.
+    """
+    keys = blocks.sorted_keys
+    tables = _tensor_tables(blocks.device)
+    parts = [
+        _triangles_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), keys, min_weight, tables)
+        for start in range(0, len(keys), _TOGETHER)
+    ]
+    edges = torch.cat(parts) if parts else torch.empty((0, 3), dtype=torch.int64, device=blocks.device)
+    if len(vertices.edge) == 0:
+        return edges[:0]
+    place = torch.searchsorted(vertices.edge, edges).clamp_(max=len(vertices.edge) - 1)
+    return place[(vertices.edge[place] == edges).all(1)]
+
+
+def _tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return first triangle of each case (257,), and per corner of a triangle (K, 3) its edge's start and axis."""
+    table = triangle_table()
+    counts = torch.tensor([0, *(len(triangles) for triangles in table)]).cumsum(0)
+    flat = [triangle for triangles in table for triangle in triangles]
+    start = torch.tensor([[a for a, _ in triangle] for triangle in flat])
+    axis = torch.tensor([[(b - a).bit_length() - 1 for a, b in triangle] for triangle in flat])
+    return counts.to(device), start.to(device), axis.to(device)
+
+
+def _triangles_of(
+    some: Neighbourhood, keys: Tensor, min_weight: int, tables: tuple[Tensor, Tensor, Tensor]
+) -> Tensor:  # (T, 3) int64 edges, numbered as in Crossings
+    counts, starts, axes = tables
+    count = len(some.corner)
+    seen = some.plane("weight").reshape(count, -1) >= min_weight
+    inside = some.plane("tsdf").reshape(count, -1) < 0
+    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=seen.device)] * 3, indexing="ij")
+    own = (((z + 1) * SIDE + (y + 1)) * SIDE + (x + 1)).flatten()
+    case = torch.zeros((count, VOXELS), dtype=torch.int64, device=seen.device)
+    complete = torch.ones_like(case, dtype=torch.bool)
+    for corner in range(8):
+        at = own + (corner & 1) + SIDE * (corner >> 1 & 1) + SIDE * SIDE * (corner >> 2)
+        case |= inside[:, at].long() << corner
+        complete &= seen[:, at]
+    per_cube = torch.where(complete, (counts[1:] - counts[:-1])[case], 0)
+    block, voxel = per_cube.nonzero(as_tuple=True)
+    repeat = per_cube[block, voxel]
+    first = torch.repeat_interleave(counts[case[block, voxel]] - (repeat.cumsum(0) - repeat), repeat)
+    row = first + torch.arange(len(first), device=first.device)
+    block, voxel = torch.repeat_interleave(block, repeat), torch.repeat_interleave(voxel, repeat)
+    return _edge_numbers(some, keys, block, voxel, starts[row], axes[row])
+
+
+def _edge_numbers(
+    some: Neighbourhood, keys: Tensor, block: Tensor, voxel: Tensor, corner: Tensor, axis: Tensor
+) -> Tensor:
+    """Number the edges that start at a corner (T, 3) of the cubes at these voxels (T,) and run along an axis (T, 3)."""
+    at = [((voxel // size % EDGE)[:, None] + (corner >> bit & 1)) for bit, size in enumerate((1, EDGE, EDGE * EDGE))]
+    step = [(place == EDGE).long() for place in at]
+    around = 13 + step[0] + 3 * step[1] + 9 * step[2]
+    row = some.rows[block[:, None], around]
+    place_of_row = torch.empty(len(keys), dtype=torch.int64, device=keys.device)
+    place_of_row[some.blocks.sorted_rows] = torch.arange(len(keys), device=keys.device)
+    inner = (at[0] % EDGE) + EDGE * (at[1] % EDGE) + EDGE * EDGE * (at[2] % EDGE)
+    return 3 * (VOXELS * place_of_row[row] + inner) + axis

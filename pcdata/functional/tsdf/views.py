@@ -1,0 +1,86 @@
+"""One view, prepared for integration: its camera, and images of depth, weight, colour and label."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.lens import fold_radius
+
+Weighting = Literal["constant", "inverse_square", "angle"]
+
+UNIT_WEIGHT = 64  # steps of the weight 1, where weights are not all 1
+_STEEPEST = 0.1  # the least weight by angle: a surface seen at 84 degrees or more
+
+
+@dataclass(frozen=True, eq=False)
+class FusionView:
+    """What one camera saw, in the form that the kernels read."""
+
+    depth: Tensor  # (H, W) float32 metres, 0 = no reading
+    rays: Tensor  # (H, W, 2) float64, x/z and y/z of every pixel
+    pinhole: tuple[float, float, float, float, float]  # fx, skew, cx, fy, cy
+    distortion: Tensor | None  # (12,) float64 coefficients
+    world_from_camera: Tensor  # (4, 4) float64
+    weight: Tensor | None = None  # (H, W) int32 at least 1; None = 1 everywhere
+    color: Tensor | None = None  # (H, W) int32: r | g << 8 | b << 16
+    label: Tensor | None = None  # (H, W) int32
+
+    @property
+    def camera_from_world(self) -> Tensor:
+        """The pose the other way, (4, 4) float64."""
+        rotation = self.world_from_camera[:3, :3]
+        inverse = self.world_from_camera.clone()
+        inverse[:3, :3] = rotation.T
+        inverse[:3, 3] = -(rotation.T @ self.world_from_camera[:3, 3])
+        return inverse
+
+    @property
+    def fold(self) -> float:
+        """The squared radius from which on the lens model folds back; infinite without a lens."""
+        return float("inf") if self.distortion is None else float(fold_radius(self.distortion[None])) ** 2
+
+
+def pack_colors(colors: Tensor) -> Tensor:
+    """Pack (..., 3) uint8 RGB into (...) int32."""
+    r, g, b = colors.int().unbind(-1)
+    return r | (g << 8) | (b << 16)
+
+
+def weight_image(
+    depth: Tensor,  # (H, W) float32
+    rays: Tensor,  # (H, W, 2) float64
+    weighting: Weighting,
+) -> Tensor | None:  # (H, W) int32, in steps of 1/64; None = 1 everywhere
+    """Say how much every reading counts.
+
+    ``inverse_square`` is ``(1 m / depth)^2``, the inverse variance of a sensor whose noise grows with the depth;
+    ``angle`` the cosine between the ray and the surface's normal, 0.1 where neighbours without reading hide it.
+    """
+    if weighting == "constant":
+        return None
+    if weighting == "inverse_square":
+        weight = 1.0 / depth.double().square().clamp(min=1e-4)
+    else:
+        weight = _cosines(depth, rays)
+    return (weight * UNIT_WEIGHT).round().clamp(1, 1 << 14).int()
+
+
+def _cosines(depth: Tensor, rays: Tensor) -> Tensor:
+    """Return |cos| between every pixel's ray and the normal from its four neighbours (H, W) float64."""
+    ones = torch.ones_like(rays[..., :1])
+    directions = torch.cat([rays, ones], dim=-1).nan_to_num()
+    points = directions * depth.double()[..., None]
+    cosine = torch.full(depth.shape, _STEEPEST, dtype=torch.float64, device=depth.device)
+    if min(depth.shape) < 3:
+        return cosine
+    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    read = depth > 0
+    known = read[1:-1, 2:] & read[1:-1, :-2] & read[2:, 1:-1] & read[:-2, 1:-1]
+    normal = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1)
+    facing = (normal * torch.nn.functional.normalize(directions[1:-1, 1:-1], dim=-1)).sum(-1).abs()
+    cosine[1:-1, 1:-1] = torch.where(known, facing.clamp(min=_STEEPEST), _STEEPEST)
+    return cosine

@@ -1,0 +1,112 @@
+"""Arrays of a zarr v2 directory, read chunk by chunk; Blosc chunks need the extra ``zarr``."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import itertools
+import json
+import lzma
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcdata.errors import CacheError
+from pcdata.extras import require
+
+# Codecs of the standard library; numcodecs has the others.
+_DECODERS: dict[str, Callable[[bytes], bytes]] = {
+    "zlib": zlib.decompress,
+    "gzip": gzip.decompress,
+    "bz2": bz2.decompress,
+    "lzma": lzma.decompress,
+}
+
+
+def zarr_arrays(folder: str | Path) -> dict[str, ZarrArray]:
+    """Return every array under a zarr v2 directory by its path inside it.
+
+    Raises:
+        CacheError: no zarr v2 directory, or a header that cannot be read.
+    """
+    folder = Path(folder)
+    if (folder / "zarr.json").exists():
+        raise CacheError(f"{folder}: is zarr v3, which loaders that pin zarr 2 cannot open; write it as v2")
+    arrays = {
+        path.parent.relative_to(folder).as_posix().removeprefix("."): ZarrArray(path.parent)
+        for path in sorted(folder.rglob(".zarray"))
+    }
+    if not arrays:
+        raise CacheError(f"{folder}: holds no zarr v2 array (no .zarray)")
+    return arrays
+
+
+class ZarrArray:
+    """One array: ``array[3]`` reads the chunks of one row, ``array[...]`` all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            header: dict[str, Any] = json.loads((folder / ".zarray").read_text(encoding="utf-8"))
+            self.shape: tuple[int, ...] = tuple(header["shape"])
+            self.chunks: tuple[int, ...] = tuple(header["chunks"])
+            self.dtype = np.dtype(header["dtype"])
+            self._compressor, self._filters = header["compressor"], header["filters"]
+            self._order, self._fill = header["order"], header["fill_value"]
+            self._separator: str = header.get("dimension_separator", ".")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CacheError(f"{folder}: its .zarray cannot be read: {error!r}") from error
+        if self.dtype.hasobject or self._filters or len(self.chunks) != len(self.shape) or 0 in self.chunks:
+            raise CacheError(f"{folder}: must hold plain numbers without filters, got {header}")
+
+    @property
+    def ndim(self) -> int:
+        """The number of axes."""
+        return len(self.shape)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        """Read one row of the first axis, or everything for ``...``."""
+        if index is Ellipsis:
+            return self._read(0, self.shape[0] if self.shape else 1)
+        if not 0 <= index < self.shape[0]:
+            raise IndexError(index)
+        row: np.ndarray = self._read(index, index + 1)[0]
+        return row
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        result = np.full((stop - start, *self.shape[1:]), 0 if self._fill is None else self._fill, self.dtype)
+        grids = [range(start // self.chunks[0], -(-stop // self.chunks[0]))]
+        grids += [range(-(-size // chunk)) for size, chunk in zip(self.shape[1:], self.chunks[1:])]
+        for position in itertools.product(*grids):
+            block = self._chunk(position)
+            if block is None:  # never written: the fill value
+                continue
+            low = position[0] * self.chunks[0]
+            first, last = max(low, start), min(low + self.chunks[0], stop)
+            inside = [slice(p * c, min((p + 1) * c, s)) for p, c, s in zip(position, self.chunks, self.shape)][1:]
+            taken = tuple(slice(0, part.stop - part.start) for part in inside)
+            result[(slice(first - start, last - start), *inside)] = block[(slice(first - low, last - low), *taken)]
+        return result
+
+    def _chunk(self, position: tuple[int, ...]) -> np.ndarray | None:
+        path = self.folder / self._separator.join(map(str, position))
+        if not path.exists():
+            return None
+        try:
+            content = self._decoded(path.read_bytes())
+            return np.frombuffer(content, self.dtype).reshape(self.chunks, order=self._order)
+        except (OSError, ValueError, EOFError, zlib.error, lzma.LZMAError) as error:
+            raise CacheError(f"{path}: this chunk cannot be read: {error}") from error
+
+    def _decoded(self, content: bytes) -> bytes:
+        if self._compressor is None:
+            return content
+        name = self._compressor["id"]
+        if name in _DECODERS:
+            return _DECODERS[name](content)
+        numcodecs = require("numcodecs")
+        decoded: bytes = bytes(numcodecs.get_codec(self._compressor).decode(content))
+        return decoded

@@ -1,0 +1,26 @@
+"""What each downstream model takes, as data: presets that meet it, checks that hold data against it, the way back."""
+
+from pcdata.models.batch import ModelBatch
+from pcdata.models.catalogue import CONTRACTS, contract
+from pcdata.models.check import check, check_files, require
+from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
+from pcdata.models.predictions import Predictions, to_frame, to_source
+from pcdata.models.preset import Preset, preset
+
+__all__ = [
+    "CONTRACTS",
+    "Channel",
+    "InputTensor",
+    "ModelBatch",
+    "ModelContract",
+    "Predictions",
+    "Preset",
+    "Role",
+    "check",
+    "check_files",
+    "contract",
+    "preset",
+    "require",
+    "to_frame",
+    "to_source",
+]

@@ -1,0 +1,146 @@
+"""Contracts by name, and the choices that they leave open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from pcdata.errors import ConfigError, near_matches
+from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.models.tables import grasping, images, pointnet, policies, scenes
+from pcdata.structures import CAMERA_FRAME
+
+CONTRACTS: dict[str, ModelContract] = {
+    contract.name: contract
+    for table in (pointnet.TABLE, grasping.TABLE, policies.TABLE, images.TABLE, scenes.TABLE)
+    for contract in table
+}
+
+# What each choice wants, for messages and pages.
+CHOICES = {
+    "frame": "the name of the frame that you train in, as the captures call it: frame='base'",
+    "crop": "the workspace ((x, y, z), (x, y, z)), smallest and largest, metres in that frame; or None for no crop",
+    "category": "the object's category as the model numbers it, 0 to 15",
+    "num_points": "one of the counts that the model's code is used with",
+    "voxel_size": "edge length in metres",
+    "channels": "the names of the channels to feed; those that are not optional must be among them",
+}
+
+
+def contract(name: str, **choices: Any) -> ModelContract:
+    """Return the contract of a model with the given choices made; choices left out stay open.
+
+    Raises:
+        ConfigError: no such model or choice, or a value that the model's code does not allow.
+    """
+    if name not in CONTRACTS:
+        hint = near_matches(name, CONTRACTS) or f"; known: {', '.join(sorted(CONTRACTS))}"
+        raise ConfigError(f"no model contract {name!r}{hint}")
+    chosen = CONTRACTS[name]
+    for choice, value in choices.items():
+        chosen = _MAKERS[choice](chosen, value) if choice in _MAKERS else _unknown(chosen, choice)
+    return chosen
+
+
+def missing_choices(chosen: ModelContract) -> str:
+    """Say which choices are still open and what to give; "" = none."""
+    return "; ".join(f"{choice}: {CHOICES[choice]}" for choice in chosen.required_choices)
+
+
+def possible_choices(chosen: ModelContract) -> dict[str, str]:
+    """Return what may be chosen for a model, required choices first, with what each wants."""
+    names = list(chosen.required_choices)
+    names += ["num_points"] if chosen.counts else []
+    names += ["voxel_size"] if chosen.voxel is not None and chosen.count_range is not None else []
+    names += ["channels"] if any(channel.optional for tensor in chosen.tensors for channel in tensor.channels) else []
+    names += ["crop"] if chosen.crop is not None and "crop" not in names else []
+    return {name: CHOICES[name] for name in names}
+
+
+def _unknown(chosen: ModelContract, choice: str) -> ModelContract:
+    raise ConfigError(
+        f"{chosen.name}: no choice {choice!r}; it has {', '.join(possible_choices(CONTRACTS[chosen.name])) or 'none'}"
+    )
+
+
+def _choose_frame(chosen: ModelContract, frame: Any) -> ModelContract:
+    given = CONTRACTS[chosen.name].frame
+    if not isinstance(frame, str) or not frame or "/" in frame:
+        raise ConfigError(f"{chosen.name}: frame must be {CHOICES['frame']}, got {frame!r}")
+    if given and frame != given:
+        raise ConfigError(
+            f"{chosen.name}: the model's code works in the frame {given!r}; it leaves no choice of {frame!r}"
+        )
+    return replace(chosen, frame=frame)
+
+
+def _choose_crop(chosen: ModelContract, crop: Any) -> ModelContract:
+    if crop is None:
+        return replace(chosen, crop=None, crop_is_open=False)
+    if "crop" not in possible_choices(CONTRACTS[chosen.name]):
+        return _unknown(chosen, "crop")
+    try:
+        (x0, y0, z0), (x1, y1, z1) = ((float(value) for value in corner) for corner in crop)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{chosen.name}: crop must be {CHOICES['crop']}, got {crop!r}") from error
+    if not (x0 < x1 and y0 < y1 and z0 < z1):
+        raise ConfigError(f"{chosen.name}: crop must have its lower corner below its upper on every axis, got {crop!r}")
+    return replace(chosen, crop=((x0, y0, z0), (x1, y1, z1)), crop_is_open=False)
+
+
+def _choose_count(chosen: ModelContract, count: Any) -> ModelContract:
+    original = CONTRACTS[chosen.name]
+    allowed = () if original.count is None else (original.count, *original.counts)
+    if count not in allowed:
+        raise ConfigError(
+            f"{chosen.name}: num_points must be one of {sorted(allowed)}, got {count!r}"
+            if allowed
+            else f"{chosen.name}: takes any number of points; leave num_points out"
+        )
+    return replace(chosen, count=count)
+
+
+def _choose_voxel(chosen: ModelContract, size: Any) -> ModelContract:
+    if "voxel_size" not in possible_choices(CONTRACTS[chosen.name]):
+        return _unknown(chosen, "voxel_size")
+    if not isinstance(size, float) or not 0.001 <= size <= 0.1:
+        raise ConfigError(f"{chosen.name}: voxel_size must be metres, 0.001 to 0.1, got {size!r}")
+    return replace(chosen, voxel=size)
+
+
+def _choose_channels(chosen: ModelContract, names: Any) -> ModelContract:
+    original = CONTRACTS[chosen.name]
+    known = [channel for tensor in original.tensors for channel in tensor.channels]
+    wanted = {names} if isinstance(names, str) else set(names)
+    needed = {channel.name for channel in known if not channel.optional}
+    if wanted - {channel.name for channel in known}:
+        raise ConfigError(f"{chosen.name}: channels are {[channel.name for channel in known]}, got {sorted(wanted)}")
+    kept = (_with_channels(tensor, wanted | needed) for tensor in original.tensors)
+    return replace(chosen, tensors=tuple(tensor for tensor in kept if tensor.channels or tensor.content == "offset"))
+
+
+def _with_channels(tensor: InputTensor, wanted: set[str]) -> InputTensor:
+    return replace(tensor, channels=tuple(channel for channel in tensor.channels if channel.name in wanted))
+
+
+def _choose_category(chosen: ModelContract, category: Any) -> ModelContract:
+    if "category" not in CONTRACTS[chosen.name].choices:
+        return _unknown(chosen, "category")
+    if not isinstance(category, int) or not 0 <= category < 16:
+        raise ConfigError(f"{chosen.name}: category must be {CHOICES['category']}, got {category!r}")
+    return replace(chosen, choices=tuple(choice for choice in chosen.choices if choice != "category"))
+
+
+_MAKERS = {
+    "frame": _choose_frame,
+    "crop": _choose_crop,
+    "num_points": _choose_count,
+    "voxel_size": _choose_voxel,
+    "channels": _choose_channels,
+    "category": _choose_category,
+}
+
+
+def is_camera(chosen: ModelContract) -> bool:
+    """Whether the coordinates before centring are the camera's own, z forward."""
+    return chosen.frame == CAMERA_FRAME

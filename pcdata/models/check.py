@@ -1,0 +1,154 @@
+"""check: is a batch, or a data set, what a model takes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pcdata.datasets import SampleDataset
+from pcdata.errors import ContractError, DTypeError, PcdataError
+from pcdata.models.batch import ModelBatch
+from pcdata.models.catalogue import contract as contract_named
+from pcdata.models.contract import ModelContract
+from pcdata.models.foreign import read_samples
+from pcdata.models.preset import batch_of
+from pcdata.models.rules import cheap_checks
+from pcdata.models.value_rules import value_checks
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.validation import Check, SampleReport, Summary, Verdict
+
+
+def check(
+    data: Any,
+    model: str,
+    *,
+    frame_id: str = "",
+    unit: str = "",
+    channels: Mapping[str, tuple[str, ...]] | None = None,
+    cheap: bool = False,
+    limit: int | None = None,
+    **choices: Any,
+) -> Summary:
+    """Judge data by a model's contract: one verdict per rule, with what to do.
+
+    Args:
+        data: a ``ModelBatch``, a ``PointCloud``, ``DepthFrame``, a mapping of tensors or arrays by the names of the
+            model's code, or a data set or list of any of these.
+        model: the contract's name.
+        frame_id: the frame of the data, where they do not say it themselves.
+        unit: "m" or "normalized", where the data do not say it themselves.
+        channels: the names of the channels of each tensor, where the data do not say it themselves.
+        cheap: read declarations and shapes alone, no values: for every step of a training loop.
+        limit: only so many samples of a data set.
+        choices: what the contract leaves open, as for :func:`preset`; a preset's batch brings its own.
+
+    Raises:
+        ConfigError: an unknown model or choice.
+        DTypeError: something that is no data.
+    """
+    contract_named(model, **choices)
+    summary = Summary()
+    for number, (name, sample) in enumerate(_samples(data)):
+        if limit is not None and number >= limit:
+            break
+        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
+        summary.add(SampleReport(name, tuple(_checks(sample, model, choices, declared, cheap))))
+    return summary
+
+
+def check_files(
+    path: str | Path,
+    model: str,
+    keys: Mapping[str, str],
+    *,
+    frame_id: str = "",
+    unit: str = "",
+    limit: int | None = None,
+    **choices: Any,
+) -> Summary:
+    """Judge every sample of an npz, npy, HDF5 or zarr v2 file that anybody wrote.
+
+    Args:
+        path: the file, or the zarr directory.
+        model: the contract's name.
+        keys: from a tensor of the model, or points, colors, normals, to the array's name in the file.
+        frame_id: the frame of the data, unless unknown.
+        unit: "m" or "normalized", unless unknown.
+        limit: only so many samples.
+        choices: what the contract leaves open.
+
+    Raises:
+        CacheError: the file cannot be read, or has no such array.
+        ConfigError: an unknown model, choice or key.
+    """
+    contract = contract_named(model, **choices)
+    summary = Summary()
+    for name, arrays, channels in itertools.islice(read_samples(path, contract, keys), limit):
+        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
+        summary.add(SampleReport(name, tuple(_checks(arrays, model, choices, declared, False))))
+    return summary
+
+
+def require(data: Any, model: str, **options: Any) -> None:
+    """Refuse data that :func:`check` fails; warnings pass.
+
+    Raises:
+        ContractError: every rule that failed, with what to do.
+    """
+    summary = check(data, model, **options)
+    if summary.verdict is not Verdict.FAIL:
+        return
+    failed = [entry.worst for entry in summary.checks.values() if entry.worst is not None]
+    faults = [f"{one.name}: {one.found}; {one.advice}" for one in failed if one.verdict is Verdict.FAIL]
+    raise ContractError(f"{model}: the model does not take this:\n" + "\n".join(faults))
+
+
+def _checks(
+    sample: Any, model: str, choices: Mapping[str, Any], declared: Mapping[str, Any], cheap: bool
+) -> Iterable[Check]:
+    if isinstance(sample, ModelBatch) and sample.model == model:
+        choices = {**sample.choices, **choices}
+    contract = contract_named(model, **choices)
+    try:
+        batch = _as_batch(sample, contract, choices, declared)
+    except PcdataError as error:
+        # The model's tensors cannot even be made of it.
+        return [Check(name="channels", verdict=Verdict.FAIL, found=str(error), advice="use the preset's pipeline")]
+    checks = list(cheap_checks(batch, contract))
+    return checks if cheap else [*checks, *value_checks(batch, contract)]
+
+
+def _as_batch(
+    sample: Any, contract: ModelContract, choices: Mapping[str, Any], declared: Mapping[str, Any]
+) -> ModelBatch:
+    if isinstance(sample, ModelBatch):
+        return sample
+    if isinstance(sample, (PointCloud, DepthFrame)):
+        return batch_of([sample], contract, choices)
+    tensors = {key: _as_tensor(value) for key, value in sample.items() if isinstance(value, (Tensor, np.ndarray))}
+    return ModelBatch(
+        tensors=tensors, frame_id=declared["frame_id"], unit=declared["unit"], channels=declared["channels"] or {}
+    )
+
+
+def _as_tensor(value: Tensor | np.ndarray) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.from_numpy(np.ascontiguousarray(value))
+
+
+def _samples(data: Any) -> Iterable[tuple[str, Any]]:
+    if isinstance(data, (ModelBatch, PointCloud, DepthFrame, Mapping)):
+        return [("batch", data)]
+    if isinstance(data, SampleDataset):
+        return zip(data.ids, data)
+    if hasattr(data, "__iter__") and not isinstance(data, (str, bytes, Tensor, np.ndarray)):
+        return ((str(number), sample) for number, sample in enumerate(data))
+    raise DTypeError(
+        f"check: takes a batch, clouds, named tensors or a data set, got {type(data).__name__}; name a bare tensor as "
+        "the model does: {'points': tensor}"
+    )

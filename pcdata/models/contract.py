@@ -1,0 +1,135 @@
+"""ModelContract: what a model's own code demands of its input, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal
+
+from pcdata.structures import CAMERA_FRAME, METRE, NORMALIZED
+
+Vec3 = tuple[float, float, float]
+
+
+class Role(str, Enum):
+    """What a channel means; it decides which values are sane."""
+
+    POSITION = "position"  # metres, or normalised coordinates
+    COLOR = "color"
+    DIRECTION = "direction"  # unit vectors
+    DEPTH = "depth"  # of an image
+    OTHER = "other"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Neighbouring columns of a tensor that mean one thing."""
+
+    name: str  # unique among all contracts for one meaning; COLUMNS of pcdata.models.tensors computes it
+    width: int = 3
+    role: Role = Role.POSITION
+    low: float | None = None  # smallest and largest value that the model expects
+    high: float | None = None
+    optional: bool = False  # the model also runs without it: preset(..., channels=[...]) may leave it out
+
+
+XYZ = Channel("xyz")
+RGB_UNIT = Channel("rgb", role=Role.COLOR, low=0.0, high=1.0)
+RGB_BYTE = Channel("rgb_255", role=Role.COLOR, low=0.0, high=255.0)
+RGB_SIGNED = Channel("rgb_signed", role=Role.COLOR, low=-1.0, high=1.0)
+RGB_IMAGENET = Channel("rgb_imagenet", role=Role.COLOR, low=-2.1180, high=2.6401)
+NORMALS = Channel("normals", role=Role.DIRECTION, low=-1.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class InputTensor:
+    """One tensor that the model takes.
+
+    ``layout`` names the axes: B clouds, N points of each, S points of all clouds one after another, C channels,
+    V views, H rows and W columns of an image, X Y Z cells of a grid; a number is an axis of that length.
+    """
+
+    key: str  # the name in the model's own code
+    layout: str
+    channels: tuple[Channel, ...] = ()
+    dtype: str = "float32"
+    content: str = "columns"  # how it is made: a name in PACKERS of pcdata.models.tensors
+
+    @property
+    def axes(self) -> list[str]:
+        """The axes of :attr:`layout`."""
+        return self.layout.split()
+
+    @property
+    def width(self) -> int:
+        """The number of channels."""
+        return sum(channel.width for channel in self.channels)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """The names of the channels in order."""
+        return tuple(channel.name for channel in self.channels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelContract:
+    """What one model takes; where a guide says otherwise than the model's code, this follows the code."""
+
+    name: str
+    title: str
+    source: str  # repository, file and lines that say so
+    tensors: tuple[InputTensor, ...]
+
+    takes: Literal["cloud", "depth image"] = "cloud"
+    frame: str = CAMERA_FRAME  # "" = the model leaves it open: it must be chosen
+    axes: str = "x right, y down, z forward"
+    half_turn: bool = False  # turn half about z: x left, y up, z forward
+
+    count: int | None = None  # points per cloud; None = any
+    counts: tuple[int, ...] = ()  # other counts that the model's code is used with
+    count_range: tuple[int, int] | None = None  # where count is None: the usual counts
+    sampler: Literal["none", "random", "random with replacement", "farthest point"] = "none"
+    pad: Literal["error", "repeat", "tile", "zeros", "keep"] = "keep"
+    voxel: float | None = None  # edge length in metres
+    voxel_rule: Literal["mean", "first", "random"] = "mean"
+    crop_before_voxels: bool = True
+
+    centring: Literal["none", "mean", "corner", "floor"] = "none"
+    scaling: Literal["none", "unit sphere"] = "none"
+    normalise: Literal["before sampling", "after sampling"] = "after sampling"
+    crop: tuple[Vec3, Vec3] | None = None  # smallest and largest x, y, z, in the contract's frame before centring
+    crop_is_open: bool = False  # the crop must be chosen: a box, or None for no crop
+    column: float | None = None  # edge length of a random column of the scene, metres
+    image_size: tuple[int, int] | None = None  # (height, width)
+
+    table: Literal["kept", "removed", "open"] = "kept"
+    max_duplicates: float = 0.5  # share of repeated points beyond which a cloud is too thin to train on
+    guide: str = ""  # what practitioners' guides say instead
+    traps: tuple[str, ...] = ()
+    wrong_frame: str = ""  # what a wrong frame would have done
+    choices: tuple[str, ...] = field(default=())  # further choices that must be given
+
+    @property
+    def main(self) -> InputTensor:
+        """The tensor with the geometry."""
+        return self.tensors[0]
+
+    @property
+    def required_choices(self) -> tuple[str, ...]:
+        """What the model leaves open, and so must be chosen."""
+        return (
+            *(() if self.frame else ("frame",)),
+            *(("crop",) if self.crop_is_open else ()),
+            *self.choices,
+        )
+
+    def frame_of_tensors(self) -> str:
+        """The frame id of the coordinates that the model sees."""
+        frame = f"{self.frame}_half_turn" if self.half_turn else self.frame
+        if self.scaling != "none":  # NormalizeUnitSphere changes the unit, and keeps the frame's name
+            return frame
+        return frame + {"none": "", "mean": "/centered", "corner": "/corner", "floor": "/floor"}[self.centring]
+
+    def unit_of_tensors(self) -> str:
+        """METRE or NORMALIZED."""
+        return NORMALIZED if self.scaling != "none" else METRE

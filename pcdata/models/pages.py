@@ -1,0 +1,148 @@
+"""A page per model, made of its contract alone, so that it cannot say anything else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pcdata.models.catalogue import CONTRACTS, possible_choices
+from pcdata.models.contract import Channel, ModelContract
+
+# Answers that make an example of every open choice.
+_EXAMPLE = {"frame": '"base"', "crop": "((0.2, -0.4, 0.0), (0.9, 0.4, 0.6))", "category": "3"}
+
+
+def write_pages(folder: str | Path) -> None:
+    """Write the pages of all models, and the list of them as README.md: ``write_pages("docs/models")``."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "README.md").write_text(index_page(), encoding="utf-8")
+    for one in CONTRACTS.values():
+        (folder / f"{one.name}.md").write_text(contract_page(one), encoding="utf-8")
+
+
+def contract_page(contract: ModelContract) -> str:
+    """Return the model's page as Markdown."""
+    parts = [
+        f"# {contract.title}",
+        f"`preset({contract.name!r})`. Source: {contract.source}.",
+        _table(contract),
+        "## Tensors\n\n" + _tensors(contract),
+        "## Preset\n\n" + _example(contract),
+    ]
+    if contract.guide:
+        parts.append(f"## What guides say\n\n{contract.guide}")
+    if contract.traps:
+        parts.append("## Traps\n\n" + "\n".join(f"- {trap}" for trap in contract.traps))
+    if contract.wrong_frame:
+        parts.append(f"## What a wrong frame would have done\n\n{contract.wrong_frame}")
+    return "\n\n".join(parts) + "\n"
+
+
+def index_page() -> str:
+    """Return the list of all models as Markdown."""
+    rows = [
+        f"| [{one.name}]({one.name}.md) | {one.title} | {one.frame or 'to choose'} | {_count(one)} | "
+        f"{_normalised(one)} |"
+        for one in CONTRACTS.values()
+    ]
+    head = "| preset | model | frame | points | normalisation |\n|---|---|---|---|---|"
+    return (
+        "# Models\n\nWhat each model takes, read from its own code; the pages are made from `pcdata/models/tables`.\n\n"
+        "`preset(name, ...)` gives the pipeline and the collate function that end in the model's tensors; what\n"
+        "a model leaves open must be chosen. `check(data, name)` holds a batch, a data set or a file against the\n"
+        "contract, also as `pcdata check PATH --model NAME`; with `cheap=True` it reads no values and fits into every\n"
+        "training step.\n"
+        "`to_source` and `to_frame` bring predictions back to the robot. What a wrong frame costs: [measured]"
+        "(wrong_frame.md).\n\n" + "\n".join([head, *rows]) + "\n"
+    )
+
+
+def _table(contract: ModelContract) -> str:
+    rows = {
+        "frame": contract.frame or "the model leaves it open: choose `frame`",
+        "axes": contract.axes,
+        "unit": "m" if contract.scaling == "none" else "normalised",
+        "points per cloud": _count(contract),
+        "sampler": contract.sampler,
+        "short clouds": _short(contract),
+        "voxels": "none" if contract.voxel is None else f"{contract.voxel * 1000:g} mm, {contract.voxel_rule} point",
+        "centring and scaling": _normalised(contract),
+        "crop": _crop(contract),
+        "table": {"kept": "kept", "removed": "removed: one object", "open": "left to you"}[contract.table],
+    }
+    if contract.takes == "depth image":
+        rows = {name: rows[name] for name in ("frame", "axes")}
+    if contract.image_size is not None:
+        rows["image"] = f"{contract.image_size[0]} x {contract.image_size[1]} (height x width)"
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+def _tensors(contract: ModelContract) -> str:
+    rows = [
+        f"| `{spec.key}` | ({', '.join(spec.axes)}) | {spec.dtype} | {', '.join(map(_channel, spec.channels)) or '-'} |"
+        for spec in contract.tensors
+    ]
+    return "\n".join(["| name | layout | dtype | channels in order |", "|---|---|---|---|", *rows])
+
+
+def _channel(channel: Channel) -> str:
+    limits = "" if channel.low is None else f" in [{channel.low:g}, {channel.high:g}]"
+    return f"{channel.name} ({channel.width}{', optional' if channel.optional else ''}){limits}"
+
+
+def _example(contract: ModelContract) -> str:
+    given = "".join(f", {choice}={_EXAMPLE[choice]}" for choice in contract.required_choices)
+    code = [
+        "```python",
+        "from pcdata import preset",
+        "",
+        f'made = preset("{contract.name}"{given})',
+        "loader = DataLoader(made.dataset(source), batch_size=8, collate_fn=made.collate)",
+        "```",
+    ]
+    choices = possible_choices(contract)
+    said = [f"- `{name}`: {what}" for name, what in choices.items()]
+    if contract.counts:
+        allowed = ", ".join(str(count) for count in sorted({contract.count or 0, *contract.counts}))
+        said = [f"{line} ({allowed})" if line.startswith("- `num_points`") else line for line in said]
+    return "\n".join([*code, *([] if not said else ["", "Choices:", "", *said])])
+
+
+def _count(contract: ModelContract) -> str:
+    if contract.takes == "depth image":
+        return "an image"
+    if contract.count is None:
+        return "any" if contract.count_range is None else "{:,} to {:,}".format(*contract.count_range)
+    return f"{contract.count:,}"
+
+
+def _short(contract: ModelContract) -> str:
+    words = {
+        "error": "refused",
+        "repeat": "random duplicates",
+        "tile": "the whole order again",
+        "zeros": "zero rows",
+        "keep": "stay as they are",
+    }
+    return words[contract.pad]
+
+
+def _normalised(contract: ModelContract) -> str:
+    if contract.scaling != "none":
+        return f"mean to the origin, farthest point to 1; {contract.normalise}"
+    if contract.centring == "none":
+        return "none"
+    where = {
+        "mean": "mean to the origin",
+        "corner": "lowest corner to the origin",
+        "floor": "middle of the floor to it",
+    }
+    return f"{where[contract.centring]}; {contract.normalise}"
+
+
+def _crop(contract: ModelContract) -> str:
+    if contract.crop_is_open:
+        return "the model leaves it open: choose `crop`"
+    if contract.crop is None:
+        return "none"
+    return f"{list(contract.crop[0])} to {list(contract.crop[1])}, in {contract.frame}"

@@ -1,0 +1,147 @@
+"""Predictions back: from the coordinates that a model saw to the source frame, or to any frame that a cloud knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import FrameError, PoseError, ShapeError
+from pcdata.functional import rigid
+from pcdata.models.batch import ModelBatch
+from pcdata.structures import PointCloud
+
+GRASP_WIDTH = 17  # graspnetAPI's row: score, width, height, depth, rotation (9), translation (3), object
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Predictions:
+    """What was given, in ``frame_id`` and metres; the rest is None."""
+
+    frame_id: str
+    points: Tensor | None = None  # (B, M, 3) float64
+    poses: Tensor | None = None  # (B, M, 4, 4) float64
+    grasps: Tensor | None = None  # (B, M, 17) float64
+    directions: Tensor | None = None  # (B, M, 3) float64, unit length
+
+
+def to_source(
+    cloud: PointCloud | ModelBatch,
+    *,
+    points: Tensor | None = None,  # (B, M, 3)
+    poses: Tensor | None = None,  # (B, M, 4, 4) rigid
+    grasps: Tensor | None = None,  # (B, M, 17) graspnetAPI rows
+    directions: Tensor | None = None,  # (B, M, 3), approach vectors and the like
+) -> Predictions:
+    """Move predictions from the coordinates of the clouds they were made on to the source frame, in metres.
+
+    A normalisation's scale moves points and grasp widths, never rotations. For one cloud the axis B may be left out of
+    the input; the result has it.
+
+    Raises:
+        PoseError: the cloud was mirrored, or scaled differently along its axes: poses have no image then.
+        ShapeError: a shape, or another number of clouds.
+    """
+    matrix, frame = _source_of(cloud)
+    return _moved(matrix, frame, points, poses, grasps, directions)
+
+
+def to_frame(
+    cloud: PointCloud | ModelBatch,
+    frame: str,
+    *,
+    frame_from_source: Tensor | None = None,  # (4, 4) or (B, 4, 4) extrinsics; None = those of the capture
+    points: Tensor | None = None,
+    poses: Tensor | None = None,
+    grasps: Tensor | None = None,
+    directions: Tensor | None = None,
+) -> Predictions:
+    """Move predictions to a named frame, such as the robot's base: :func:`to_source`, then the extrinsics.
+
+    Raises:
+        FrameError: the cloud does not know the frame, and no extrinsics are given.
+        PoseError, ShapeError: as :func:`to_source`; or the extrinsics are not rigid.
+    """
+    matrix, source = _source_of(cloud)
+    if frame_from_source is not None:
+        rigid.check_rigid("to_frame: frame_from_source", frame_from_source)
+        matrix = frame_from_source.to(matrix) @ matrix
+    elif frame != source:
+        if frame not in cloud.frames:
+            raise FrameError(
+                f"to_frame: the cloud knows the frames {sorted({source, *cloud.frames})}, not {frame!r}; give "
+                "frame_from_source, the camera's extrinsics"
+            )
+        matrix = cloud.frames[frame] @ matrix
+    return _moved(matrix, frame, points, poses, grasps, directions)
+
+
+def _source_of(cloud: PointCloud | ModelBatch) -> tuple[Tensor, str]:
+    if cloud.source_from_cloud is None:
+        raise FrameError("the batch does not say where it came from; make it by a preset's collate")
+    return cloud.source_from_cloud, cloud.source_frame
+
+
+def _moved(
+    matrix: Tensor,  # (B, 4, 4) float64
+    frame: str,
+    points: Tensor | None,
+    poses: Tensor | None,
+    grasps: Tensor | None,
+    directions: Tensor | None,
+) -> Predictions:
+    batch = len(matrix)
+    return Predictions(
+        frame_id=frame,
+        points=None if points is None else _move_points(matrix, _batched("points", points, batch, (3,))),
+        poses=None if poses is None else _move_poses(matrix, _batched("poses", poses, batch, (4, 4))),
+        grasps=None if grasps is None else _move_grasps(matrix, _batched("grasps", grasps, batch, (GRASP_WIDTH,))),
+        directions=None
+        if directions is None
+        else _move_directions(matrix, _batched("directions", directions, batch, (3,))),
+    )
+
+
+def _batched(name: str, values: Tensor, batch: int, tail: tuple[int, ...]) -> Tensor:
+    """Return (B, M, *tail) float64."""
+    if batch == 1 and values.ndim == len(tail) + 1:
+        values = values[None]
+    if values.ndim != len(tail) + 2 or tuple(values.shape[2:]) != tail or len(values) != batch:
+        wanted = ", ".join(map(str, (batch, "M", *tail)))
+        raise ShapeError(f"{name} must be ({wanted}) for a batch of {batch} clouds, got {tuple(values.shape)}")
+    return values.double()
+
+
+def _move_points(matrix: Tensor, points: Tensor) -> Tensor:
+    matrix = matrix.to(points.device)
+    return points @ matrix[:, :3, :3].mT + matrix[:, None, :3, 3]
+
+
+def _move_poses(matrix: Tensor, poses: Tensor) -> Tensor:
+    rigid.check_rigid("poses", poses)
+    return rigid.map_poses(matrix[:, None].to(poses.device), poses)
+
+
+def _move_directions(matrix: Tensor, directions: Tensor) -> Tensor:
+    linear = matrix[:, :3, :3].to(directions.device)
+    if bool((torch.linalg.det(linear) <= 0).any()):
+        raise PoseError("directions: the cloud was mirrored; an approach direction has no image under that")
+    return torch.nn.functional.normalize(directions @ linear.mT, dim=-1)
+
+
+def _move_grasps(matrix: Tensor, grasps: Tensor) -> Tensor:
+    """Move rotation and translation, and scale width, height and depth; score and object stay."""
+    poses = rigid.from_rotation_translation(grasps[..., 4:13].unflatten(-1, (3, 3)), grasps[..., 13:16])
+    moved = _move_poses(matrix, poses)
+    scale = torch.linalg.det(matrix[:, :3, :3]).abs().pow(1 / 3).to(grasps.device)[:, None, None]
+    return torch.cat(
+        [
+            grasps[..., :1],
+            grasps[..., 1:4] * scale,
+            moved[..., :3, :3].flatten(-2),
+            moved[..., :3, 3],
+            grasps[..., 16:],
+        ],
+        dim=-1,
+    )

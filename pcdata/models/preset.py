@@ -1,0 +1,170 @@
+"""preset: a model's contract as a pipeline and a collate function that end in the model's own tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+
+from pcdata.datasets import CaptureSource, CloudDataset
+from pcdata.errors import ConfigError, DTypeError
+from pcdata.models.batch import ModelBatch
+from pcdata.models.catalogue import contract as contract_named
+from pcdata.models.catalogue import missing_choices
+from pcdata.models.contract import ModelContract
+from pcdata.models.images import image_tensor
+from pcdata.models.steps import pipeline_of
+from pcdata.models.tensors import contract_tensor
+from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
+from pcdata.transforms import Compose, Pipeline
+from pcdata.transforms.config import pipeline_from_config
+from pcdata.yaml_nodes import yaml_text
+
+
+class Preset:
+    """A contract with its choices made, the pipeline that meets it, and :meth:`collate` for ``DataLoader``.
+
+    The pipeline is yours to change (``preset.pipeline``): put your own cleaning and augmentation into its sections;
+    :func:`pcdata.models.check` says whether the result still fits the model.
+    """
+
+    def __init__(
+        self, contract: ModelContract, choices: Mapping[str, Any], pipeline: Pipeline | Compose | None = None
+    ) -> None:
+        self.contract = contract
+        self.choices = dict(choices)
+        self.pipeline = pipeline_of(contract, merge_views=True) if pipeline is None else pipeline
+
+    def dataset(self, source: CaptureSource, *, seed: int = 0) -> CloudDataset:
+        """Run the pipeline on the captures of a source; :meth:`collate` makes the batches."""
+        return _PresetDataset(source, self.pipeline, seed=seed, gives=self._sample_type())
+
+    def collate(self, samples: Sequence[PointCloud | DepthFrame]) -> ModelBatch:
+        """Make a batch of the pipeline's results: the model's tensors, with all that leads back.
+
+        Raises:
+            ContractError: the clouds are in another frame or unit, or of another count than the model takes.
+        """
+        kind = self._sample_type()
+        if not isinstance(samples, (list, tuple)) or not samples:
+            raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got {type(samples).__name__}")
+        wrong = [type(sample).__name__ for sample in samples if not isinstance(sample, kind)]
+        if wrong:
+            raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got a {wrong[0]} in it")
+        from pcdata.models.check import require  # it builds batches of clouds by this module
+
+        batch = batch_of(samples, self.contract, self.choices)
+        require(batch, self.contract.name, cheap=True)
+        return batch
+
+    def _sample_type(self) -> type:
+        return DepthFrame if self.contract.takes == "depth image" else PointCloud
+
+    def to_yaml(self) -> str:
+        """Write model, choices and pipeline as YAML that :meth:`from_yaml` reads back."""
+        if isinstance(self.pipeline, Pipeline):
+            sections: Any = self.pipeline.to_config()
+        else:
+            sections = {"depth": self.pipeline.to_config_list()}
+        choices = {name: _plain(value) for name, value in self.choices.items()}
+        return yaml_text({"model": self.contract.name, "choices": choices, "pipeline": sections})
+
+    @classmethod
+    def from_yaml(cls, text: str) -> Preset:
+        """Build from YAML, with the pipeline as it is written there.
+
+        Raises:
+            ConfigError: not a preset, an unknown model or choice, or a pipeline that cannot be built.
+        """
+        try:
+            stored = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"preset: cannot read this YAML: {error}") from error
+        if not isinstance(stored, dict) or set(stored) != {"model", "choices", "pipeline"}:
+            raise ConfigError("preset: the YAML must have model, choices and pipeline, and only those")
+        choices = {name: _tuples(value) for name, value in (stored["choices"] or {}).items()}
+        made = preset(stored["model"], **choices)
+        if made.contract.takes == "depth image":
+            made.pipeline = pipeline_from_config(stored["pipeline"]["depth"])
+        else:
+            made.pipeline = Pipeline.from_config(stored["pipeline"])
+        return made
+
+    def __repr__(self) -> str:
+        choices = "".join(f", {name}={value!r}" for name, value in self.choices.items())
+        return f"preset({self.contract.name!r}{choices})"
+
+    def __str__(self) -> str:
+        return f"{self!r}: {self.contract.title}\n{self.to_yaml()}"
+
+
+def preset(name: str, **choices: Any) -> Preset:
+    """Return the pipeline and collate function of a model; what its contract leaves open must be given.
+
+    Args:
+        name: a name in :data:`pcdata.models.CONTRACTS`.
+        choices: such as ``frame``, ``crop``, ``num_points``, ``channels``; see the model's page.
+
+    Raises:
+        ConfigError: an unknown model or choice, or an open choice that was not made, with what to give.
+    """
+    contract = contract_named(name, **choices)
+    left = {choice for choice in contract.required_choices if choice not in choices}
+    if left:
+        raise ConfigError(f"preset({name!r}): the model leaves open what must be chosen: {missing_choices(contract)}")
+    return Preset(contract, choices)
+
+
+def batch_of(
+    samples: Sequence[PointCloud | DepthFrame], contract: ModelContract, choices: Mapping[str, Any]
+) -> ModelBatch:
+    """Make the contract's tensors of clouds or depth images, without judging them."""
+    channels = {tensor.key: tensor.channel_names for tensor in contract.tensors}
+    if contract.takes == "depth image":
+        frames = [sample for sample in samples if isinstance(sample, DepthFrame)]
+        return ModelBatch(
+            tensors={tensor.key: image_tensor(frames, contract, tensor) for tensor in contract.tensors},
+            model=contract.name,
+            choices=choices,
+            channels=channels,
+            frame_id=CAMERA_FRAME,
+            unit=METRE,
+            meta=[{"sample_id": frame.sample_id} for frame in frames],
+        )
+    parts = [sample for sample in samples if isinstance(sample, PointCloud)]
+    clouds = PointCloud.cat(parts).with_meta(
+        [{"sample": number} for number, part in enumerate(parts) for _ in range(part.num_clouds)]
+    )
+    if "category" in choices:
+        clouds = clouds.with_meta([{"category": choices["category"]}] * clouds.num_clouds)
+    return ModelBatch(
+        tensors={tensor.key: contract_tensor(clouds, contract, tensor) for tensor in contract.tensors},
+        model=contract.name,
+        choices=choices,
+        channels=channels,
+        frame_id=clouds.frame_id,
+        unit=clouds.unit,
+        counts=tuple(clouds.counts.tolist()),
+        steps=tuple(str(step.get("step", "")) for step in clouds.history[0]),
+        source_from_cloud=clouds.source_from_cloud,
+        source_frame=clouds.source_frame,
+        frames=clouds.frames,
+        meta=clouds.meta,
+    )
+
+
+class _PresetDataset(CloudDataset):
+    """A dataset whose samples are what the preset's pipeline gives."""
+
+    def __init__(self, source: CaptureSource, pipeline: Pipeline | Compose, *, seed: int, gives: type) -> None:
+        super().__init__(source, pipeline, seed=seed)
+        self.gives = gives
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

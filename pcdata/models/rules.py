@@ -1,0 +1,174 @@
+"""Rules that read what a batch declares and its shapes alone: cheap enough for every step of a training loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from pcdata.models.batch import ModelBatch
+from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.structures import METRE
+from pcdata.validation import Check, Verdict
+
+MIN_POINTS = 32  # fewer describe no surface, whatever the model
+
+
+def cheap_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
+    """Yield one check per rule."""
+    yield _layout(batch, contract)
+    yield _dtype(batch, contract)
+    yield _frame(batch, contract)
+    yield _unit(batch, contract)
+    yield _count(batch, contract)
+    yield _channels(batch, contract)
+
+
+def layout_fault(tensor: Tensor, spec: InputTensor, contract: ModelContract) -> str:
+    """Say what is wrong with the shape apart from the counts; "" = nothing."""
+    wanted = f"({', '.join(spec.axes)}) with C = {spec.width}" if "C" in spec.axes else f"({', '.join(spec.axes)})"
+    if tensor.ndim != len(spec.axes):
+        return f"{spec.key} has {tensor.ndim} axes {tuple(tensor.shape)}, not {wanted}"
+    for axis, size in zip(spec.axes, tensor.shape, strict=True):
+        if (axis == "C" and size != spec.width) or (axis.isdigit() and size != int(axis)):
+            turned = "; are the axes swapped?" if spec.width in tensor.shape else ""
+            return f"{spec.key} is {tuple(tensor.shape)}, not {wanted}{turned}"
+    return ""
+
+
+def verdict(name: str, fault: str, advice: str, *, found: str, unknown: bool = False) -> Check:
+    """Fail with the fault, or warn where nothing is known, or pass."""
+    if fault:
+        return Check(name=name, verdict=Verdict.WARN if unknown else Verdict.FAIL, found=fault, advice=advice)
+    return Check(name=name, verdict=Verdict.PASS, found=found)
+
+
+def _layout(batch: ModelBatch, contract: ModelContract) -> Check:
+    keys = [spec.key for spec in contract.tensors]
+    missing = [key for key in keys if key not in batch.tensors]
+    faults = [f"no tensor {key!r}; there are {sorted(batch.tensors)}" for key in missing]
+    faults += [layout_fault(batch[spec.key], spec, contract) for spec in contract.tensors if spec.key in batch.tensors]
+    layouts = ", ".join(f"{spec.key} ({', '.join(spec.axes)})" for spec in contract.tensors)
+    advice = f"the model takes {layouts}: transpose or rename, or let the preset's collate do it"
+    return verdict("layout", "; ".join(fault for fault in faults if fault), advice, found=layouts)
+
+
+def _dtype(batch: ModelBatch, contract: ModelContract) -> Check:
+    faults = []
+    for spec in contract.tensors:
+        if spec.key in batch.tensors:
+            dtype = str(batch[spec.key].dtype).removeprefix("torch.")
+            if dtype != spec.dtype:
+                faults.append(f"{spec.key} is {dtype}, not {spec.dtype}")
+    return verdict(
+        "dtype", "; ".join(faults), "convert with .to(dtype) before the model", found="as the model takes it"
+    )
+
+
+def _frame(batch: ModelBatch, contract: ModelContract) -> Check:
+    if not contract.frame:
+        return verdict(
+            "frame",
+            f"the model leaves the frame open; the data are in {batch.frame_id or 'an unknown frame'!r}",
+            "say which frame you train in: frame='base'",
+            found="",
+            unknown=True,
+        )
+    wanted = contract.frame_of_tensors()
+    if not batch.frame_id:
+        return verdict(
+            "frame",
+            "the frame is not known",
+            f"the model works in {wanted!r}: declare the frame",
+            found="",
+            unknown=True,
+        )
+    # Files that others wrote do not say whether they are centred: there the values decide, under normalisation.
+    whole = batch.steps is not None
+    ours, theirs = (batch.frame_id, wanted) if whole else (batch.frame_id.split("/")[0], wanted.split("/")[0])
+    fault = "" if ours == theirs else f"the data are in {batch.frame_id!r}, the model works in {wanted!r}"
+    steps = ["ToFrame(frame=...)"] if ours.split("/")[0] != theirs.split("/")[0] else []
+    steps += ["the preset's centring"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
+    return verdict(
+        "frame", fault, f"add {' and '.join(steps)}, or use the preset. {contract.wrong_frame}", found=batch.frame_id
+    )
+
+
+def _unit(batch: ModelBatch, contract: ModelContract) -> Check:
+    wanted = contract.unit_of_tensors()
+    if not batch.unit:
+        return verdict("unit", "the unit is not known", f"declare the unit, {wanted!r}", found="", unknown=True)
+    fault = "" if batch.unit == wanted else f"the data are in {batch.unit!r}, the model takes {wanted!r}"
+    advice = (
+        "remove the normalisation: the model's radii are in metres"
+        if wanted == METRE
+        else "add NormalizeUnitSphere where the preset has it"
+    )
+    return verdict("unit", fault, advice, found=batch.unit)
+
+
+def _count(batch: ModelBatch, contract: ModelContract) -> Check:
+    sizes = _sizes(batch, contract)
+    if contract.image_size is not None:
+        tensor, spec = batch.tensors.get(contract.main.key), contract.main
+        size = None
+        if tensor is not None and tensor.ndim == len(spec.axes):
+            size = (tensor.shape[spec.axes.index("H")], tensor.shape[spec.axes.index("W")])
+        fault = "" if size == contract.image_size else f"images of {size}, not (height, width) {contract.image_size}"
+        return verdict("count", fault, f"put ResizeDepth(size={contract.image_size}) last", found=str(size))
+    if not sizes:
+        return verdict("count", "the counts are not known", "give whole clouds", found="", unknown=True)
+    low, high = min(sizes), max(sizes)
+    found = f"{low}" if low == high else f"{low} to {high}"
+    if contract.count is not None and {low, high} == {contract.count}:
+        return verdict("count", "", "", found=found)
+    if contract.count is not None:
+        known = low == high and low in contract.counts
+        how = "FarthestPointSample" if contract.sampler == "farthest point" else "RandomSample"
+        return verdict(
+            "count",
+            f"{found} points per cloud, the model's default is {contract.count}"
+            if known
+            else f"{found} points per cloud, the model takes {contract.count}",
+            f"say num_points={low} if you mean it"
+            if known
+            else f"end with {how}(num_points={contract.count}, if_short={contract.pad!r})",
+            found=found,
+            unknown=known,
+        )
+    lowest, highest = contract.count_range or (MIN_POINTS, None)
+    fault = "" if lowest <= low and (highest is None or high <= highest) else f"{found} points per cloud"
+    wanted = f"at least {lowest}" if highest is None else f"{lowest} to {highest}"
+    return verdict("count", fault, f"the model takes {wanted}: check crop, voxel size and frame", found=found)
+
+
+def _sizes(batch: ModelBatch, contract: ModelContract) -> list[int]:
+    """The points per cloud, from the shapes and from what was declared."""
+    spec, sizes = contract.main, list(batch.counts or ())
+    tensor = batch.tensors.get(spec.key)
+    if tensor is None or tensor.ndim != len(spec.axes):
+        return sizes
+    if "N" in spec.axes:
+        sizes.append(tensor.shape[spec.axes.index("N")])
+    elif spec.axes[0] == "S" and not sizes:
+        sizes.append(len(tensor))
+    return sizes
+
+
+def _channels(batch: ModelBatch, contract: ModelContract) -> Check:
+    faults, unknown = [], []
+    for spec in contract.tensors:
+        if not spec.channels:
+            continue
+        declared = batch.channels.get(spec.key)
+        if declared is None:
+            unknown.append(spec.key)
+        elif tuple(declared) != spec.channel_names:
+            faults.append(f"{spec.key} has {', '.join(declared)}, not {', '.join(spec.channel_names)}")
+    wanted = "; ".join(f"{spec.key}: {', '.join(spec.channel_names)}" for spec in contract.tensors if spec.channels)
+    advice = f"put the channels in the model's order ({wanted})"
+    if faults or not unknown:
+        return verdict("channels", "; ".join(faults), advice, found=wanted)
+    return verdict(
+        "channels", f"the order of the channels of {', '.join(unknown)} is not known", advice, found="", unknown=True
+    )

@@ -1,0 +1,102 @@
+"""From a contract to the steps that meet it."""
+
+from __future__ import annotations
+
+from pcdata.models.catalogue import is_camera
+from pcdata.models.contract import ModelContract
+from pcdata.structures import CAMERA_FRAME
+from pcdata.transforms import (
+    Center,
+    Compose,
+    CropWorkspace,
+    Deproject,
+    EstimateNormals,
+    FarthestPointSample,
+    FillHoles,
+    MergeViews,
+    NormalizeUnitSphere,
+    Pipeline,
+    RandomColumn,
+    RandomSample,
+    RandomVoxelSample,
+    ResizeDepth,
+    ShiftToOrigin,
+    ToFrame,
+    Transform,
+    VoxelDownsample,
+    VoxelSample,
+)
+
+_HALF_TURN = ((-1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Pipeline | Compose:
+    """Build the pipeline: a Pipeline that ends in clouds, or a Compose of image steps that ends in images."""
+    if contract.takes == "depth image":
+        return Compose(_image_steps(contract))
+    depth: list[Transform] = [Deproject()]
+    if contract.image_size is not None:  # organised clouds
+        depth = [ResizeDepth(size=contract.image_size), Deproject()]
+    steps = _cloud_steps(contract, merge_views)
+    first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
+    return Pipeline(depth=depth, cloud=steps[:first], augment=steps[first:])
+
+
+def _image_steps(contract: ModelContract) -> list[Transform]:
+    assert contract.image_size is not None
+    return [FillHoles(rule="nearest"), ResizeDepth(size=contract.image_size)]
+
+
+def _cloud_steps(contract: ModelContract, merge_views: bool) -> list[Transform]:
+    steps: list[Transform] = []
+    if not is_camera(contract):
+        steps.append(ToFrame(frame=contract.frame))
+        if merge_views and contract.main.content != "organised":
+            steps.append(MergeViews())
+    if contract.main.content == "organised":  # a crop would be holes; the model keeps every pixel
+        return steps
+    crop = _crop(contract)
+    voxels = _voxels(contract)
+    shift = [ShiftToOrigin(anchor=contract.centring)] if contract.centring in ("corner", "floor") else []
+    if contract.crop_before_voxels:
+        steps += [*crop, *shift, *voxels]
+    else:
+        steps += [*voxels, *crop, *shift]
+    if any(channel.name == "normals" for tensor in contract.tensors for channel in tensor.channels):
+        steps.append(EstimateNormals())
+    if contract.half_turn:
+        steps.append(ToFrame(frame=f"{CAMERA_FRAME}_half_turn", start=CAMERA_FRAME, matrix=_HALF_TURN))
+    normalise, sample = _normalise(contract), _sample(contract)
+    if contract.normalise == "before sampling":
+        return [*steps, *normalise, *sample]
+    return [*steps, *sample, *normalise]
+
+
+def _crop(contract: ModelContract) -> list[Transform]:
+    if contract.crop is None:
+        return []
+    lower, upper = contract.crop
+    return [CropWorkspace(frame=contract.frame, lower=lower, upper=upper)]
+
+
+def _voxels(contract: ModelContract) -> list[Transform]:
+    if contract.voxel is None:
+        return []
+    rules = {"mean": VoxelDownsample, "first": VoxelSample, "random": RandomVoxelSample}
+    return [rules[contract.voxel_rule](voxel_size=contract.voxel)]
+
+
+def _sample(contract: ModelContract) -> list[Transform]:
+    column: list[Transform] = [] if contract.column is None else [RandomColumn(size=contract.column)]
+    if contract.count is None:
+        return column
+    if contract.sampler == "farthest point":
+        return [*column, FarthestPointSample(num_points=contract.count, if_short=contract.pad)]
+    replace = contract.sampler == "random with replacement"
+    return [*column, RandomSample(num_points=contract.count, if_short=contract.pad, with_replacement=replace)]
+
+
+def _normalise(contract: ModelContract) -> list[Transform]:
+    if contract.scaling == "unit sphere":
+        return [NormalizeUnitSphere()]
+    return [Center()] if contract.centring == "mean" else []

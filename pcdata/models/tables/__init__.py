@@ -1,0 +1,1 @@
+"""The contracts, one table per family."""

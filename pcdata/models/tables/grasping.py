@@ -1,0 +1,167 @@
+"""Grasp networks on point clouds: GraspNet baseline, GSNet, AnyGrasp, Contact-GraspNet, M2T2, GraspGen."""
+
+from dataclasses import replace
+
+from pcdata.models.contract import RGB_IMAGENET, RGB_UNIT, XYZ, Channel, InputTensor, ModelContract, Role
+
+_CELLS = Channel("xyz_cells", 3, Role.OTHER)  # in voxel edges
+_ONES = Channel("ones", 3, Role.OTHER, 1.0, 1.0)
+
+_UPSIDE_DOWN = (
+    "Nothing crashes. The network has only seen scenes from the camera's side, with z away from it: in the base frame "
+    "it looks at the scene from below the table, and proposes approaches through the table top."
+)
+_METRIC = (
+    "Ball radii are in metres: a cloud in millimetres or in the unit sphere gives neighbourhoods of nothing or all."
+)
+_TABLE = "The table stays: the network is trained with it, and finds no free space without it."
+
+GRASPNET_BASELINE = ModelContract(
+    name="graspnet_baseline",
+    title="GraspNet-1Billion baseline",
+    source="graspnet/graspnet-baseline 280c215: dataset/graspnet_dataset.py:23-25,76-144; demo.py:29-75; "
+    "models/backbone.py:30-64",
+    tensors=(InputTensor("point_clouds", "B N C", (XYZ,)),),
+    count=20000,
+    sampler="random",
+    pad="repeat",
+    guide='Guides say "20,000+ in the camera frame" and to remove the table. The code: exactly 20,000 (at most '
+    "50,000), xyz only; colour is loaded and never fed; the table is kept.",
+    traps=(
+        _TABLE,
+        _METRIC,
+        "remove_outlier=True is no outlier filter: it is the box around the true foreground, grown by 2 cm.",
+        "The rotation augmentation is about x, whatever its comment says, and x is mirrored with probability 0.5.",
+    ),
+    wrong_frame=_UPSIDE_DOWN,
+)
+
+GSNET = ModelContract(
+    name="gsnet",
+    title="GSNet (graspness)",
+    source="rhett-chen/graspness_implementation ff33da1: dataset/graspnet_dataset.py:139-142,237-246; train.py:28-30",
+    tensors=(
+        InputTensor("point_clouds", "B N C", (XYZ,)),
+        InputTensor("coors", "B N C", (_CELLS,)),
+        InputTensor("feats", "B N C", (_ONES,)),
+    ),
+    count=15000,
+    counts=(20000,),
+    sampler="random",
+    pad="repeat",
+    traps=(
+        _TABLE,
+        _METRIC,
+        "coors are xyz / 0.005 as floats: MinkowskiEngine's collate quantises them, per batch.",
+        "Colour is never used: the features are ones.",
+    ),
+    guide='The "15,000 points of AnyGrasp" in guides are GSNet\'s.',
+    wrong_frame=_UPSIDE_DOWN,
+)
+
+ANYGRASP = ModelContract(
+    name="anygrasp",
+    title="AnyGrasp SDK",
+    source="graspnet/anygrasp_sdk a86214a, c0d5732: grasp_detection/demo.py:37-81, grasp_tracking/demo.py:41-53 "
+    "(the library itself is closed)",
+    tensors=(InputTensor("points", "S C", (XYZ,)), InputTensor("colors", "S C", (replace(RGB_UNIT, optional=True),))),
+    crop=((-10.0, -10.0, 0.0), (10.0, 10.0, 1.0)),
+    max_duplicates=0.1,
+    guide='Guides say "15,000-30,000 points". The SDK takes the whole cropped cloud, without a count.',
+    traps=(
+        _TABLE,
+        "lims filters the grasps that come out, not the points that go in.",
+        "The gripper is at most 0.1 m wide.",
+        "get_grasp takes one cloud: use batches of one. Newer versions take no colours.",
+    ),
+    wrong_frame=_UPSIDE_DOWN,
+)
+
+CONTACT_GRASPNET = ModelContract(
+    name="contact_graspnet",
+    title="Contact-GraspNet, as the network sees it",
+    source="NVlabs/contact_graspnet 7217060: contact_graspnet/data.py:79-85,189-236; config.yaml:4-8,50-53; "
+    "contact_grasp_estimator.py:180,200-226,333-363",
+    tensors=(InputTensor("pointclouds_pl", "B N C", (XYZ,)),),
+    half_turn=True,
+    axes="x left, y up, z forward, from the mean of the sampled points",
+    count=20000,
+    sampler="random",
+    pad="repeat",
+    centring="mean",
+    crop=((-10.0, -10.0, 0.2), (10.0, 10.0, 1.8)),
+    guide='Guides say 20,000 points in the camera frame, and "intrinsics as a separate input". The intrinsics only '
+    "turn depth into points; the network never sees them.",
+    traps=(
+        _TABLE,
+        _METRIC,
+        "x and y are negated inside, then the mean of the sampled points is subtracted; both are undone on the grasps. "
+        "Feed the estimator contact_graspnet_api, the bare network this.",
+        "z is cropped to 0.2-1.8 m only on the depth path; a cloud given as such is not cropped.",
+    ),
+    wrong_frame=_UPSIDE_DOWN,
+)
+
+CONTACT_GRASPNET_API = ModelContract(
+    name="contact_graspnet_api",
+    title="Contact-GraspNet, as its estimator takes it",
+    source=CONTACT_GRASPNET.source,
+    tensors=(InputTensor("pc_full", "S C", (XYZ,)),),
+    crop=CONTACT_GRASPNET.crop,
+    max_duplicates=0.1,
+    traps=(
+        "The estimator samples, flips and centres by itself: points that were flipped before are flipped back.",
+        "The stock command line needs depth and K in its npz; with xyz alone it stops with an UnboundLocalError.",
+    ),
+    wrong_frame=_UPSIDE_DOWN,
+)
+
+M2T2 = ModelContract(
+    name="m2t2",
+    title="M2T2",
+    source="NVlabs/M2T2 be2e5f6: dataset.py:26-106,272-293; dataset_utils.py:47-71; config.yaml",
+    tensors=(
+        InputTensor("inputs", "B N C", (XYZ, RGB_IMAGENET)),
+        InputTensor("points", "B N C", (Channel("xyz_in_frame"),)),
+    ),
+    frame="",
+    axes="world or robot base, z up",
+    count=16384,
+    sampler="random",
+    pad="tile",
+    centring="mean",
+    normalise="before sampling",
+    traps=(
+        "The mean is that of the full cloud, before sampling; points stays uncentred.",
+        "The sampler repeats whole permutations of a short cloud.",
+        "The colours are part of inputs but unused: use_rgb is off.",
+        "A held object is 1024 more points in the end effector's frame; this preset makes the scene.",
+    ),
+    wrong_frame="Placements are searched for on horizontal surfaces: in the camera frame the table is a ramp.",
+)
+
+GRASPGEN = ModelContract(
+    name="graspgen",
+    title="GraspGen",
+    source="NVlabs/GraspGen a56d518: grasp_gen/grasp_server.py:186-237; utils/point_cloud_utils.py:26-88; "
+    "dataset.py:843-1119; models/generator.py:294-298",
+    tensors=(InputTensor("points", "B N C", (XYZ,)),),
+    frame="",
+    axes="any; grasps come back in it",
+    count=3500,
+    counts=(16384,),
+    sampler="random with replacement",
+    pad="repeat",
+    centring="mean",
+    table="removed",
+    max_duplicates=0.7,
+    traps=(
+        "One segmented object, not a scene: cut the object out first.",
+        "The mean is subtracted in metres; the network scales by its own factor: do not normalise to the unit sphere.",
+        "Its depth helper rounds fx, fy, cx, cy to whole pixels: deproject elsewhere.",
+    ),
+    wrong_frame="The object's pose is free, so the grasps are as good; but they come back in the frame that went in, "
+    "and a robot that takes them for base coordinates reaches beside the object.",
+)
+
+TABLE = (GRASPNET_BASELINE, GSNET, ANYGRASP, CONTACT_GRASPNET, CONTACT_GRASPNET_API, M2T2, GRASPGEN)

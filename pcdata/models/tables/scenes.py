@@ -1,0 +1,34 @@
+"""Scene understanding: Pointcept (Point Transformer V3)."""
+
+from dataclasses import replace
+
+from pcdata.models.contract import NORMALS, RGB_UNIT, XYZ, Channel, InputTensor, ModelContract, Role
+
+POINTCEPT = ModelContract(
+    name="pointcept",
+    title="Pointcept (Point Transformer V3, ScanNet configuration)",
+    source="Pointcept/Pointcept d74c646: pointcept/datasets/defaults.py:35-143; transform.py:143-185,840-865; "
+    "configs/scannet/semseg-pt-v3m1-0-base.py:96-163",
+    tensors=(
+        InputTensor("coord", "S C", (XYZ,)),
+        InputTensor("grid_coord", "S C", (Channel("cells", 3, Role.OTHER),), "int64", "grid_cells"),
+        InputTensor("feat", "S C", (RGB_UNIT, replace(NORMALS, optional=True))),
+        InputTensor("offset", "B", (), "int64", "offset"),
+    ),
+    frame="",
+    axes="z up; x and y from the middle of the scene's box, z from its floor",
+    voxel=0.02,
+    voxel_rule="random",
+    centring="floor",
+    normalise="before sampling",
+    max_duplicates=0.1,
+    traps=(
+        "Colours are stored 0-255 and divided by 255 in the loader: files with 0-1 are nearly black.",
+        "A random point of each voxel is kept, not the mean.",
+        "offset holds the ends of the clouds, so its last value is the number of points.",
+    ),
+    wrong_frame="z = 0 is no longer the floor, and the serialisation orders points along the wrong axes: the network "
+    "runs and labels badly.",
+)
+
+TABLE = (POINTCEPT,)

@@ -1,0 +1,283 @@
+"""Rules that read the values: ranges, scale, normalisation, crop, duplicates, the table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.planes import ransac_plane
+from pcdata.models.batch import ModelBatch
+from pcdata.models.catalogue import is_camera
+from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
+from pcdata.models.rules import layout_fault, verdict
+from pcdata.structures import METRE
+from pcdata.validation import Check
+from pcdata.validation.check import graded
+
+# The longest side of a cloud in metres. Below: a cloud in kilometres or a lone point; above: millimetres, where a cup
+# is 80 and a table 800.
+EXTENT = (0.005, 25.0)
+
+_STRAY = 0.01  # share of values that sensor noise may put outside a crop or behind the camera
+_TOLERANCE = 1e-3  # of a normalised coordinate
+_PLANE_SAMPLE = 2000  # points that the search for a table looks at
+_OBJECT_STEPS = {"RemovePlane", "ClusterObjects", "SplitObjects"}
+
+# Of colours by their extremes: the encodings that they can have, narrowest first.
+_ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.118, 2.6401), "rgb_255": (0.0, 255.0)}
+
+
+def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
+    """Yield one check per rule; tensors whose layout is wrong are left out."""
+    sound = [
+        spec
+        for spec in contract.tensors
+        if spec.key in batch.tensors and not layout_fault(batch[spec.key], spec, contract)
+    ]
+    yield _finite(batch)
+    if any(not bool(torch.isfinite(tensor).all()) for tensor in batch.values() if tensor.is_floating_point()):
+        return  # means and extremes of NaN would only repeat it
+    yield _ranges(batch, sound)
+    if contract.main not in sound:
+        return
+    if contract.takes == "depth image":
+        yield _image_scale(batch[contract.main.key], contract)
+        yield _image_normalisation(batch[contract.main.key], contract)
+        return
+    clouds = [cloud for cloud in positions(batch, contract) if len(cloud)]
+    if not clouds:
+        yield verdict("scale", "there are no points", "check crop and frame", found="")
+        return
+    yield _scale(clouds, contract)
+    yield _normalisation(clouds, contract)
+    if is_camera(contract) and not contract.half_turn and contract.centring == "none":
+        yield _in_front(clouds)
+    if contract.crop is not None and contract.centring == "none":
+        yield _crop(clouds, contract)
+    yield _duplicates(clouds, contract)
+    yield _table(batch, clouds, contract)
+
+
+def channel_values(tensor: Tensor, spec: InputTensor, channel: Channel) -> Tensor:
+    """(n, width): the values of one channel, all other axes flattened."""
+    start = 0
+    for other in spec.channels:
+        if other.name == channel.name:
+            break
+        start += other.width
+    rows = tensor.movedim(spec.axes.index("C"), -1).reshape(-1, spec.width)
+    return rows[:, start : start + channel.width]
+
+
+def positions(batch: ModelBatch, contract: ModelContract) -> list[Tensor]:
+    """The (n, 3) coordinates of every cloud, without rows and cells that only fill the tensor."""
+    spec, tensor = contract.main, batch[contract.main.key]
+    if spec.axes[0] == "S":
+        counts = batch.counts if batch.counts is not None and sum(batch.counts) == len(tensor) else (len(tensor),)
+        return [part[:, :3].float() for part in tensor.split(counts)]
+    clouds = []
+    for one in tensor.movedim(spec.axes.index("C"), -1).flatten(1, -2):
+        if spec.content == "voxel_grid":
+            one = one[one[:, -1] > 0]
+        elif spec.content == "organised" or contract.pad == "zeros":
+            one = one[(one[:, :3] != 0).any(dim=1)]
+        clouds.append(one[:, :3].float())
+    return clouds
+
+
+def _finite(batch: ModelBatch) -> Check:
+    faults = [
+        f"{key} has {count} values that are NaN or infinite"
+        for key, tensor in batch.items()
+        if tensor.is_floating_point() and (count := int((~torch.isfinite(tensor)).sum()))
+    ]
+    advice = "find the step that makes them (step_through); one NaN spoils the weights for good"
+    return verdict("finite", "; ".join(faults), advice, found="all values are finite")
+
+
+def _ranges(batch: ModelBatch, specs: list[InputTensor]) -> Check:
+    faults = [
+        fault
+        for spec in specs
+        for channel in spec.channels
+        if channel.low is not None
+        if (fault := _range_fault(channel_values(batch[spec.key], spec, channel), channel))
+    ]
+    return verdict("range", "; ".join(faults), "convert the channel, or use the preset's collate", found="as expected")
+
+
+def _range_fault(values: Tensor, channel: Channel) -> str:
+    if not len(values):
+        return ""
+    values = values.float()
+    assert channel.low is not None
+    assert channel.high is not None
+    lowest, highest = float(values.min()), float(values.max())
+    slack = _TOLERANCE * max(1.0, channel.high - channel.low)
+    said = f"{channel.name} is in [{lowest:.3g}, {highest:.3g}]"
+    if lowest < channel.low - slack or highest > channel.high + slack:
+        return f"{said}, the model takes [{channel.low:g}, {channel.high:g}]"
+    if channel.role is Role.COLOR and lowest < highest:
+        return _encoding_fault(values, channel, said)
+    if channel.role is Role.DIRECTION:
+        length = values.norm(dim=1)
+        share = float(((length - 1).abs() > 0.01)[length > 0].float().mean()) if bool((length > 0).any()) else 1.0
+        return f"{share:.0%} of {channel.name} are not of unit length" if share > _STRAY else ""
+    return ""
+
+
+def _encoding_fault(values: Tensor, channel: Channel, said: str) -> str:
+    """Find colours that fit another, narrower encoding: nobody's picture is that dark."""
+    if channel.name == "rgb_minus_mean":
+        return f"{channel.name} has the mean {float(values.mean()):.2g}, not 0" if abs(values.mean()) > 0.05 else ""
+    used = values[(values != 0).any(dim=1)]  # rows that only fill the tensor say nothing
+    lowest, highest = (float(used.min()), float(used.max())) if len(used) else (0.0, 0.0)
+    fitting = [name for name, (low, high) in _ENCODINGS.items() if low - 1e-3 <= lowest and highest <= high + 1e-3]
+    if channel.name in _ENCODINGS and fitting and fitting[0] == "rgb" and channel.name != "rgb" and highest > lowest:
+        return f"{said}: these look like colours in [0, 1], the model takes {channel.name}"
+    return ""
+
+
+def _scale(clouds: list[Tensor], contract: ModelContract) -> Check:
+    extents = [float((cloud.amax(0) - cloud.amin(0)).max()) for cloud in clouds]
+    low, high = min(extents), max(extents)
+    found = f"the clouds are {low:.3g} to {high:.3g} long"
+    if contract.unit_of_tensors() != METRE:
+        fault = found if high > 2 + _TOLERANCE or low < 0.1 else ""
+        return verdict("scale", fault, "normalise as the preset does: the longest side is at most 2", found=found)
+    fault = found if low < EXTENT[0] or high > EXTENT[1] else ""
+    hint = "millimetres? give the reader metres_per_unit=0.001" if high > EXTENT[1] else "a crop that leaves nothing?"
+    return verdict("scale", fault, f"the model works in metres: {hint}", found=f"{found}, in metres")
+
+
+def _normalisation(clouds: list[Tensor], contract: ModelContract) -> Check:
+    faults = [fault for cloud in clouds if (fault := _normalisation_fault(cloud, contract))]
+    rule = {"none": "not centred", "mean": "mean at the origin", "corner": "corner at the origin", "floor": "on z = 0"}
+    wanted = rule[contract.centring] + (", farthest point at 1" if contract.scaling != "none" else "")
+    if contract.centring != "none":
+        wanted += f", {contract.normalise}"
+    advice = f"the model takes clouds that are: {wanted}; follow the preset's order of steps"
+    return verdict("normalisation", faults[0] if faults else "", advice, found=wanted)
+
+
+def _normalisation_fault(cloud: Tensor, contract: ModelContract) -> str:
+    mean, lower, upper = cloud.double().mean(0), cloud.amin(0), cloud.amax(0)
+    extent = max(float((upper - lower).max()), 1e-12)
+    offset = float(mean.norm())
+    exact = contract.normalise == "after sampling"
+    if contract.scaling != "none":
+        radius = float(cloud.norm(dim=1).max())
+        good = abs(radius - 1) <= _TOLERANCE if exact else 0.5 <= radius <= 1 + _TOLERANCE
+        if not good or offset > (_TOLERANCE if exact else 0.25):
+            return f"mean at {offset:.3g} from the origin, farthest point at {radius:.3g}"
+        return ""
+    if contract.centring == "mean":
+        limit = _TOLERANCE * extent if exact else 0.1 * extent
+        return f"the mean is {offset:.3g} from the origin" if offset > limit else ""
+    if contract.centring in ("corner", "floor"):
+        # A sampled cloud may miss its lowest points, so only what lies below is sure to be wrong.
+        if float(lower[2]) < -_TOLERANCE:
+            return f"the lowest point is at z = {float(lower[2]):.3g}, not on the floor"
+        middle = (lower + upper)[:2].abs().max() / 2
+        if contract.centring == "floor" and float(middle) > 0.1 * extent + _TOLERANCE:
+            return f"the middle of the box is {float(middle):.3g} from the origin in x or y"
+        half = None if contract.column is None else contract.column / 2
+        if half is not None and float(cloud[:, :2].abs().max()) > half + _TOLERANCE:
+            return (
+                f"x and y reach {float(cloud[:, :2].abs().max()):.3g} from the column's centre, at most {half:g} fits"
+            )
+        return ""
+    return "the mean is at the origin: it was subtracted" if offset < 1e-5 * extent else ""
+
+
+def _in_front(clouds: list[Tensor]) -> Check:
+    behind = float((torch.cat(clouds)[:, 2] <= 0).float().mean())
+    fault = f"{behind:.1%} of the points have z <= 0, behind the camera" if behind > _STRAY else ""
+    advice = "the model takes camera coordinates, z forward: leave ToFrame out, or undo the change of axes"
+    return verdict("axes", fault, advice, found="all points lie before the camera")
+
+
+def _crop(clouds: list[Tensor], contract: ModelContract) -> Check:
+    assert contract.crop is not None
+    points = torch.cat(clouds)
+    lower, upper = points.new_tensor(contract.crop)
+    outside = float(((points < lower - _TOLERANCE) | (points > upper + _TOLERANCE)).any(dim=1).float().mean())
+    fault = f"{outside:.1%} of the points lie outside the crop {contract.crop}" if outside > _STRAY else ""
+    advice = f"add CropWorkspace(frame={contract.frame!r}, lower={contract.crop[0]}, upper={contract.crop[1]})"
+    return verdict("crop", fault, advice, found="all points lie inside")
+
+
+def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Check:
+    share = max(1.0 - len(torch.unique(cloud, dim=0)) / len(cloud) for cloud in clouds)
+    fault = f"{share:.0%} of the points are repeated" if share > contract.max_duplicates else ""
+    return verdict(
+        "duplicates",
+        fault,
+        f"at most {contract.max_duplicates:.0%} is usual: the clouds are too thin, widen the crop or use finer voxels",
+        found=f"{share:.0%} of the points are repeated",
+    )
+
+
+def _table(batch: ModelBatch, clouds: list[Tensor], contract: ModelContract) -> Check:
+    removed = None if batch.steps is None else bool(_OBJECT_STEPS & set(batch.steps))
+    if contract.table == "kept":
+        if removed:
+            return verdict("table", "the table was removed", "leave RemovePlane out: the model expects it", found="")
+        fault = ""
+        if removed is None and (share := _plane_share(clouds[0])) < 0.1:
+            fault = f"the largest plane holds {share:.0%} of the points: was the table removed?"
+        return verdict("table", fault, "the model is trained with the table in view", found="kept", unknown=True)
+    if contract.table == "removed":
+        fault = ""
+        if removed is False:
+            fault = "no step removed the table or cut objects out"
+        elif removed is None and (share := _plane_share(clouds[0])) > 0.5:
+            fault = f"one plane holds {share:.0%} of the points: is the table still there?"
+        return verdict("table", fault, "the model takes one object: cut it out first", found="removed", unknown=True)
+    return verdict("table", "", "", found="left to you")
+
+
+def _plane_share(cloud: Tensor) -> float:
+    """The share of points within 2 % of the cloud's extent of its largest plane."""
+    sample = cloud[:: max(1, len(cloud) // _PLANE_SAMPLE)].contiguous()
+    if len(sample) < 3:
+        return 0.0
+    extent = float((sample.amax(0) - sample.amin(0)).max())
+    _, inliers = ransac_plane(sample, None, distance=max(0.02 * extent, 1e-6), num_hypotheses=200)
+    return float(inliers.float().mean())
+
+
+def _image_scale(images: Tensor, contract: ModelContract) -> Check:
+    depth = channel_values(images, contract.main, contract.main.channels[0])
+    if contract.main.channels[0].name == "depth_relative":
+        clipped = float((depth.abs() >= 1).float().mean())
+        return graded(
+            "scale",
+            clipped,
+            threshold=0.2,
+            fails_at=0.6,
+            found=f"{clipped:.0%} of the image is clipped, 1 m from the mean depth",
+            advice="in millimetres? the clip takes metres; a far background? mask it before the holes are filled",
+        )
+    middle = float(depth.median())
+    fault = f"the median depth is {middle:.3g}" if not 0.05 <= middle <= 10 else ""
+    return verdict("scale", fault, "the model takes metres", found=f"the median depth is {middle:.3g} m")
+
+
+def _image_normalisation(images: Tensor, contract: ModelContract) -> Check:
+    channel = contract.main.channels[0]
+    depth = channel_values(images, contract.main, channel)
+    if channel.name == "depth_relative":
+        offset = float(depth.reshape(len(images), -1).mean(dim=1).abs().max())
+        return graded(
+            "normalisation",
+            offset,
+            threshold=0.1,
+            fails_at=0.5,
+            found=f"the mean of an image is at most {offset:.3g} from 0",
+            advice="subtract the image's mean, then clip to [-1, 1]; a far background shifts the mean",
+        )
+    fault = "there are depths of 0 or less" if float(depth.min()) <= 0 else ""
+    return verdict("normalisation", fault, "give plain metres: the network subtracts by itself", found="plain metres")

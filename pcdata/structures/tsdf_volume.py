@@ -1,0 +1,281 @@
+"""TSDFVolume: views go in one after another, one surface comes out."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import CaptureError, ConfigError, DeviceError, DTypeError, FrameError, VolumeTooLargeError
+from pcdata.functional import tsdf
+from pcdata.functional.depth import check_rays, pixel_rays
+from pcdata.functional.tsdf.views import UNIT_WEIGHT
+from pcdata.structures.confidence import Confidence
+from pcdata.structures.depth_frame import DepthFrame
+from pcdata.structures.fields import Kind
+from pcdata.structures.point_cloud import PointCloud
+from pcdata.structures.surface_mesh import SurfaceMesh
+
+_CAMERAS_KEPT = 8  # 5 MB each at 640x480
+_WEIGHTINGS = ("constant", "inverse_square", "angle")
+
+
+@dataclass(eq=False, kw_only=True)
+class TSDFVolume:
+    """A sparse truncated signed distance field that averages depth images into one surface.
+
+    The result depends on the frames and their order alone: not on threads, and up to rounding not on the order
+    either, unless ``carve`` is set.
+    """
+
+    voxel_size: float = 0.002  # metres
+    truncation: float | None = None  # metres on either side of a surface; None = 5 voxels
+    weighting: tsdf.Weighting = "constant"  # how much a reading counts; see functional.tsdf.weight_image
+    carve: bool = False  # readings behind a surface seen before wear it away; costs a pass over all blocks per view
+    min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
+    max_bytes: int = 4 << 30  # refuse to grow beyond
+    device: torch.device | str = "cpu"
+    backend: str = "auto"  # see pcdata.dispatch
+    frame_id: str | None = None  # the frame of the surface; None = that of the first frame
+    num_views: int = field(default=0, init=False)
+    blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
+    _kept_rays: dict[tuple[float, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.weighting not in _WEIGHTINGS:
+            raise ConfigError(f"TSDFVolume: weighting must be one of {_WEIGHTINGS}, got {self.weighting!r}")
+        if self.max_bytes < 1:
+            raise ConfigError(f"TSDFVolume: max_bytes must be at least 1, got {self.max_bytes}")
+        self.device = torch.device(self.device)
+        self.truncation = self.grid.truncation
+
+    @property
+    def grid(self) -> tsdf.VoxelGrid:
+        """The lengths, checked."""
+        return tsdf.VoxelGrid(self.voxel_size, 5 * self.voxel_size if self.truncation is None else self.truncation)
+
+    @property
+    def num_blocks(self) -> int:
+        """How many blocks of 8 x 8 x 8 voxels there are."""
+        return 0 if self.blocks is None else len(self.blocks)
+
+    @property
+    def num_bytes(self) -> int:
+        """The memory that the blocks take."""
+        return 0 if self.blocks is None else len(self.blocks) * self.blocks.planes.bytes_per_block
+
+    # -- in --------------------------------------------------------------------------------------------------------
+
+    def integrate(self, frame: DepthFrame) -> None:
+        """Average every view of a capture into the field.
+
+        The first frame decides whether the volume holds colours and labels, and the coordinate frame; those that follow
+        must agree. A frame that is refused leaves the volume as it was.
+
+        Raises:
+            FrameError: the frame has no poses, or they lead to another frame.
+            CaptureError: it has other images than the first one.
+            VolumeTooLargeError: the blocks it needs would exceed ``max_bytes``; nothing was allocated.
+            DeviceError: it is on another device.
+            UnitError: a reading lies 2^20 blocks or more from the origin.
+        """
+        views, touched = self._prepared(frame)
+        new = self._missing(touched)
+        self._check_room(frame, len(new))
+        if self.blocks is None:
+            self.frame_id = frame.frame_id
+            self.blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device)
+        self.blocks.add(new)
+        for view, keys in zip(views, touched, strict=True):
+            rows = torch.arange(len(self.blocks), device=frame.device) if self.carve else self.blocks.find(keys)
+            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve, backend=self.backend)
+        self.num_views += len(views)
+
+    def estimate_bytes(self, frame: DepthFrame) -> int:
+        """Return the memory that the blocks would take with this frame, without allocating any; exact.
+
+        Raises:
+            FrameError, CaptureError, DeviceError, UnitError: as :meth:`integrate`.
+        """
+        _, touched = self._prepared(frame)
+        return (self.num_blocks + len(self._missing(touched))) * self._planes_of(frame).bytes_per_block
+
+    def _prepared(self, frame: DepthFrame) -> tuple[list[tsdf.FusionView], list[Tensor]]:
+        self._check_frame(frame)
+        views = [self._view(frame, index) for index in range(frame.num_views)]
+        return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
+
+    def _missing(self, touched: list[Tensor]) -> Tensor:
+        keys = touched[0] if len(touched) == 1 else torch.cat(touched).unique()
+        return keys if self.blocks is None else self.blocks.missing(keys)
+
+    def _check_room(self, frame: DepthFrame, new: int) -> None:
+        per_block = self._planes_of(frame).bytes_per_block
+        needed = (self.num_blocks + new) * per_block
+        if needed > self.max_bytes:
+            raise VolumeTooLargeError(
+                f"TSDFVolume: {frame!r} needs {new} more blocks of {per_block} bytes at voxels of "
+                f"{self.voxel_size:g} m, {needed / 2**20:.1f} MiB in all, but max_bytes allows "
+                f"{self.max_bytes / 2**20:.1f} MiB; use larger voxels, mask depth outside the workspace (MaskDepth), "
+                "or allow more"
+            )
+
+    def _planes_of(self, frame: DepthFrame) -> tsdf.Planes:
+        counted = self.weighting != "constant" or self.carve
+        return tsdf.Planes(colors=frame.colors is not None, labels=frame.labels is not None, views=counted)
+
+    def _check_frame(self, frame: DepthFrame) -> None:
+        if not isinstance(frame, DepthFrame):
+            raise DTypeError(f"TSDFVolume.integrate takes a DepthFrame, got {type(frame).__name__}")
+        if frame.world_from_camera is None:
+            raise FrameError(
+                f"TSDFVolume: {frame!r} has no world_from_camera, so its views cannot be put together; give the "
+                "capture poses"
+            )
+        if self.frame_id is not None and frame.frame_id != self.frame_id:
+            raise FrameError(
+                f"TSDFVolume: the surface is in frame {self.frame_id!r} but the poses of {frame!r} lead to "
+                f"{frame.frame_id!r}; bring both to one frame"
+            )
+        if frame.device != self.device:
+            raise DeviceError(f"TSDFVolume: {frame!r} is on {frame.device}, the volume on {self.device}; move one")
+        if self.blocks is not None and self._planes_of(frame) != self.blocks.planes:
+            had, has = self.blocks.planes, self._planes_of(frame)
+            raise CaptureError(
+                f"TSDFVolume: every frame needs the images of the first, which had colours: {had.colors}, labels: "
+                f"{had.labels}; {frame!r} has colours: {has.colors}, labels: {has.labels}"
+            )
+        if frame.labels is not None and int(frame.labels.abs().max()) >= 2**31:
+            raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
+
+    def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
+        camera = frame.camera
+        k = camera.intrinsics[index]
+        lens = None if camera.distortion is None else camera.distortion[index]
+        rays = self._rays(k, lens, frame)
+        depth = frame.depth[index]
+        if self.min_confidence is not None and frame.confidence is not None:
+            depth = torch.where(frame.confidence[index] >= self.min_confidence, depth, 0.0)
+        if lens is not None:
+            check_rays("TSDFVolume", rays[None], (depth > 0)[None])
+        assert frame.world_from_camera is not None
+        return tsdf.FusionView(
+            depth=depth,
+            rays=rays,
+            pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
+            distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
+            world_from_camera=frame.world_from_camera[index],
+            weight=tsdf.weight_image(depth, rays, self.weighting),
+            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index]),
+            label=None if frame.labels is None else frame.labels[index].int(),
+        )
+
+    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
+        """Return the rays (H, W, 2) of a camera; those of a few cameras are kept: frames repeat them."""
+        coefficients = () if lens is None else tuple(lens.tolist())
+        known = (*k.flatten().tolist(), *coefficients, *frame.size)
+        if known not in self._kept_rays:
+            if len(self._kept_rays) >= _CAMERAS_KEPT:
+                self._kept_rays.pop(next(iter(self._kept_rays)))
+            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0]
+            self._kept_rays[known] = rays.to(frame.device)
+        return self._kept_rays[known]
+
+    # -- out -------------------------------------------------------------------------------------------------------
+
+    def extract_points(self, *, min_weight: float = 0.0) -> PointCloud:
+        """Return the points where the field crosses zero along the edges of its grid.
+
+        They carry normals out of the surface, colours and labels where the frames had them, and
+        ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less. The label is the one that
+        most views gave if more than half did. The history says what ``min_weight`` dropped.
+
+        Args:
+            min_weight: the least weight of both ends of an edge. 0 keeps whatever was seen, right for few views; with
+                constant weights, n asks for n views.
+
+        Raises:
+            ConfigError: nothing was integrated yet.
+        """
+        return self._cloud(*self._surface(min_weight), min_weight)
+
+    def extract_mesh(self, *, min_weight: float = 0.0) -> SurfaceMesh:
+        """Return the surface as triangles between the points of :meth:`extract_points`.
+
+        Only cubes with eight seen corners hold triangles, so single views give a surface with gaps at its rim.
+        Points that are in no triangle are left out.
+        """
+        found, dropped = self._surface(min_weight)
+        assert self.blocks is not None
+        triangles = tsdf.find_triangles(self.blocks, found, self._least_weight(min_weight))
+        used, renumbered = triangles.unique(return_inverse=True)
+        vertices = self._cloud(found.select(used), dropped, min_weight)
+        return SurfaceMesh(vertices=vertices, triangles=renumbered.reshape(-1, 3))
+
+    def _least_weight(self, min_weight: float) -> int:
+        if not (math.isfinite(min_weight) and min_weight >= 0):
+            raise ConfigError(f"TSDFVolume: min_weight must be finite and at least 0, got {min_weight}")
+        return max(1, math.ceil(min_weight * self._unit))
+
+    @property
+    def _unit(self) -> int:
+        return 1 if self.weighting == "constant" else UNIT_WEIGHT
+
+    def _surface(self, min_weight: float) -> tuple[tsdf.Crossings, int]:
+        if self.blocks is None:
+            raise ConfigError("TSDFVolume: nothing was integrated yet")
+        least = self._least_weight(min_weight)
+        found = tsdf.find_crossings(self.blocks, self.grid, backend=self.backend)
+        if least == 1:
+            return found, 0
+        kept = found.select(found.weight >= least)
+        return kept, len(found.edge) - len(kept.edge)
+
+    def _cloud(self, found: tsdf.Crossings, dropped: int, min_weight: float) -> PointCloud:
+        assert self.frame_id is not None
+        step: dict[str, Any] = {
+            "step": "TSDFVolume",
+            "voxel_size": self.voxel_size,
+            "truncation": self.truncation,
+            "weighting": self.weighting,
+            "carve": self.carve,
+            "views": self.num_views,
+            "min_weight": min_weight,
+            "dropped": dropped,
+            "points": len(found.edge),
+        }
+        return PointCloud(
+            points=found.points,
+            frame_id=self.frame_id,
+            normals=found.normals,
+            colors=found.colors,
+            labels=found.labels,
+            extra={"num_views": found.views.long(), "weight": found.weight.float() / self._unit},
+            kinds={"num_views": Kind.INVARIANT, "weight": Kind.INVARIANT},
+            frames={self.frame_id: torch.eye(4, dtype=torch.float64, device=found.points.device)[None]},
+            history=[[step]],
+        )
+
+    # -- to disk ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the volume as an uncompressed ``.npz`` file; it appears complete or not at all."""
+        from pcdata.structures.tsdf_file import save_volume
+
+        save_volume(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, max_bytes: int = 4 << 30, device: str = "cpu") -> TSDFVolume:
+        """Read what :meth:`save` wrote; sizes are checked before anything is allocated, nothing is unpickled.
+
+        Raises:
+            CacheError: the file is damaged or holds something else.
+            VolumeTooLargeError: it holds more than ``max_bytes``.
+        """
+        from pcdata.structures.tsdf_file import load_volume
+
+        return load_volume(path, max_bytes=max_bytes, device=device)

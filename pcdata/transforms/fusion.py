@@ -1,0 +1,69 @@
+"""From several depth images to one averaged surface: FuseTSDF."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Literal
+
+from pcdata.errors import ConfigError
+from pcdata.sensors import SensorProfile
+from pcdata.structures import DepthFrame, PointCloud, TSDFVolume
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.fields import ConfidenceName, Count, FromSensor, Metres, Name, NonNegative, confidence_named
+
+
+class FuseTSDF(Transform):
+    """Average the views of a capture into one surface and take its points, in the frame that the poses lead to.
+
+    Replaces Deproject, ToFrame and MergeViews where views overlap: noise is averaged, the overlap is there once, and
+    every point has a normal. One cloud comes out, with ``num_views`` and ``weight`` per point. Points that no pixel
+    gave have no ``source_index``. ``meta["fusion"]`` says how many ``min_weight`` dropped.
+    """
+
+    takes = DepthFrame
+    gives = PointCloud
+
+    frame: Name  # the frame that the capture's poses lead to; a capture with others is refused
+    voxel_size: Annotated[Metres, FromSensor(SensorProfile.voxel_size)] = 0.002
+    # On either side of the surface; None = 5 voxels. Three standard deviations of the noise should fit.
+    truncation: Metres | None = None
+    weighting: Literal["constant", "inverse_square", "angle"] = "constant"
+    carve: bool = False  # later views wear away what they see through
+    min_weight: NonNegative = 0.0  # of a point; with constant weights n asks for n views
+    min_confidence: ConfidenceName | None = None  # leave out readings that are less to be trusted
+    max_megabytes: Count = 4096  # refuse to take more memory
+
+    def frame_given(self) -> str:
+        """The frame that the poses lead to."""
+        return self.frame
+
+    def check_fields(self) -> None:
+        """Require a truncation that fits the voxels."""
+        try:
+            self._volume()
+        except ConfigError as error:
+            raise ConfigError(f"FuseTSDF: {error}") from error
+
+    def apply(self, data: DepthFrame, params: Params) -> PointCloud:
+        """Integrate all views and extract the points."""
+        volume = self._volume(str(data.device))
+        volume.integrate(data)
+        cloud = volume.extract_points(min_weight=self.min_weight)
+        provenance = {name: value for name, value in data.provenance.items() if name != "history"}
+        (facts,) = cloud.history[0]
+        fusion = {name: facts[name] for name in ("views", "min_weight", "dropped")}
+        meta = {"sample_id": data.sample_id, "capture_index": data.capture_index, "provenance": provenance}
+        return replace(cloud, meta=[{**meta, "fusion": fusion}], history=[tuple(data.provenance.get("history", ()))])
+
+    def _volume(self, device: str = "cpu") -> TSDFVolume:
+        level = None if self.min_confidence is None else confidence_named(self.min_confidence)
+        return TSDFVolume(
+            voxel_size=self.voxel_size,
+            truncation=self.truncation,
+            weighting=self.weighting,
+            carve=self.carve,
+            min_confidence=level,
+            max_bytes=self.max_megabytes << 20,
+            device=device,
+            frame_id=self.frame,
+        )

@@ -1,0 +1,295 @@
+"""Fusion of depth images: the grid, one voxel's average against arithmetic, both backends, and surfaces with truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pcdata.dispatch import why_unavailable
+from pcdata.errors import BackendError, ConfigError, UnitError
+from pcdata.functional import tsdf
+from pcdata.functional.tsdf.blocks import COLOR_SCALE, MAX_WEIGHT, TSDF_SCALE
+from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, pack_keys, unpack_keys
+from pcdata.functional.tsdf.marching import triangle_table
+from pcdata.rng import seeded
+from pcdata.structures import Camera, DepthFrame, TSDFVolume
+from pcdata.synthetic import tabletop
+
+needs_core = pytest.mark.skipif(why_unavailable("cpu") is not None, reason="the compiled core is not installed")
+CAMERA = Camera.pinhole(fx=40.0, fy=41.0, cx=15.6, cy=11.3, size=(24, 32))
+
+
+def frame_of(depth: Tensor, *, pose: Tensor | None = None, **images: Tensor) -> DepthFrame:
+    pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
+    return DepthFrame(depth=depth[None], camera=CAMERA, world_from_camera=pose[None], frame_id="world", **images)
+
+
+def wall(distance: float) -> Tensor:
+    return torch.full((24, 32), distance)
+
+
+def volume_of(*frames: DepthFrame, **options: object) -> TSDFVolume:
+    volume = TSDFVolume(**{"voxel_size": 0.01, **options})  # type: ignore[arg-type]
+    for frame in frames:
+        volume.integrate(frame)
+    return volume
+
+
+block = st.integers(-BLOCKS_PER_SIDE + 1, BLOCKS_PER_SIDE - 1)
+
+
+@given(st.lists(st.tuples(block, block, block), min_size=1, max_size=20))
+def test_keys_lead_back_to_their_blocks_and_sort_like_them(blocks):
+    keys = pack_keys(torch.tensor(blocks))
+    assert unpack_keys(keys).tolist() == [list(one) for one in blocks]
+    assert bool((keys >= 0).all())
+    assert unpack_keys(keys.sort().values).tolist() == [list(one) for one in sorted(blocks)]
+
+
+def test_a_block_out_of_reach_is_refused():
+    far = torch.eye(4, dtype=torch.float64)
+    far[0, 3] = 1e6
+    for backend in ("torch", "auto"):
+        with pytest.raises(UnitError, match=r"blocks from the origin, more than 2\^20"):
+            volume_of(frame_of(wall(0.5), pose=far), backend=backend)
+
+
+@pytest.mark.parametrize("truncation", [0.001, 1.0, math.nan])
+def test_a_truncation_that_does_not_fit_the_voxels_is_refused(truncation):
+    with pytest.raises(ConfigError, match="truncation must be 2 to 64 voxels"):
+        tsdf.VoxelGrid(0.01, truncation)
+
+
+def stored(volume: TSDFVolume, name: str, voxel: tuple[int, int, int]) -> int:
+    """The value at one voxel, by its place on the whole grid."""
+    place = torch.tensor([voxel])
+    row = volume.blocks.find(pack_keys(place.div(8, rounding_mode="floor")))
+    x, y, z = (place % 8)[0].tolist()
+    return int(volume.blocks.gather(name, row)[0, 64 * z + 8 * y + x])
+
+
+def test_a_voxel_holds_the_mean_distance_along_z():
+    depths = [0.5, 0.512, 0.493, 0.507]
+    volume = volume_of(*(frame_of(wall(depth)) for depth in depths))
+    mean = sum(min(depth - 0.49, 0.05) for depth in depths) / 4
+    assert stored(volume, "tsdf", (0, 0, 49)) / TSDF_SCALE * 0.05 == pytest.approx(mean, abs=2e-6)
+    assert stored(volume, "weight", (0, 0, 49)) == 4
+    assert stored(volume, "weight", (0, 0, 57)) == 0, "a voxel further behind than the truncation says nothing"
+
+
+def test_weights_are_those_of_the_formula():
+    by_depth = volume_of(frame_of(wall(0.5)), weighting="inverse_square")
+    assert stored(by_depth, "weight", (0, 0, 50)) == 64 * 4
+    assert stored(by_depth, "views", (0, 0, 50)) == 1
+    slanted = 1.0 / (1.0 - (torch.arange(32.0) - 15.6) / 40.0) * torch.ones(24, 1)  # the plane z = 1 + x
+    by_angle = volume_of(frame_of(slanted * 0.5), weighting="angle")
+    # Voxel (0, 0, 50) is seen along the optical axis, at 45 degrees to that plane; nearest pixel 16.
+    ray = torch.tensor([0.4 / 40, -0.3 / 41, 1.0]).double()
+    cosine = (ray / ray.norm()) @ torch.tensor([1.0, 0.0, -1.0]).double() / math.sqrt(2)
+    assert stored(by_angle, "weight", (0, 0, 50)) == pytest.approx(64 * abs(float(cosine)), abs=0.6)
+
+
+def test_many_views_stay_within_rounding_of_the_exact_mean():
+    """Stored distances and colours are integers, updated view by view; the mean in float64 is the truth."""
+    generator = seeded(0)
+    depth = 0.5 + 0.004 * torch.randn(200, generator=generator)
+    colors = torch.randint(40, 200, (200, 1, 24, 32, 3), generator=generator, dtype=torch.uint8)
+    volume = volume_of(*(frame_of(wall(float(d)), colors=c) for d, c in zip(depth, colors)))
+    exact = float((depth.double() - 0.5).mean())
+    assert stored(volume, "tsdf", (0, 0, 50)) / TSDF_SCALE * 0.05 == pytest.approx(exact, abs=2e-5)  # 1/500 voxel
+    packed = stored(volume, "color", (0, 0, 50))
+    for channel in range(3):
+        found = (packed >> 10 * channel & 1023) / COLOR_SCALE
+        assert found == pytest.approx(float(colors[:, 0, 11, 16, channel].double().mean()), abs=1.5)
+
+
+def test_a_colour_that_does_not_change_stays_exact():
+    colors = torch.randint(256, (1, 24, 32, 3), generator=seeded(1), dtype=torch.uint8)
+    volume = volume_of(*[frame_of(wall(0.5), colors=colors)] * 30)
+    packed = stored(volume, "color", (0, 0, 50))
+    assert [(packed >> 10 * c & 1023) / COLOR_SCALE for c in range(3)] == colors[0, 11, 16].tolist()
+
+
+def test_weights_stop_instead_of_overflowing():
+    near = frame_of(wall(0.2))
+    volume = volume_of(*[near] * 25, weighting="inverse_square")  # 25 * 64 / 0.04
+    assert stored(volume, "weight", (0, 0, 20)) == MAX_WEIGHT
+
+
+@pytest.mark.parametrize("views", [[3, 3, -1], [7, 3, 3, 7, 3], [-1, 5, -1]])
+def test_labels_are_those_that_most_views_gave(views):
+    frames = [frame_of(wall(0.5), labels=torch.full((1, 24, 32), label)) for label in views]
+    assert set(volume_of(*frames).extract_points().labels.tolist()) == {max(set(views), key=views.count)}
+
+
+def test_carving_wears_away_what_later_views_see_through():
+    frames = [frame_of(wall(0.5))] + [frame_of(wall(0.8))] * 30
+    kept, carved = volume_of(*frames), volume_of(*frames, carve=True)
+    assert bool((kept.extract_points().points[:, 2] < 0.55).any())
+    assert not bool((carved.extract_points().points[:, 2] < 0.55).any())
+    assert float((carved.extract_points().points[:, 2] - 0.8).abs().max()) < 1e-4
+    assert int(carved.extract_points().extra["num_views"].max()) == 30
+
+
+def test_readings_below_the_confidence_do_not_count():
+    confidence = torch.full((1, 24, 32), 3, dtype=torch.uint8)
+    confidence[:, :, 16:] = 1
+    frame = frame_of(wall(0.5), confidence=confidence)
+    edge = 0.5 * (15.5 - 15.6 + 0.5) / 40  # half a pixel past column 15, on the wall
+    assert float(volume_of(frame, min_confidence=2).extract_points().points[:, 0].max()) <= edge
+    assert float(volume_of(frame).extract_points().points[:, 0].max()) > edge + 0.1
+
+
+offsets = st.tuples(*[st.floats(-2000.0, 2000.0, allow_nan=False)] * 3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(offsets, st.integers(0, 3))
+def test_a_wall_is_found_wherever_it_stands(offset, turns):
+    """Block borders, negative coordinates, far origins: the surface is where the depth says, without a gap."""
+    pose = torch.eye(4, dtype=torch.float64)
+    quarter = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
+    pose[:3, :3] = torch.linalg.matrix_power(quarter, turns)
+    pose[:3, 3] = torch.tensor(offset, dtype=torch.float64)
+    mesh = volume_of(frame_of(wall(0.5), pose=pose), voxel_size=0.02).extract_mesh()
+    local = (mesh.vertices.points.double() - pose[:3, 3]) @ pose[:3, :3]
+    assert float((local[:, 2] - 0.5).abs().max()) < 1e-5 + 1e-6 * max(map(abs, offset))
+    corners = local[mesh.triangles]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).sum() / 2
+    seen = (0.5 * 32 / 40) * (0.5 * 24 / 41)
+    assert 0.75 * seen < float(area) < 1.02 * seen, "all but a rim of a voxel"
+
+
+def test_a_capture_without_readings_gives_an_empty_cloud():
+    cloud = volume_of(frame_of(wall(0.0))).extract_points()
+    assert cloud.num_points == 0
+    mesh = volume_of(frame_of(wall(0.0))).extract_mesh()
+    assert len(mesh.triangles) == 0
+
+
+LENS = torch.tensor([[0.1, -0.05, 0.001, -0.002, 0.01]], dtype=torch.float64)
+
+
+def scene_frames(lens: bool = False) -> list[DepthFrame]:
+    scene = tabletop(1, num_objects=3, num_views=2, size=(60, 80), noise="stereo", floor=False)
+    frames = [scene.frame, scene.render(1)]
+    if not lens:
+        return frames
+    return [dataclasses.replace(f, camera=dataclasses.replace(f.camera, distortion=LENS.repeat(2, 1))) for f in frames]
+
+
+KINDS = {
+    "constant": {},
+    "inverse_square": {"weighting": "inverse_square"},
+    "angle": {"weighting": "angle"},
+    "carving": {"carve": True},
+    "lens": {},
+}
+
+
+def assert_same_volume(a: TSDFVolume, b: TSDFVolume) -> None:
+    assert torch.equal(a.blocks.keys, b.blocks.keys)
+    for one, other in zip(a.blocks.chunks, b.blocks.chunks, strict=True):
+        for name, plane in one.tensors().items():
+            assert torch.equal(plane, other.tensors()[name]), name
+
+
+@needs_core
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_core_gives_what_the_reference_gives(kind):
+    frames = scene_frames(lens=kind == "lens")
+    reference, core = (volume_of(*frames, backend=name, **KINDS[kind]) for name in ("torch", "cpu"))
+    assert_same_volume(reference, core)
+    expected, found = reference.extract_points(), core.extract_points()
+    assert expected.num_points > 1000
+    for name, value in expected.fields().items():
+        if name == "normals":
+            torch.testing.assert_close(found.normals, value, rtol=0, atol=3e-7)  # the last bit of a square root
+        else:
+            assert torch.equal(value, found.fields()[name]), name
+
+
+@needs_core
+def test_threads_change_nothing():
+    before = torch.get_num_threads()
+    try:
+        volumes = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            volumes.append(volume_of(*scene_frames()))
+            volumes[-1].extract_points()
+        for other in volumes[1:]:
+            assert_same_volume(volumes[0], other)
+            found, expected = other.extract_points(), volumes[0].extract_points()
+            assert all(torch.equal(value, found.fields()[name]) for name, value in expected.fields().items())
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(BackendError, match="unknown backend 'gpu'"):
+        volume_of(frame_of(wall(0.5)), backend="gpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device to compare the CPU with")
+def test_cuda_agrees_with_the_cpu():
+    on_cpu, on_gpu = (TSDFVolume(voxel_size=0.01, backend="torch", device=device) for device in ("cpu", "cuda"))
+    for frame in scene_frames():
+        on_cpu.integrate(frame)
+        on_gpu.integrate(frame.to("cuda"))
+    assert torch.equal(on_cpu.blocks.keys, on_gpu.blocks.keys.cpu())
+    apart = on_gpu.extract_points().points.cpu() - on_cpu.extract_points().points
+    assert float(apart.abs().max()) < 1e-5
+
+
+def test_every_case_of_the_cube_gives_a_closed_surface():
+    """Within a cube, a cut edge lies on two faces; a line along a face is drawn once, in one direction."""
+    for inside, triangles in enumerate(triangle_table()):
+        used = {edge for triangle in triangles for edge in triangle}
+        cut = {(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1}
+        assert used == {(a, b) for a, b in cut if (inside >> a & 1) != (inside >> b & 1)}
+        sides = [(t[i], t[(i + 1) % 3]) for t in triangles for i in range(3)]
+        assert len(set(sides)) == len(sides)
+        outline = {side for side in sides if (side[1], side[0]) not in sides}
+        assert all(_common_faces(*side) for side in outline), "what is not shared by two triangles lies on a face"
+
+
+def _common_faces(one: tuple[int, int], other: tuple[int, int]) -> list[tuple[int, int]]:
+    corners = (*one, *other)
+    return [(axis, side) for axis in range(3) for side in (0, 1) if all(c >> axis & 1 == side for c in corners)]
+
+
+def test_a_mesh_between_seen_voxels_is_closed_and_faces_outwards():
+    """A ball written into the field by hand: every edge has two triangles, and the volume is the ball's."""
+    volume = volume_of(frame_of(wall(0.5)), voxel_size=0.05, truncation=0.25)
+    places = torch.cartesian_prod(*[torch.arange(-2, 2)] * 3)
+    volume.blocks = tsdf.VoxelBlocks(tsdf.Planes(), torch.device("cpu"))
+    volume.blocks.add(pack_keys(places).sort().values)
+    corner = unpack_keys(volume.blocks.keys) * 8
+    inner = torch.stack([torch.arange(512) % 8, torch.arange(512) // 8 % 8, torch.arange(512) // 64], dim=-1)
+    distance = ((corner[:, None] + inner) * 0.05).double().norm(dim=-1) - 0.41
+    chunk = volume.blocks.chunks[0]
+    chunk.tsdf[:64] = (distance / 0.25 * TSDF_SCALE).clamp(-TSDF_SCALE, TSDF_SCALE).round().short()
+    chunk.weight[:64] = 1
+    mesh = volume.extract_mesh()
+    a, b, c = mesh.vertices.points.double()[mesh.triangles].unbind(1)
+    assert float((a * torch.linalg.cross(b, c)).sum() / 6) == pytest.approx(4 / 3 * math.pi * 0.41**3, rel=0.03)
+    sides = torch.cat([mesh.triangles[:, [i, (i + 1) % 3]] for i in range(3)]).tolist()
+    assert sorted(map(tuple, sides)) == sorted((b, a) for a, b in sides)
+    assert float((mesh.vertices.points.norm(dim=1) - 0.41).abs().max()) < 2e-3
+    outwards = torch.nn.functional.normalize(mesh.vertices.points, dim=1)
+    assert float((outwards * mesh.vertices.normals).sum(1).min()) > 0.98
+
+
+def test_blocks_are_found_in_whatever_order_they_came():
+    blocks = tsdf.VoxelBlocks(tsdf.Planes(), torch.device("cpu"))
+    blocks.add(pack_keys(torch.tensor([[0, 0, 0], [1, 2, 3]])))
+    blocks.add(pack_keys(torch.tensor([[-1, 0, 0], [0, 5, 0]])))
+    wanted = pack_keys(torch.tensor([[1, 2, 3], [0, 5, 0], [4, 4, 4], [-1, 0, 0], [0, 0, 0]]))
+    assert blocks.find(wanted).tolist() == [1, 3, -1, 2, 0]

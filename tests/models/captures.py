@@ -1,0 +1,55 @@
+"""Correct batches of every contract, from synthetic captures through the presets themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import torch
+
+from pcdata.models import CONTRACTS, ModelBatch, Preset, preset
+from pcdata.rng import seeded
+from pcdata.structures import DepthFrame
+from pcdata.synthetic import BASE_FRAME, tabletop
+
+# What each open choice is answered with; the box holds the table of the synthetic world and what stands on it.
+ANSWERS: dict[str, Any] = {
+    "frame": BASE_FRAME,
+    "crop": ((-0.3, -0.3, -0.05), (0.3, 0.3, 0.6)),
+    "category": 3,
+}
+
+
+def answers(name: str) -> dict[str, Any]:
+    """The choices that a contract leaves open."""
+    return {choice: ANSWERS[choice] for choice in CONTRACTS[name].required_choices}
+
+
+@cache
+def capture() -> DepthFrame:
+    """One view of a table with objects, with colour."""
+    frame = tabletop(3, num_objects=4, num_views=1, size=(240, 320), sample_id="scene").frame
+    return frame
+
+
+def made_preset(name: str) -> Preset:
+    """The preset with every open choice answered."""
+    return preset(name, **answers(name))
+
+
+def sample_of(name: str, seed: int = 0) -> Any:
+    """The capture through the preset's pipeline."""
+    pipeline = made_preset(name).pipeline
+    return pipeline(capture(), generator=seeded(seed) if pipeline.is_random else None)
+
+
+@cache
+def correct_batch(name: str) -> ModelBatch:
+    """A batch of two samples by the preset alone."""
+    return made_preset(name).collate([sample_of(name, seed) for seed in (0, 1)])
+
+
+def with_tensor(batch: ModelBatch, key: str, value: torch.Tensor) -> ModelBatch:
+    """The batch with one tensor replaced."""
+    return replace(batch, tensors={**batch.tensors, key: value})

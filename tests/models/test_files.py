@@ -1,0 +1,197 @@
+"""Files that others wrote, and our own data sets, against a model."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import json
+import lzma
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from pcdata.build import build_dataset, config_from_yaml
+from pcdata.cli import main
+from pcdata.errors import CacheError, ConfigError, MissingExtraError
+from pcdata.exports.zarr_v2 import RowWriter
+from pcdata.io.zarr_arrays import zarr_arrays
+from pcdata.models import CONTRACTS, check_files, preset
+from pcdata.models.pages import contract_page, index_page
+from pcdata.synthetic import SyntheticSource
+from pcdata.validation import Verdict
+from tests.models.captures import correct_batch
+
+DOCS = Path(__file__).parents[2] / "docs" / "models"
+PACKERS = {
+    None: lambda content: content,
+    "zlib": zlib.compress,
+    "gzip": gzip.compress,
+    "bz2": bz2.compress,
+    "lzma": lzma.compress,
+}
+
+
+def write_zarr(folder: Path, array: np.ndarray, chunks: tuple[int, ...], packer: str | None = None, fill=0) -> None:
+    """Write one array as the zarr v2 specification says, edge chunks padded."""
+    folder.mkdir(parents=True)
+    header = {"zarr_format": 2, "shape": array.shape, "chunks": chunks, "dtype": array.dtype.str, "order": "C"}
+    header |= {"compressor": packer and {"id": packer}, "filters": None, "fill_value": fill}
+    (folder / ".zarray").write_text(json.dumps(header))
+    for position in np.ndindex(*[-(-size // chunk) for size, chunk in zip(array.shape, chunks)]):
+        block = np.full(chunks, fill, array.dtype)
+        part = array[tuple(slice(p * c, (p + 1) * c) for p, c in zip(position, chunks))]
+        block[tuple(slice(0, size) for size in part.shape)] = part
+        (folder / ".".join(map(str, position))).write_bytes(PACKERS[packer](block.tobytes()))
+
+
+@pytest.mark.parametrize("packer", PACKERS)
+def test_zarr_arrays_are_read_row_by_row_and_whole(tmp_path, packer):
+    array = np.random.default_rng(0).normal(size=(7, 5, 3)).astype(np.float32)
+    write_zarr(tmp_path / "data" / "point_cloud", array, (3, 4, 2), packer)
+    (stored,) = zarr_arrays(tmp_path).values()
+    assert np.array_equal(stored[...], array)
+    assert all(np.array_equal(stored[row], array[row]) for row in range(7))
+    assert list(zarr_arrays(tmp_path)) == ["data/point_cloud"]
+
+
+@pytest.mark.parametrize("compression", ["zlib", "none"])
+def test_what_our_exports_write_is_read_back(tmp_path, compression):
+    rows = np.random.default_rng(1).normal(size=(7, 4, 6)).astype(np.float32)
+    writer = RowWriter(tmp_path / "a", rows.shape, "<f4", chunk_rows=3, compression=compression)
+    for row in rows:
+        writer.add(row)
+    assert np.array_equal(zarr_arrays(tmp_path)["a"][...], rows)
+
+
+def test_a_zarr_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
+    array = np.arange(12.0).reshape(4, 3)
+    write_zarr(tmp_path / "a", array, (2, 3), fill=-1.0)
+    (tmp_path / "a" / "1.0").unlink()
+    assert zarr_arrays(tmp_path)["a"][...].tolist() == [[0, 1, 2], [3, 4, 5], [-1] * 3, [-1] * 3]
+
+
+def test_faulty_zarr_directories_are_refused(tmp_path):
+    with pytest.raises(CacheError, match="no zarr v2 array"):
+        zarr_arrays(tmp_path)
+    write_zarr(tmp_path / "a", np.zeros((4, 3)), (2, 3), "zlib")
+    (tmp_path / "a" / "0.0").write_bytes(b"no zlib")
+    with pytest.raises(CacheError, match="this chunk cannot be read"):
+        zarr_arrays(tmp_path)["a"][0]
+    header = json.loads((tmp_path / "a" / ".zarray").read_text())
+    (tmp_path / "a" / ".zarray").write_text(json.dumps({**header, "compressor": {"id": "blosc"}}))
+    try:
+        import numcodecs  # noqa: F401
+    except ImportError:
+        with pytest.raises(MissingExtraError, match="Blosc"):
+            zarr_arrays(tmp_path)["a"][0]
+    (tmp_path / "zarr.json").write_text("{}")
+    with pytest.raises(CacheError, match="zarr v3"):
+        zarr_arrays(tmp_path)
+
+
+def test_a_dp3_zarr_passes_and_one_in_millimetres_fails(tmp_path):
+    cloud = correct_batch("dp3_real")["point_cloud"].numpy()
+    write_zarr(tmp_path / "good" / "data" / "point_cloud", cloud, (100, 1024, 6))
+    cloud = cloud.copy()
+    cloud[..., :3] *= 1000
+    write_zarr(tmp_path / "bad" / "data" / "point_cloud", cloud, (100, 1024, 6), "zlib")
+    keys = {"point_cloud": "data/point_cloud"}
+    good = check_files(tmp_path / "good", "dp3_real", keys, frame_id="base", unit="m", frame="base")
+    assert good.verdict is Verdict.WARN  # the order of the channels is not known
+    assert sum(good.samples.values()) == 2
+    bad = check_files(tmp_path / "bad", "dp3_real", keys, frame_id="base", unit="m", frame="base")
+    assert {name for (name, _), entry in bad.checks.items() if entry.counts[Verdict.FAIL]} == {"scale"}
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5"])
+def test_points_and_colours_by_role_are_joined_in_the_models_order(tmp_path, kind):
+    cloud = correct_batch("dp3_real")["point_cloud"].numpy()
+    path = tmp_path / f"clouds.{kind}"
+    if kind == "npz":
+        np.savez(path, xyz=cloud[..., :3], rgb=cloud[..., 3:])
+    else:
+        with h5py.File(path, "w") as file:
+            file["xyz"], file["rgb"] = cloud[..., :3], cloud[..., 3:]
+    given = {"frame_id": "base", "unit": "m", "frame": "base", "limit": 1}
+    joined = check_files(path, "dp3_real", {"colors": "rgb", "points": "xyz"}, **given)
+    assert joined.verdict is Verdict.PASS
+    alone = check_files(path, "dp3_real", {"points": "xyz"}, **given)
+    assert {name for (name, _), entry in alone.checks.items() if entry.counts[Verdict.FAIL]} == {"layout", "channels"}
+
+
+def test_channels_first_models_take_the_rows_that_files_hold(tmp_path):
+    points = correct_batch("pointnet2_cls")["points"].numpy().transpose(0, 2, 1)
+    path = tmp_path / "clouds.npz"
+    np.savez(path, p=points[..., :3], n=points[..., 3:])
+    keys = {"points": "p", "normals": "n"}
+    summary = check_files(path, "pointnet2_cls", keys, frame_id="base", unit="normalized", frame="base")
+    assert not summary.samples[Verdict.FAIL]
+
+
+def test_keys_and_arrays_that_do_not_exist_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, xyz=np.zeros((10, 3), np.float32))
+    with pytest.raises(CacheError, match="no array 'xyzz'"):
+        check_files(path, "graspnet_baseline", {"points": "xyzz"})
+    with pytest.raises(ConfigError, match="no key 'point'"):
+        check_files(path, "graspnet_baseline", {"point": "xyz"})
+    with pytest.raises(ConfigError, match="--keys points=NAME"):
+        check_files(path, "graspnet_baseline", {})
+    (tmp_path / "b.npz").write_bytes(b"PK nothing")
+    with pytest.raises(CacheError, match="cannot be read"):
+        check_files(tmp_path / "b.npz", "graspnet_baseline", {"points": "xyz"})
+
+
+def test_the_command_judges_foreign_files(tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    cloud = correct_batch("graspnet_baseline")["point_clouds"].numpy()
+    np.savez(path, xyz=cloud)
+    given = ["check", str(path), "--model", "graspnet_baseline", "--keys", "points=xyz", "--unit", "m"]
+    assert main([*given, "--frame", "camera", "--json", str(tmp_path / "out.json")]) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["verdict"] == "pass"
+    assert main([*given, "--frame", "base"]) == 1
+    assert "the model works in 'camera'" in capsys.readouterr().out
+    assert main([*given[:-4], "--keys", "xyz"]) == 2
+
+
+def test_the_command_judges_a_built_data_set(tmp_path, capsys):
+    made = preset("dp3_sim", frame="base", crop=((-0.3, -0.3, -0.05), (0.3, 0.3, 0.6)))
+    source = SyntheticSource(num_scenes=2, size=(120, 160))
+    build_dataset(config_from_yaml(made.pipeline.to_yaml()), source, tmp_path / "out")
+    assert main(["check", str(tmp_path / "out"), "--model", "dp3_sim", "--frame", "base"]) == 0
+    assert main(["check", str(tmp_path / "out"), "--model", "graspnet_baseline"]) == 1
+    out = capsys.readouterr().out
+    assert "20000" in out
+    assert "FAIL" in out
+
+
+def test_the_models_are_listed_and_shown(capsys):
+    assert main(["models"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in CONTRACTS)
+    assert main(["models", "rise"]) == 0
+    assert "towards zero" in capsys.readouterr().out
+    assert main(["models", "rize"]) == 2
+
+
+@pytest.mark.parametrize("name", CONTRACTS)
+def test_the_page_of_a_model_says_what_its_contract_says(name):
+    assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == contract_page(CONTRACTS[name])
+
+
+def test_there_is_a_page_for_every_model_and_no_other():
+    assert (DOCS / "README.md").read_text(encoding="utf-8") == index_page()
+    pages = {path.stem for path in DOCS.glob("*.md")} - {"README", "wrong_frame"}
+    assert pages == set(CONTRACTS)
+
+
+def test_the_page_on_wrong_frames_quotes_what_was_measured():
+    page = (DOCS / "wrong_frame.md").read_text(encoding="utf-8")
+    measured = json.loads((DOCS.parents[1] / "benchmarks" / "results" / "train_pointnet.json").read_text())
+    for name, row in measured["trainings"].items():
+        assert f"| {name} | {row['accuracy'][-1]:.0%} |".replace("%", " %") in page
+        assert row["refused"] in page
+    assert not measured["trainings"]["base, metres"]["refused"]

@@ -1,0 +1,215 @@
+"""preset: open choices must be made; the result is exactly the contract's tensors; YAML keeps it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from pcdata.errors import ConfigError, ContractError, DTypeError, NoReadingError
+from pcdata.models import CONTRACTS, Preset, contract, preset
+from pcdata.models.steps import pipeline_of
+from pcdata.rng import seeded
+from pcdata.structures import NORMALIZED, PointCloud
+from pcdata.synthetic import SyntheticSource
+from pcdata.transforms import Pipeline, RandomSample
+from tests.models.captures import answers, capture, correct_batch, made_preset, sample_of
+
+each_contract = pytest.mark.parametrize("name", CONTRACTS)
+
+
+@each_contract
+def test_a_preset_ends_in_exactly_the_tensors_of_its_contract(name):
+    batch, made = correct_batch(name), contract(name, **answers(name))
+    assert list(batch) == [spec.key for spec in made.tensors]
+    for spec in made.tensors:
+        tensor = batch[spec.key]
+        assert str(tensor.dtype) == f"torch.{spec.dtype}"
+        sizes = dict(zip(spec.axes, tensor.shape, strict=True))
+        assert sizes.get("B", 2) == 2
+        assert sizes.get("C", spec.width) == spec.width
+        assert sizes.get("N", made.count) == made.count
+        assert sizes.get("S", sum(batch.counts or [0])) == sum(batch.counts or [0])
+        if "H" in sizes:
+            assert (sizes["H"], sizes["W"]) == made.image_size
+        assert tensor.is_contiguous()
+    assert batch.frame_id == made.frame_of_tensors()
+    assert batch.unit == made.unit_of_tensors()
+
+
+@each_contract
+def test_the_pipeline_leads_to_the_frame_that_the_contract_names(name):
+    made = contract(name, **answers(name))
+    pipeline = pipeline_of(made, merge_views=True)
+    if isinstance(pipeline, Pipeline):
+        steps = pipeline._from_depth
+        assert (steps.frame_after("camera"), steps.unit_given() or "m") == (
+            made.frame_of_tensors(),
+            made.unit_of_tensors(),
+        )
+
+
+@each_contract
+def test_yaml_gives_an_equal_preset_back(name):
+    made = made_preset(name)
+    again = Preset.from_yaml(made.to_yaml())
+    assert again.to_yaml() == made.to_yaml()
+    assert again.contract == made.contract
+    first, second = made.collate([sample_of(name)]), again.collate([sample_of(name)])
+    assert all(torch.equal(first[key], second[key]) for key in first)
+    assert name in str(made)
+
+
+@each_contract
+def test_choices_left_open_are_asked_for_and_never_guessed(name):
+    for choice in CONTRACTS[name].required_choices:
+        given = {key: value for key, value in answers(name).items() if key != choice}
+        with pytest.raises(ConfigError, match=f"{choice}: "):
+            preset(name, **given)
+
+
+def test_crop_none_is_a_choice_and_means_no_crop():
+    steps = [type(step).__name__ for step in preset("dp3_sim", frame="base", crop=None).pipeline.cloud]
+    assert "CropWorkspace" not in steps
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"frame": "base"}, "works in the frame 'camera'"),
+        ({"num_points": 1000}, "one of"),
+        ({"speed": 3}, "no choice 'speed'"),
+    ],
+)
+def test_choices_that_the_code_does_not_allow_are_refused(choices, message):
+    with pytest.raises(ConfigError, match=message):
+        preset("gsnet", **choices)
+
+
+def test_the_counts_that_the_code_is_used_with_can_be_chosen():
+    made = preset("dp3_sim", frame="base", crop=None, num_points=1024)
+    assert made.collate([made.pipeline(capture())])["point_cloud"].shape == (1, 1024, 6)
+
+
+def test_optional_channels_can_be_left_out_but_others_cannot():
+    made = preset("pointnet2_cls", frame="base", channels=["xyz"])
+    assert made.collate([made.pipeline(capture())])["points"].shape == (1, 3, 1024)
+    assert preset("dp3_sim", frame="base", crop=None, channels=["rgb_255"]).contract.main.width == 6
+    with pytest.raises(ConfigError, match="channels are"):
+        preset("dp3_sim", frame="base", crop=None, channels=["xyz", "heat"])
+
+
+def test_colours_are_scaled_as_each_model_takes_them():
+    def middle(name: str, key: str) -> tuple[float, float]:
+        values = correct_batch(name)[key][..., 3:6]
+        return float(values.min()), float(values.max())
+
+    low, high = middle("dp3_real", "point_cloud")
+    assert low >= 0
+    assert 1 < high <= 255
+    assert middle("m2t2", "inputs")[0] < 0
+    signed = correct_batch("peract")["voxel_grid"]
+    assert -1 <= float(signed[:, 3:6].min()) < 0
+
+
+def test_contact_graspnet_sees_x_and_y_negated_and_the_mean_of_its_own_points_removed():
+    cloud = sample_of("contact_graspnet")
+    in_camera = cloud.in_source_frame().points
+    wanted = in_camera * torch.tensor([-1.0, -1.0, 1.0])
+    wanted = wanted - wanted.double().mean(0).float()
+    assert torch.allclose(cloud.points, wanted, atol=1e-5)
+    assert cloud.source_frame == "camera"
+
+
+def test_m2t2_centres_by_the_full_cloud_and_keeps_points_where_they_are():
+    batch = correct_batch("m2t2")
+    shift = batch["points"] - batch["inputs"][..., :3]
+    assert torch.allclose(shift, shift[:, :1].expand_as(shift), atol=1e-5)
+    own_mean = batch["points"].mean(dim=1)
+    assert float((shift[:, 0] - own_mean).abs().max()) > 1e-6  # the mean is not that of the sample
+
+
+def test_rise_cuts_cells_towards_zero():
+    batch = correct_batch("rise")
+    xyz = batch["input_feats_list"][:, :3].numpy()
+    assert np.array_equal(batch["input_coords_list"][:, 1:].numpy(), np.trunc(xyz / np.float32(0.005)).astype(np.int32))
+    assert batch["input_coords_list"][:, 0].tolist() == [b for b, n in enumerate(batch.counts) for _ in range(n)]
+
+
+def test_pointcept_cells_are_unique_and_start_at_zero():
+    batch = correct_batch("pointcept")
+    start = 0
+    for stop in batch["offset"].tolist():
+        cells = batch["grid_coord"][start:stop]
+        assert cells.amin(dim=0).tolist() == [0, 0, 0]
+        assert len(torch.unique(cells, dim=0)) == len(cells)
+        start = stop
+    assert start == len(batch["coord"])
+
+
+def test_peract_cells_hold_the_mean_of_the_points_inside():
+    cloud = sample_of("peract")
+    grid = made_preset("peract").collate([cloud])["voxel_grid"][0]
+    lower, upper = torch.tensor(answers("peract")["crop"])
+    cell = ((cloud.points - lower) / (upper - lower) * 100).floor().long().clamp(0, 99)
+    x, y, z = cell[len(cell) // 2].tolist()
+    inside = (cell == cell[len(cell) // 2]).all(dim=1)
+    assert torch.allclose(grid[:3, x, y, z], cloud.points[inside].mean(0), atol=1e-5)
+    assert grid[6:9, x, y, z].tolist() == pytest.approx([x / 100, y / 100, z / 100])
+    assert int(grid[9].sum()) == len(torch.unique(cell, dim=0))
+
+
+def test_organised_maps_put_every_point_back_at_its_pixel():
+    cloud = sample_of("3d_diffuser_actor")
+    images = made_preset("3d_diffuser_actor").collate([cloud])["pcd_obs"]
+    pixel = int(cloud.source_index[1234])
+    assert torch.equal(images[0, 0, :, pixel // 256, pixel % 256], cloud.points[1234])
+
+
+def test_unit_sphere_before_and_after_sampling_are_different_orders():
+    after = correct_batch("pointnet_cls")["pointclouds_pl"]
+    assert torch.allclose(after.norm(dim=-1).amax(dim=1), torch.ones(2), atol=1e-5)
+    steps = [
+        type(step).__name__
+        for part in ("cloud", "augment")
+        for step in getattr(made_preset("pointnet_part").pipeline, part)
+    ]
+    assert steps.index("NormalizeUnitSphere") < steps.index("RandomSample")
+    assert correct_batch("pointnet_part").unit == NORMALIZED
+
+
+def test_depth_images_with_holes_are_refused():
+    made = preset("ggcnn")
+    frame = made.pipeline(capture())
+    frame.depth[0, :5] = 0
+    with pytest.raises(NoReadingError, match="holes"):
+        made.collate([frame])
+
+
+def test_collate_refuses_clouds_of_another_frame_or_count():
+    made = preset("graspnet_baseline")
+    cloud = sample_of("graspnet_baseline")
+    with pytest.raises(ContractError, match="frame: the data are in 'elsewhere'"):
+        made.collate([PointCloud(points=cloud.points, frame_id="elsewhere")])
+    with pytest.raises(ContractError, match="count"):
+        made.collate([RandomSample(num_points=100)(cloud, generator=seeded(0))])
+    with pytest.raises(DTypeError, match="list of PointCloud"):
+        made.collate(cloud)
+
+
+@pytest.mark.parametrize("name", ["graspnet_baseline", "ggcnn"])
+def test_presets_feed_a_data_loader(name):
+    source = SyntheticSource(num_scenes=2, size=(240, 320), num_objects=2)
+    made = preset(name)
+    (batch,) = DataLoader(made.dataset(source), batch_size=2, collate_fn=made.collate)
+    assert len(batch[made.contract.main.key]) == 2
+
+
+def test_a_batch_moves_as_a_whole_and_opens_like_a_dict():
+    batch = correct_batch("graspnet_baseline")
+    moved = batch.to("meta")
+    assert moved["point_clouds"].device.type == moved.source_from_cloud.device.type == "meta"
+    assert dict(batch).keys() == dict(batch.items()).keys() == {"point_clouds"}
+    assert "point_clouds" in batch
+    assert len(batch) == len(batch.values()) == 1
