@@ -36,9 +36,11 @@ def read_samples(
     for name in keys:
         if name not in known:
             raise ConfigError(f"{contract.name}: no key {name!r}{near_matches(name, known)}; it has {', '.join(known)}")
-    if not keys:
-        raise ConfigError(f"{contract.name}: say which array is what: --keys points=NAME,colors=NAME; or {known}")
     arrays = _open_arrays(Path(path))
+    if not keys:
+        raise ConfigError(
+            f"{contract.name}: say which array is what, as in --keys points=NAME; the keys are {', '.join(known)}"
+        )
     chosen = {name: _array(arrays, path, stored) for name, stored in keys.items()}
     main = next(iter(chosen.values()))
     by_role = bool(set(keys) & set(ROLES))
