@@ -23,22 +23,12 @@ _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order
 def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     """Collect keys in one hash table per thread; sorted, they do not depend on the threads."""
     height, width = view.depth.shape
-    offsets = torch.tensor(grid.band, dtype=torch.float64)
+    offsets = integrate.band(grid)
     found = torch.empty(height * width * len(offsets), dtype=torch.int64)  # what is not written never becomes memory
     count = torch.empty(1, dtype=torch.int64)
-    call(
-        "pc_tsdf_touched",
-        view.depth.contiguous(),
-        view.rays.contiguous(),
-        height,
-        width,
-        view.world_from_camera[:3].contiguous(),
-        offsets,
-        len(offsets),
-        1.0 / grid.block_size,
-        found,
-        count,
-    )
+    turn, fraction, camera = integrate.camera_in_blocks(view, grid)
+    images = (view.depth.contiguous(), view.rays.contiguous(), height, width)
+    call("pc_tsdf_touched", *images, turn, fraction, camera, offsets, len(offsets), found, count)
     if count < 0:
         return integrate.touched_blocks(view, grid)  # knows what to say
     return torch.from_numpy(found[: int(count)].numpy().copy())
@@ -58,7 +48,7 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
         *images,
         height,
         width,
-        view.camera_from_world[:3].contiguous(),
+        integrate.image_from_world(view).contiguous(),
         grid.block_size,
         integrate.voxel_steps(view, grid).contiguous(),
         torch.tensor(view.pinhole, dtype=torch.float32),

@@ -20,7 +20,7 @@ from pcdata.structures.fields import Kind
 from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
-_CAMERAS_KEPT = 8  # 5 MB each at 640x480
+_CAMERAS_KEPT = 8  # 7 MB each at 640x480
 _WEIGHTINGS = ("constant", "inverse_square", "angle")
 
 
@@ -43,7 +43,7 @@ class TSDFVolume:
     frame_id: str | None = None  # the frame of the surface; None = that of the first frame
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
-    _kept_rays: dict[tuple[float, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+    _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.weighting not in _WEIGHTINGS:
@@ -156,7 +156,7 @@ class TSDFVolume:
         camera = frame.camera
         k = camera.intrinsics[index]
         lens = None if camera.distortion is None else camera.distortion[index]
-        rays = self._rays(k, lens, frame)
+        rays, directions = self._rays(k, lens, frame)
         depth = frame.depth[index]
         if self.min_confidence is not None and frame.confidence is not None:
             depth = torch.where(frame.confidence[index] >= self.min_confidence, depth, 0.0)
@@ -165,7 +165,7 @@ class TSDFVolume:
         assert frame.world_from_camera is not None
         return tsdf.FusionView(
             depth=depth,
-            rays=rays,
+            rays=directions,
             pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
             distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
             world_from_camera=frame.world_from_camera[index],
@@ -174,15 +174,15 @@ class TSDFVolume:
             label=None if frame.labels is None else frame.labels[index].int(),
         )
 
-    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
-        """Return the rays (H, W, 2) of a camera; those of a few cameras are kept: frames repeat them."""
+    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> tuple[Tensor, Tensor]:
+        """Return the rays of a camera, (H, W, 2) float64 and (2, H, W) float32; kept, because frames repeat cameras."""
         coefficients = () if lens is None else tuple(lens.tolist())
         known = (*k.flatten().tolist(), *coefficients, *frame.size)
         if known not in self._kept_rays:
             if len(self._kept_rays) >= _CAMERAS_KEPT:
                 self._kept_rays.pop(next(iter(self._kept_rays)))
-            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0]
-            self._kept_rays[known] = rays.to(frame.device)
+            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0].to(frame.device)
+            self._kept_rays[known] = rays, rays.permute(2, 0, 1).float().contiguous()
         return self._kept_rays[known]
 
     # -- out -------------------------------------------------------------------------------------------------------

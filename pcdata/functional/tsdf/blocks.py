@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,14 +26,26 @@ class Planes:
     views: bool = False  # count views apart from weights; without, every view weighs 1 and the weight is the count
 
     @property
+    def dtypes(self) -> dict[str, torch.dtype]:
+        """The planes of a block by name, in the order in which they lie in memory."""
+        found = {"tsdf": torch.int16, "weight": torch.int16}
+        found |= {"color": torch.int32} if self.colors else {}
+        found |= {"views": torch.int16} if self.views else {}
+        found |= {"label": torch.int32, "votes": torch.int16} if self.labels else {}
+        return found
+
+    @property
     def bytes_per_block(self) -> int:
         """The memory of one block: 4 bytes a voxel, 8 with colour."""
-        return VOXELS * (4 + 4 * self.colors + 6 * self.labels + 2 * self.views)
+        return VOXELS * sum(dtype.itemsize for dtype in self.dtypes.values())
 
 
 @dataclass(eq=False)
 class Chunk:
-    """The voxels of ``CHUNK`` blocks; all zero = never seen."""
+    """The voxels of ``CHUNK`` blocks; all zero = never seen.
+
+    The planes of one block lie behind one another, so that a block is one stretch of memory: with colour, a page.
+    """
 
     tsdf: Tensor  # (C, 512) int16: signed distance / truncation * TSDF_SCALE, positive in front of the surface
     weight: Tensor  # (C, 512) int16
@@ -50,21 +62,22 @@ class Chunk:
     @staticmethod
     def empty(planes: Planes, device: torch.device) -> Chunk:
         """Reserve a chunk of zeros; on the CPU a page takes memory only once it is written."""
+        room = _zeros(CHUNK * planes.bytes_per_block, device).reshape(CHUNK, planes.bytes_per_block)
+        found, start = {}, 0
+        for name, dtype in planes.dtypes.items():
+            end = start + VOXELS * dtype.itemsize
+            found[name] = room[:, start:end].view(dtype)
+            start = end
+        return Chunk(**found)
 
-        def zeros(dtype: torch.dtype) -> Tensor:
-            if device.type == "cpu":
-                numpy_dtype = {torch.int16: np.int16, torch.int32: np.int32}[dtype]
-                return torch.from_numpy(np.zeros((CHUNK, VOXELS), numpy_dtype))
-            return torch.zeros((CHUNK, VOXELS), dtype=dtype, device=device)
 
-        return Chunk(
-            tsdf=zeros(torch.int16),
-            weight=zeros(torch.int16),
-            color=zeros(torch.int32) if planes.colors else None,
-            views=zeros(torch.int16) if planes.views else None,
-            label=zeros(torch.int32) if planes.labels else None,
-            votes=zeros(torch.int16) if planes.labels else None,
-        )
+def _zeros(count: int, device: torch.device) -> Tensor:
+    if device.type != "cpu" or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return torch.zeros(count, dtype=torch.uint8, device=device)
+    # A volume grows by tens of megabytes per view. Page faults of 4 KB would take longer than filling these.
+    pages = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    pages.madvise(mmap.MADV_HUGEPAGE)
+    return torch.frombuffer(pages, dtype=torch.uint8)
 
 
 @dataclass(eq=False)

@@ -1,0 +1,57 @@
+// What a comparison of lanes gives, in the form that the processor computes it: one bit per lane with AVX-512, else all
+// ones or zero in each.
+#pragma once
+
+#include "pc/lanes.hpp"
+
+namespace pc {
+
+#if defined(__AVX512DQ__)
+
+struct Truth {
+  __mmask16 bits;
+
+  bool any() const { return bits != 0; }
+  Truth operator&(Truth other) const { return {static_cast<__mmask16>(bits & other.bits)}; }
+  Truth operator|(Truth other) const { return {static_cast<__mmask16>(bits | other.bits)}; }
+};
+
+inline __m512 raw(const FloatLanes& lanes) { return reinterpret_cast<__m512>(lanes); }
+inline __m512i raw(const IntLanes& lanes) { return reinterpret_cast<__m512i>(lanes); }
+inline Truth less(const FloatLanes& a, const FloatLanes& b) { return {_mm512_cmp_ps_mask(raw(a), raw(b), _CMP_LT_OQ)}; }
+inline Truth at_most(const FloatLanes& a, const FloatLanes& b) {
+  return {_mm512_cmp_ps_mask(raw(a), raw(b), _CMP_LE_OQ)};
+}
+inline Truth less(const IntLanes& a, const IntLanes& b) { return {_mm512_cmplt_epi32_mask(raw(a), raw(b))}; }
+inline Truth equal(const IntLanes& a, const IntLanes& b) { return {_mm512_cmpeq_epi32_mask(raw(a), raw(b))}; }
+inline FloatLanes select(Truth truth, const FloatLanes& a, const FloatLanes& b) {
+  return reinterpret_cast<FloatLanes>(_mm512_mask_blend_ps(truth.bits, raw(b), raw(a)));
+}
+inline IntLanes select(Truth truth, const IntLanes& a, const IntLanes& b) {
+  return reinterpret_cast<IntLanes>(_mm512_mask_blend_epi32(truth.bits, raw(b), raw(a)));
+}
+inline Truth all_lanes() { return {0xffff}; }
+
+#else
+
+struct Truth {
+  IntLanes lanes;
+
+  bool any() const { return bits_of_lanes(lanes) != 0; }
+  Truth operator&(const Truth& other) const { return {lanes & other.lanes}; }
+  Truth operator|(const Truth& other) const { return {lanes | other.lanes}; }
+};
+
+inline Truth less(const FloatLanes& a, const FloatLanes& b) { return {a < b}; }
+inline Truth at_most(const FloatLanes& a, const FloatLanes& b) { return {a <= b}; }
+inline Truth less(const IntLanes& a, const IntLanes& b) { return {a < b}; }
+inline Truth equal(const IntLanes& a, const IntLanes& b) { return {a == b}; }
+template <class Lanes>
+inline Lanes select(const Truth& truth, const Lanes& a, const Lanes& b) {
+  return truth.lanes ? a : b;
+}
+inline Truth all_lanes() { return {IntLanes{} - 1}; }
+
+#endif
+
+}  // namespace pc
