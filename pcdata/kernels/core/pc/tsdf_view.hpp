@@ -10,6 +10,14 @@ namespace pc {
 
 constexpr int kGroups = kVoxels / kLanes;  // of voxels updated together
 
+// Where two registers can be permuted as one, pixels of small windows are found in registers instead of in memory.
+#if defined(__AVX512DQ__)
+constexpr bool kHasTables = true;
+#else
+constexpr bool kHasTables = false;
+#endif
+constexpr int kSmallestTable = 64, kLargestTable = 256;  // pixels
+
 struct View {
   const float* depth;     // (height, width)
   const int32_t* weight;  // the same; null = 1 everywhere
@@ -37,18 +45,20 @@ inline float highest(const Corners& x) {
 // A block as a view sees it.
 struct SeenBlock {
   int64_t row;
-  float first[3];               // its first voxel, as View::pose maps it
-  bool inside;                  // every voxel is in front of the camera and falls on a pixel
-  bool is_small;                // and all of these lie within kTable x kTable pixels, of which this is the first:
-  int32_t u, v;
+  float first[3];     // its first voxel, as View::pose maps it
+  bool inside;        // every voxel is in front of the camera and falls on a pixel
+  int32_t entries;    // of the table that holds these pixels; 0 where they are too many for one
+  int32_t u, v;       // the first pixel of the table
+  int32_t shift;      // rows of the table are 1 << shift pixels apart
   uint32_t groups[(kGroups + 31) / 32];  // those that may hold a voxel to update
-
-  static constexpr int kTable = 8;
 
   bool any() const {
     uint32_t all = 0;
     for (const uint32_t word : groups) all |= word;
     return all != 0;
+  }
+  void clear() {
+    for (uint32_t& word : groups) word = 0;
   }
 };
 
@@ -72,7 +82,8 @@ class Sight {
     SeenBlock seen;
     seen.row = row;
     place(key, seen.first);
-    seen.inside = seen.is_small = false;
+    seen.inside = false;
+    seen.entries = 0;
     constexpr float everything = std::numeric_limits<float>::infinity();
     Range range{-everything, everything};
     if (view_.lens == nullptr) range = look(seen);
@@ -116,11 +127,24 @@ class Sight {
     const auto first_u = static_cast<int32_t>(std::max(left, 0.0f)), first_v = static_cast<int32_t>(std::max(top, 0.0f));
     const auto last_u = static_cast<int32_t>(std::min(right, width - 1));
     const auto last_v = static_cast<int32_t>(std::min(bottom, height - 1));
-    constexpr int kTable = SeenBlock::kTable;
-    seen.u = std::min(first_u, static_cast<int32_t>(view_.width) - kTable);
-    seen.v = std::min(first_v, static_cast<int32_t>(view_.height) - kTable);
-    seen.is_small = seen.inside && std::min(seen.u, seen.v) >= 0 && last_u - seen.u < kTable && last_v - seen.v < kTable;
+    if (kHasTables && seen.inside) choose_table(first_u, last_u, first_v, last_v, seen);
     return widened(readings(first_u, last_u, first_v, last_v));
+  }
+
+  // The smallest table that holds a window, moved inwards at the borders of the image.
+  void choose_table(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v, SeenBlock& seen) const {
+    for (int32_t entries = kSmallestTable; entries <= kLargestTable; entries *= 2)
+      for (int32_t shift = 3; shift <= 4; ++shift) {
+        const int32_t width = 1 << shift, height = entries >> shift;
+        const int32_t u = std::min(first_u, static_cast<int32_t>(view_.width) - width);
+        const int32_t v = std::min(first_v, static_cast<int32_t>(view_.height) - height);
+        if (u < 0 || v < 0 || last_u - u >= width || last_v - v >= height) continue;
+        seen.entries = entries;
+        seen.shift = shift;
+        seen.u = u;
+        seen.v = v;
+        return;
+      }
   }
 
   // The range of the readings in some pixels; it may take more pixels in.
@@ -150,7 +174,7 @@ class Sight {
   }
 
   void mark(Range range, SeenBlock& seen) const {
-    for (auto& word : seen.groups) word = 0;
+    seen.clear();
     if (range.low > range.high) return;
     for (int g = 0; g < kGroups; g += kLanes) {
       const FloatLanes low = seen.first[2] + load<FloatLanes>(low_ + g), high = seen.first[2] + load<FloatLanes>(high_ + g);

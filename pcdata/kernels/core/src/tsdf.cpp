@@ -14,42 +14,79 @@ inline void bend(const float* c, FloatLanes& x, FloatLanes& y, const FloatLanes&
   x = bent;
 }
 
-// Pixels of an image by their number.
+// Pixels looked up in the image.
 struct ImagePixels {
-  IntLanes number;
-
-  ImagePixels(const View& view, const SeenBlock&, const IntLanes& u, const IntLanes& v)
-      : number(v * (IntLanes{} + static_cast<int32_t>(view.width)) + u) {}
   template <class T>
-  auto of(const T* image, const View&, const SeenBlock&) const {
-    return gather(image, number);
-  }
+  class Table {
+   public:
+    Table(const View&, const SeenBlock&, const T* image) : image_(image) {}
+    auto at(const IntLanes& place) const { return gather(image_, place); }
+
+   private:
+    const T* image_;
+  };
+
+  class Places {
+   public:
+    Places(const View& view, const SeenBlock&) : width_(IntLanes{} + static_cast<int32_t>(view.width)) {}
+    IntLanes of(const IntLanes& u, const IntLanes& v) const { return v * width_ + u; }
+
+   private:
+    IntLanes width_;
+  };
 };
 
 #if defined(__AVX512DQ__)
-// Pixels of a window that four registers hold: two permutations instead of a gather's sixteen loads.
+// Pixels of a small window, looked up by permuting registers: a gather loads sixteen times.
+template <int kEntries>
 struct TablePixels {
-  static constexpr int kTable = SeenBlock::kTable;
-  IntLanes place;
-
-  TablePixels(const View&, const SeenBlock& block, const IntLanes& u, const IntLanes& v)
-      : place((v << 3) + u - (block.v * kTable + block.u)) {}
   template <class T>
-  auto of(const T* image, const View& view, const SeenBlock& block) const {
-    const T* from = image + block.v * view.width + block.u;
-    __m512i rows[4];
-    for (int i = 0; i < 4; ++i, from += 2 * view.width) {
-      const __m256i first = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from));
-      const __m256i second = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from + view.width));
-      rows[i] = _mm512_inserti64x4(_mm512_castsi256_si512(first), second, 1);
+  class Table {
+   public:
+    Table(const View& view, const SeenBlock& block, const T* image) {
+      const T* from = image + block.v * view.width + block.u;
+      for (int i = 0; i < kRegisters; ++i) {
+        if (block.shift == 4) {
+          rows_[i] = _mm512_loadu_si512(from);
+          from += view.width;
+        } else {
+          const __m256i first = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from));
+          const __m256i second = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from + view.width));
+          rows_[i] = _mm512_inserti64x4(_mm512_castsi256_si512(first), second, 1);
+          from += 2 * view.width;
+        }
+      }
     }
-    const __m512i at = raw(place);
-    const __m512i low = _mm512_permutex2var_epi32(rows[0], at, rows[1]);
-    const __m512i high = _mm512_permutex2var_epi32(rows[2], at, rows[3]);
-    const __m512i found = _mm512_mask_blend_epi32(_mm512_test_epi32_mask(at, _mm512_set1_epi32(32)), low, high);
-    typedef T Lanes __attribute__((vector_size(4 * kLanes)));
-    return reinterpret_cast<Lanes>(found);
-  }
+    auto at(const IntLanes& place) const {
+      typedef T Lanes __attribute__((vector_size(4 * kLanes)));
+      return reinterpret_cast<Lanes>(find<kRegisters>(rows_, raw(place)));
+    }
+
+   private:
+    static constexpr int kRegisters = kEntries / kLanes;
+
+    template <int kCount>
+    static __m512i find(const __m512i* rows, __m512i place) {
+      if constexpr (kCount == 2) {
+        return _mm512_permutex2var_epi32(rows[0], place, rows[1]);
+      } else {
+        const __mmask16 second = _mm512_test_epi32_mask(place, _mm512_set1_epi32(kCount / 2 * kLanes));
+        return _mm512_mask_blend_epi32(second, find<kCount / 2>(rows, place), find<kCount / 2>(rows + kCount / 2, place));
+      }
+    }
+    __m512i rows_[kRegisters];
+  };
+
+  class Places {
+   public:
+    Places(const View&, const SeenBlock& block)
+        : shift_(block.shift), first_(IntLanes{} + ((block.v << block.shift) + block.u)) {}
+    IntLanes of(const IntLanes& u, const IntLanes& v) const { return (v << shift_) + u - first_; }
+
+   private:
+    int32_t shift_;
+    IntLanes first_;
+  };
 };
 #endif
 
@@ -71,122 +108,162 @@ inline void vote(int32_t* label, int16_t* votes, const IntLanes& seen, Truth nea
   store_short(votes, select(near, after, lead));
 }
 
-// kMore: with weights, labels, views or carving. kInside: every voxel is known to fall on a pixel. kBent: with a lens.
-template <class Pixels, bool kMore, bool kInside, bool kBent>
-void update(const View& view, const VoxelPlanes& planes, const SeenBlock& block) {
+// A block on its way: what the view says about its voxels, while these come from memory.
+struct Waiting {
+  SeenBlock block;
+  alignas(64) float distance[kVoxels];  // as stored; far behind the surface where the view says nothing
+  alignas(64) int32_t place[kVoxels];   // of the pixel
+
+  static constexpr float kNothing = -1e30f;
+};
+
+template <class Body>
+void for_each_group(const SeenBlock& block, Body&& body) {
+  for (int word = 0; word < (kGroups + 31) / 32; ++word)
+    for (uint32_t left = block.groups[word]; left != 0; left &= left - 1)
+      body((32 * word + __builtin_ctz(left)) * kLanes);
+}
+
+// Measure the distances of a block, send for the voxels to update, and leave out groups without any.
+template <class Pixels, bool kInside, bool kBent>
+void measure(const View& view, const VoxelPlanes& planes, Waiting& turn) {
+  SeenBlock& block = turn.block;
   const FloatLanes zero = {}, most = zero + kTsdfScale;
   const auto width = static_cast<float>(view.width), height = static_cast<float>(view.height);
+  const typename Pixels::template Table<float> depth(view, block, view.depth);
+  const int16_t *const tsdfs = planes.tsdf.block(block.row), *const weights = planes.weight.block(block.row);
+  const int32_t* const colors = planes.color ? planes.color.block(block.row) : reinterpret_cast<const int32_t*>(tsdfs);
+  const FloatLanes furthest = view.carve ? zero + std::numeric_limits<float>::infinity() : most;
+  const typename Pixels::Places places(view, block);
+  const FloatLanes first_u = zero + block.first[0], first_v = zero + block.first[1], first_z = zero + block.first[2];
+  const float* const steps = view.steps;
+  const float scale = view.scale;
+  uint32_t kept[(kGroups + 31) / 32] = {};
+  int last = 0;  // group with a voxel to update
+  for_each_group(block, [&](int at) {
+    const FloatLanes z = first_z + load<FloatLanes>(steps + 2 * kVoxels + at);
+    const FloatLanes inverse = 1.0f / z;
+    FloatLanes u = (first_u + load<FloatLanes>(steps + at)) * inverse;
+    FloatLanes v = (first_v + load<FloatLanes>(steps + kVoxels + at)) * inverse;
+    Truth inside = all_lanes();
+    if constexpr (kBent) {
+      const float fx = view.pinhole[0], skew = view.pinhole[1], cx = view.pinhole[2], fy = view.pinhole[3];
+      const FloatLanes radius = u * u + v * v;
+      inside = less(radius, zero + view.lens[12]);
+      bend(view.lens, u, v, radius);
+      u = ((u * fx + v * skew) + cx) + 0.5f;
+      v = (v * fy + view.pinhole[4]) + 0.5f;
+    }
+    if constexpr (!kInside) {
+      inside = inside & less(zero, z) & at_most(zero, u) & less(u, zero + width) & at_most(zero, v) &
+               less(v, zero + height);
+      u = select(inside, u, zero);
+      v = select(inside, v, zero);
+    }
+    const IntLanes place = places.of(truncated(u), truncated(v));
+    const FloatLanes reading = depth.at(place);
+    const FloatLanes scaled = (reading - z) * scale;
+    inside = inside & less(zero, reading);
+    store(turn.distance + at, select(inside, scaled, zero + Waiting::kNothing));
+    store(turn.place + at, place);
+    // Without branches: which groups these are, no processor foresees.
+    const bool is_near = (inside & at_most(scaled, furthest) & at_most(-most, scaled)).any();
+    kept[at / kLanes / 32] |= static_cast<uint32_t>(is_near) << at / kLanes % 32;
+    last = is_near ? at : last;
+    __builtin_prefetch(tsdfs + last, 1);
+    __builtin_prefetch(weights + last, 1);
+    __builtin_prefetch(colors + last, 1);
+  });
+  std::copy(std::begin(kept), std::end(kept), block.groups);
+}
+
+// Average what was measured into the voxels. kMore: with weights, labels, views or carving.
+template <class Pixels, bool kMore>
+void update(const View& view, const VoxelPlanes& planes, const Waiting& turn) {
+  const SeenBlock& block = turn.block;
+  const FloatLanes zero = {}, most = zero + kTsdfScale;
   const bool has_color = planes.color && view.color != nullptr;
   int16_t *const tsdfs = planes.tsdf.block(block.row), *const weights = planes.weight.block(block.row);
   int32_t* const colors = has_color ? planes.color.block(block.row) : nullptr;
   int16_t* const counts = kMore && planes.views ? planes.views.block(block.row) : nullptr;
+  const bool has_labels = kMore && planes.label && view.label != nullptr, has_weights = kMore && view.weight != nullptr;
+  using Table = typename Pixels::template Table<int32_t>;
+  const auto* const none = reinterpret_cast<const int32_t*>(view.depth);
+  const Table pixel_colors(view, block, has_color ? view.color : none);
+  const Table pixel_weights(view, block, has_weights ? view.weight : none);
+  const Table pixel_labels(view, block, has_labels ? view.label : none);
   IntLanes lane;
   for (int i = 0; i < kLanes; ++i) lane[i] = i;
-
-  for (int word = 0; word < (kGroups + 31) / 32; ++word)
-    for (uint32_t left = block.groups[word]; left != 0; left &= left - 1) {
-      const int at = (32 * word + __builtin_ctz(left)) * kLanes;
-      const FloatLanes z = block.first[2] + load<FloatLanes>(view.steps + 2 * kVoxels + at);
-      const FloatLanes inverse = 1.0f / z;
-      FloatLanes u = (block.first[0] + load<FloatLanes>(view.steps + at)) * inverse;
-      FloatLanes v = (block.first[1] + load<FloatLanes>(view.steps + kVoxels + at)) * inverse;
-      Truth inside = all_lanes();
-      if constexpr (kBent) {
-        const float fx = view.pinhole[0], skew = view.pinhole[1], cx = view.pinhole[2], fy = view.pinhole[3];
-        const FloatLanes radius = u * u + v * v;
-        inside = less(radius, zero + view.lens[12]);
-        bend(view.lens, u, v, radius);
-        u = ((u * fx + v * skew) + cx) + 0.5f;
-        v = (v * fy + view.pinhole[4]) + 0.5f;
-      }
-      if constexpr (!kInside) {
-        inside = inside & less(zero, z) & at_most(zero, u) & less(u, zero + width) & at_most(zero, v) &
-                 less(v, zero + height);
-        if (!inside.any()) continue;
-        u = select(inside, u, zero);
-        v = select(inside, v, zero);
-      }
-      const Pixels pixel(view, block, truncated(u), truncated(v));
-      const FloatLanes reading = pixel.of(view.depth, view, block);
-      const FloatLanes scaled = (reading - z) * view.scale;
-      inside = inside & less(zero, reading);
-      const Truth near = inside & at_most(scaled, most) & at_most(-most, scaled);
-      Truth seen = near;
-      const IntLanes old_weight = widened(weights + at);
-      if (kMore && view.carve) seen = seen | (inside & less(most, scaled) & less(IntLanes{}, old_weight));
-      if (!seen.any()) continue;
-
-      const FloatLanes old = as_float(old_weight);
-      const FloatLanes more = kMore && view.weight != nullptr ? as_float(pixel.of(view.weight, view, block)) : zero + 1;
-      const FloatLanes sum = old + more;
-      const FloatLanes share = more / sum;
-      const IntLanes stored = widened(tsdfs + at);
-      const FloatLanes before = as_float(stored);
-      const FloatLanes distance = kMore ? least(scaled, most) : scaled;  // of what is near, none is more
-      store_short(tsdfs + at, select(seen, rounded(before + (distance - before) * share), stored));
-      store_short(weights + at, select(seen, truncated(least(sum, zero + kMaxWeight)), old_weight));
-      const IntLanes count = counts != nullptr ? widened(counts + at) : old_weight;
-      if (has_color) {
-        const IntLanes color = load<IntLanes>(colors + at);
-        const IntLanes turn = ((count * 159 + (lane + at) * 83) & 255) << 7;
-        const IntLanes mixed = mixed_color(color, pixel.of(view.color, view, block), rounded(share * 32768), turn);
-        store(colors + at, select(near, mixed, color));
-      }
-      if constexpr (kMore) {
-        if (planes.label && view.label != nullptr)
-          vote(planes.label.block(block.row) + at, planes.votes.block(block.row) + at,
-               pixel.of(view.label, view, block), near);
-        if (counts != nullptr) store_short(counts + at, select(near, least(count + 1, IntLanes{} + 32767), count));
-      }
+  for_each_group(block, [&](int at) {
+    const auto scaled = load<FloatLanes>(turn.distance + at);
+    const auto place = load<IntLanes>(turn.place + at);
+    const Truth near = at_most(scaled, most) & at_most(-most, scaled);
+    const IntLanes old_weight = widened(weights + at);
+    Truth seen = near;
+    if (kMore && view.carve) seen = seen | (less(most, scaled) & less(IntLanes{}, old_weight));
+    const FloatLanes old = as_float(old_weight);
+    const FloatLanes more = has_weights ? as_float(pixel_weights.at(place)) : zero + 1;
+    const FloatLanes sum = old + more;
+    const FloatLanes share = more / sum;
+    const IntLanes stored = widened(tsdfs + at);
+    const FloatLanes before = as_float(stored);
+    const FloatLanes distance = kMore ? least(scaled, most) : scaled;  // of what is near, none is more
+    store_short(tsdfs + at, select(seen, rounded(before + (distance - before) * share), stored));
+    store_short(weights + at, select(seen, truncated(least(sum, zero + kMaxWeight)), old_weight));
+    const IntLanes count = counts != nullptr ? widened(counts + at) : old_weight;
+    if (has_color) {
+      const IntLanes color = load<IntLanes>(colors + at);
+      const IntLanes turn_up = ((count * 159 + (lane + at) * 83) & 255) << 7;
+      const IntLanes mixed = mixed_color(color, pixel_colors.at(place), rounded(share * 32768), turn_up);
+      store(colors + at, select(near, mixed, color));
     }
+    if constexpr (kMore) {
+      if (has_labels)
+        vote(planes.label.block(block.row) + at, planes.votes.block(block.row) + at, pixel_labels.at(place), near);
+      if (counts != nullptr) store_short(counts + at, select(near, least(count + 1, IntLanes{} + 32767), count));
+    }
+  });
 }
 
-template <bool kMore>
-void update(const View& view, const VoxelPlanes& planes, const SeenBlock& block) {
+// Call body(Pixels{}) with the way to look up a block's pixels.
+template <bool kMore, class Body>
+void with_pixels(const SeenBlock& block, Body&& body) {
 #if defined(__AVX512DQ__)
-  if (block.is_small) return update<TablePixels, kMore, true, false>(view, planes, block);
+  if (block.entries == 64) return body(TablePixels<64>{});
+  if (block.entries == 128) return body(TablePixels<128>{});
+  if (block.entries == 256) return body(TablePixels<256>{});
 #endif
-  if (view.lens != nullptr) return update<ImagePixels, kMore, false, true>(view, planes, block);
-  if (block.inside) return update<ImagePixels, kMore, true, false>(view, planes, block);
-  update<ImagePixels, kMore, false, false>(view, planes, block);
-}
-
-// Bring what an update will read and write into the cache.
-void prefetch(const VoxelPlanes& planes, const SeenBlock& block) {
-  constexpr int kPerLine = 64 / sizeof(int16_t) / kLanes;  // groups
-  const char* tsdf = reinterpret_cast<const char*>(planes.tsdf.block(block.row));
-  const char* weight = reinterpret_cast<const char*>(planes.weight.block(block.row));
-  const char* color = planes.color ? reinterpret_cast<const char*>(planes.color.block(block.row)) : nullptr;
-  for (int g = 0; g < kGroups; g += kPerLine) {
-    if ((block.groups[g / 32] >> g % 32 & ((1u << kPerLine) - 1)) == 0) continue;
-    const int at = g * kLanes * static_cast<int>(sizeof(int16_t));
-    __builtin_prefetch(tsdf + at, 1);
-    __builtin_prefetch(weight + at, 1);
-    if (color == nullptr) continue;
-    __builtin_prefetch(color + 2 * at, 1);
-    __builtin_prefetch(color + 2 * at + 64, 1);
-  }
+  body(ImagePixels{});
 }
 
 template <bool kMore>
 void integrate(const pc_context& context, const View& view, const VoxelPlanes& planes, const int64_t* rows,
                int64_t num_rows, const int64_t* keys) {
   constexpr int64_t kGrain = 64;
-  constexpr int kAhead = 3;  // blocks on their way from memory
+  constexpr int kAhead = 2;  // blocks on their way from memory
   const Sight sight(view);
   parallel_for(context, num_rows, kGrain, [&](int64_t begin, int64_t end, int64_t) {
-    SeenBlock waiting[kAhead];
+    Waiting waiting[kAhead];
+    const auto finish = [&](const Waiting& turn) {
+      with_pixels<kMore>(turn.block, [&](auto pixels) { update<decltype(pixels), kMore>(view, planes, turn); });
+    };
     int64_t met = 0;
     for (int64_t i = begin; i < end; ++i) {
-      const SeenBlock block = sight.of(keys[rows[i]], rows[i]);
-      if (!block.any()) continue;
-      prefetch(planes, block);
-      SeenBlock& turn = waiting[met % kAhead];
-      if (met >= kAhead) update<kMore>(view, planes, turn);
-      turn = block;
+      Waiting& turn = waiting[met % kAhead];
+      if (met >= kAhead) finish(turn);
+      turn.block = sight.of(keys[rows[i]], rows[i]);
+      with_pixels<kMore>(turn.block, [&](auto pixels) {
+        using Pixels = decltype(pixels);
+        if (view.lens != nullptr)
+          measure<ImagePixels, false, true>(view, planes, turn);
+        else if (turn.block.inside)
+          measure<Pixels, true, false>(view, planes, turn);
+        else
+          measure<ImagePixels, false, false>(view, planes, turn);
+      });
       ++met;
     }
-    for (int64_t i = std::max<int64_t>(0, met - kAhead); i < met; ++i) update<kMore>(view, planes, waiting[i % kAhead]);
+    for (int64_t i = std::max<int64_t>(0, met - kAhead); i < met; ++i) finish(waiting[i % kAhead]);
   });
 }
 
