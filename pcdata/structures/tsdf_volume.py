@@ -84,15 +84,17 @@ class TSDFVolume:
             UnitError: a reading lies 2^20 blocks or more from the origin.
         """
         views, touched = self._prepared(frame)
-        new = self._missing(touched)
+        found, new = self._found(touched)
         self._check_room(frame, len(new))
         if self.blocks is None:
             self.frame_id = frame.frame_id
             self.blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device)
         self.blocks.add(new)
-        for view, keys in zip(views, touched, strict=True):
-            rows = torch.arange(len(self.blocks), device=frame.device) if self.carve else self.blocks.find(keys)
-            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve, backend=self.backend)
+        if len(new) or not found:
+            found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
+        for view, rows in zip(views, found, strict=True):
+            every = torch.arange(len(self.blocks), device=frame.device) if self.carve else rows
+            tsdf.integrate_view(self.blocks, every, view, self.grid, carve=self.carve, backend=self.backend)
         self.num_views += len(views)
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
@@ -102,16 +104,21 @@ class TSDFVolume:
             FrameError, CaptureError, DeviceError, UnitError: as :meth:`integrate`.
         """
         _, touched = self._prepared(frame)
-        return (self.num_blocks + len(self._missing(touched))) * self._planes_of(frame).bytes_per_block
+        return (self.num_blocks + len(self._found(touched)[1])) * self._planes_of(frame).bytes_per_block
 
     def _prepared(self, frame: DepthFrame) -> tuple[list[tsdf.FusionView], list[Tensor]]:
         self._check_frame(frame)
         views = [self._view(frame, index) for index in range(frame.num_views)]
         return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
 
-    def _missing(self, touched: list[Tensor]) -> Tensor:
-        keys = touched[0] if len(touched) == 1 else torch.cat(touched).unique()
-        return keys if self.blocks is None else self.blocks.missing(keys)
+    def _found(self, touched: list[Tensor]) -> tuple[list[Tensor], Tensor]:
+        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of all that are missing."""
+        if self.blocks is None:
+            found, missing = [], touched
+        else:
+            both = [tsdf.find_blocks(self.blocks, keys, backend=self.backend) for keys in touched]
+            found, missing = [rows for rows, _ in both], [keys for _, keys in both]
+        return found, missing[0] if len(missing) == 1 else torch.cat(missing).unique()
 
     def _check_room(self, frame: DepthFrame, new: int) -> None:
         per_block = self._planes_of(frame).bytes_per_block
@@ -170,7 +177,7 @@ class TSDFVolume:
             distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
             world_from_camera=frame.world_from_camera[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
-            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index]),
+            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
             label=None if frame.labels is None else frame.labels[index].int(),
         )
 

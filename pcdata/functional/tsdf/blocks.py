@@ -86,42 +86,69 @@ class VoxelBlocks:
 
     planes: Planes
     device: torch.device
-    keys: Tensor = field(init=False)  # (B,) int64 in the order of appearance
-    sorted_keys: Tensor = field(init=False)  # (B,) int64
-    sorted_rows: Tensor = field(init=False)  # (B,) int64: the row of each sorted key
     chunks: list[Chunk] = field(default_factory=list)
+    table: Tensor | None = None  # of hashed keys; the compiled core makes it and keeps it up to date
+    in_table: int = 0  # rows that the table has
+    _count: int = field(default=0, init=False)
+    _room: Tensor = field(init=False, repr=False)  # for keys; doubled when full
+    _sorted: tuple[Tensor, Tensor] = field(init=False, repr=False)  # keys, rows of the blocks there were at some time
 
     def __post_init__(self) -> None:
-        self.keys = self.sorted_keys = self.sorted_rows = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._room = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._sorted = self._room, self._room
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return self._count
 
-    def missing(self, keys: Tensor) -> Tensor:
-        """Return those of the sorted, distinct keys that have no block yet."""
-        return keys[self.find(keys) < 0]
+    @property
+    def keys(self) -> Tensor:
+        """The keys (B,) int64 in the order of appearance."""
+        return self._room[: self._count]
+
+    @property
+    def sorted_keys(self) -> Tensor:
+        """The keys (B,) int64 in their own order."""
+        return self._merged()[0]
+
+    @property
+    def sorted_rows(self) -> Tensor:
+        """The row (B,) int64 of every sorted key."""
+        return self._merged()[1]
 
     def add(self, keys: Tensor) -> None:
         """Open blocks for sorted, distinct keys that have none."""
-        rows = torch.arange(len(self), len(self) + len(keys), device=self.device)
-        self.keys = torch.cat([self.keys, keys])
-        # Merge the two sorted lists: what is new goes behind the known keys below it.
-        places = torch.searchsorted(self.sorted_keys, keys) + torch.arange(len(keys), device=self.device)
-        is_known = torch.ones(len(self.keys), dtype=torch.bool, device=self.device)
-        is_known[places] = False
-        merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
-        merged_keys[places], merged_rows[places] = keys, rows
-        merged_keys[is_known], merged_rows[is_known] = self.sorted_keys, self.sorted_rows
-        self.sorted_keys, self.sorted_rows = merged_keys, merged_rows
-        while len(self.chunks) * CHUNK < len(self):
+        count = self._count + len(keys)
+        if count > len(self._room):
+            room = self._room.new_empty(max(count, 2 * len(self._room)))
+            room[: self._count] = self.keys
+            self._room = room
+        self._room[self._count : count] = keys
+        self._count = count
+        while len(self.chunks) * CHUNK < count:
             self.chunks.append(Chunk.empty(self.planes, self.device))
 
     def find(self, keys: Tensor) -> Tensor:
         """Return the (N,) row of every key, -1 where there is no block."""
         if len(self) == 0:
             return torch.full_like(keys, -1)
-        place = torch.searchsorted(self.sorted_keys, keys).clamp_(max=len(self) - 1)
-        return torch.where(self.sorted_keys[place] == keys, self.sorted_rows[place], -1)
+        sorted_keys, sorted_rows = self._merged()
+        place = torch.searchsorted(sorted_keys, keys).clamp_(max=len(self) - 1)
+        return torch.where(sorted_keys[place] == keys, sorted_rows[place], -1)
+
+    def _merged(self) -> tuple[Tensor, Tensor]:
+        """Merge what was added since the last time into the sorted keys: it goes behind the known keys below it."""
+        known_keys, known_rows = self._sorted
+        known = len(known_keys)
+        if known < self._count:
+            keys, order = self.keys[known:].sort()
+            places = torch.searchsorted(known_keys, keys) + torch.arange(len(keys), device=self.device)
+            is_known = torch.ones(self._count, dtype=torch.bool, device=self.device)
+            is_known[places] = False
+            merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
+            merged_keys[places], merged_rows[places] = keys, order + known
+            merged_keys[is_known], merged_rows[is_known] = known_keys, known_rows
+            self._sorted = merged_keys, merged_rows
+        return self._sorted
 
     def in_chunks(self, rows: Tensor) -> Iterator[tuple[Chunk, Tensor, Tensor]]:
         """Split rows by chunk: the chunk, the rows within it, and where these stood in ``rows``."""

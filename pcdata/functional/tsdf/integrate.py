@@ -36,6 +36,12 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     return torch.cat(found).unique()
 
 
+def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the row (N,) of every key, -1 where there is no block, and the keys (M,) of which this is true."""
+    rows = blocks.find(keys)
+    return rows, keys[rows < 0]
+
+
 def camera_in_blocks(view: FusionView, grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
     """Return how to count blocks from the camera's own, in float32 without losing any, however far the origin is.
 

@@ -226,8 +226,8 @@ void update(const View& view, const VoxelPlanes& planes, const Waiting& turn) {
 }
 
 // Call body(Pixels{}) with the way to look up a block's pixels.
-template <bool kMore, class Body>
-void with_pixels(const SeenBlock& block, Body&& body) {
+template <class Body>
+void with_pixels([[maybe_unused]] const SeenBlock& block, Body&& body) {
 #if defined(__AVX512DQ__)
   if (block.entries == 64) return body(TablePixels<64>{});
   if (block.entries == 128) return body(TablePixels<128>{});
@@ -245,14 +245,14 @@ void integrate(const pc_context& context, const View& view, const VoxelPlanes& p
   parallel_for(context, num_rows, kGrain, [&](int64_t begin, int64_t end, int64_t) {
     Waiting waiting[kAhead];
     const auto finish = [&](const Waiting& turn) {
-      with_pixels<kMore>(turn.block, [&](auto pixels) { update<decltype(pixels), kMore>(view, planes, turn); });
+      with_pixels(turn.block, [&](auto pixels) { update<decltype(pixels), kMore>(view, planes, turn); });
     };
     int64_t met = 0;
     for (int64_t i = begin; i < end; ++i) {
       Waiting& turn = waiting[met % kAhead];
       if (met >= kAhead) finish(turn);
       turn.block = sight.of(keys[rows[i]], rows[i]);
-      with_pixels<kMore>(turn.block, [&](auto pixels) {
+      with_pixels(turn.block, [&](auto pixels) {
         using Pixels = decltype(pixels);
         if (view.lens != nullptr)
           measure<ImagePixels, false, true>(view, planes, turn);

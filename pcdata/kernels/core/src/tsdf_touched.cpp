@@ -1,5 +1,6 @@
 // The blocks that a depth image touches, and the table that finds blocks.
 #include "pc/radix_sort.hpp"
+#include "pc/truth.hpp"
 #include "pc/tsdf.hpp"
 #include "pc/voxel_table.hpp"
 
@@ -17,76 +18,152 @@ struct TouchingView {
   int64_t num_offsets;
 };
 
-// The blocks of a row of pixels at every offset, counted from the camera's.
+// The three coordinates of a block, counted from the camera's, in 32 bits.
+struct NearBlock {
+  static constexpr int32_t kNone = INT32_MIN;  // no reading; z = -512, which is not used
+  static constexpr int32_t kWide = 1 << 10, kDeep = 1 << 9;  // x and y, z lie below
+
+  static bool fits(int axis, int32_t least, int32_t most) {
+    const int32_t limit = axis == 2 ? kDeep : kWide;
+    return least > -limit && most < limit;
+  }
+  static IntLanes pack(const IntLanes& x, const IntLanes& y, const IntLanes& z) {
+    return (x & 2047) | (y & 2047) << 11 | z << 22;
+  }
+  static int32_t x(int32_t packed) { return static_cast<int32_t>(static_cast<uint32_t>(packed) << 21) >> 21; }
+  static int32_t y(int32_t packed) { return static_cast<int32_t>(static_cast<uint32_t>(packed) << 10) >> 21; }
+  static int32_t z(int32_t packed) { return packed >> 22; }
+};
+
+// The blocks of a row of pixels at every offset.
 class Row {
  public:
-  static constexpr int32_t kNone = INT32_MIN;  // without a reading
-
   Row(ScratchFrame& scratch, const TouchingView& view)
-      : stride_((view.width + kLanes) / kLanes * kLanes + kLanes), places_(scratch.take<int32_t>(3 * view.num_offsets * stride_)) {
-    std::fill(places_, places_ + 3 * view.num_offsets * stride_, kNone);
+      : stride_((view.width + kLanes) / kLanes * kLanes + kLanes), packed_(scratch.take<int32_t>(view.num_offsets * stride_)) {
+    std::fill(packed_, packed_ + view.num_offsets * stride_, NearBlock::kNone);
   }
-  // Entry u of the result is that of pixel u - 1, so that each has one on its left.
-  int32_t* at(int64_t step, int axis) const { return places_ + (3 * step + axis) * stride_; }
+  // Entry u + 1 is that of pixel u, so that each has one on its left.
+  int32_t* at(int64_t step) const { return packed_ + step * stride_; }
 
  private:
   int64_t stride_;
-  int32_t* places_;
+  int32_t* packed_;
 };
 
-// Find the blocks of a row of pixels; call found(x, y, z) for each pixel's that are not those of the pixel to the left,
-// of the one above, or of the same pixel one offset before. False if a block lies out of reach.
-template <class Found>
-bool walk(const TouchingView& view, int64_t row, const Row& above, Row& here, Found&& found) {
-  int32_t low[3], high[3];
-  for (int a = 0; a < 3; ++a) {
-    constexpr int64_t limit = int64_t{1} << 30;
-    low[a] = static_cast<int32_t>(std::clamp(-kBlocksPerSide + 1 - view.camera[a], -limit, limit + 1));
-    high[a] = static_cast<int32_t>(std::clamp(kBlocksPerSide - 1 - view.camera[a], -limit - 1, limit));
+// The lanes of some pixels of a row.
+struct Pixels {
+  FloatLanes depth, along[3];  // the way of their rays through blocks, per metre of depth
+
+  Pixels(const TouchingView& view, int64_t row, int64_t u) {
+    const int64_t at = row * view.width + u;
+    depth = load_up_to(view.depth + at, view.width);
+    const FloatLanes x = load_up_to(view.rays + at, view.width);
+    const FloatLanes y = load_up_to(view.rays + view.height * view.width + at, view.width);
+    for (int a = 0; a < 3; ++a) {
+      const float* m = view.turn + 3 * a;
+      along[a] = (m[0] * x + m[1] * y) + m[2];
+    }
   }
-  const float *m = view.turn, *depth = view.depth + row * view.width;
-  const float *ray_x = view.rays + row * view.width, *ray_y = ray_x + view.height * view.width;
-  IntLanes far = {};
+};
+
+// Collects what does not fit: the range of the blocks of a row.
+struct Extent {
+  IntLanes low[3] = {}, high[3] = {};
+
+  void join(int axis, const IntLanes& place) {
+    low[axis] = least(low[axis], place);
+    high[axis] = greatest(high[axis], place);
+  }
+};
+
+enum class Reach { kNear, kWide, kFar };
+
+// Find the blocks of a row of pixels at every offset.
+inline Reach locate(const TouchingView& view, int64_t row, const Row& here) {
+  Extent extent;
+  const FloatLanes zero = {};
+  const IntLanes none = IntLanes{} + NearBlock::kNone;
+  const int64_t last = std::max<int64_t>(0, view.width - kLanes);
   for (int64_t at = 0; at < view.width; at += kLanes) {
-    const int64_t u = std::max<int64_t>(0, std::min(at, view.width - kLanes));
-    const FloatLanes z = load_up_to(depth + u, view.width), x = load_up_to(ray_x + u, view.width);
-    const FloatLanes y = load_up_to(ray_y + u, view.width);
-    const FloatLanes zero = {};
-    FloatLanes along[3];
-    for (int a = 0; a < 3; ++a) along[a] = (m[3 * a] * x + m[3 * a + 1] * y) + m[3 * a + 2];
+    const int64_t u = std::min(at, last);
+    const Pixels pixels(view, row, u);
+    const Truth read = less(zero, pixels.depth);
     for (int64_t step = 0; step < view.num_offsets; ++step) {
-      const FloatLanes moved = z + view.offsets[step];
-      const IntLanes read = (z > zero) & (moved > zero);
+      const FloatLanes z = pixels.depth + view.offsets[step];
+      const Truth good = read & less(zero, z);
+      IntLanes place[3];
       for (int a = 0; a < 3; ++a) {
-        const IntLanes place = floored(along[a] * moved + view.fraction[a]);
-        far |= read & ((place < low[a]) | (place > high[a]));
-        store(here.at(step, a) + 1 + u, read ? place : IntLanes{} + Row::kNone);
+        place[a] = select(good, floored(pixels.along[a] * z + view.fraction[a]), IntLanes{});
+        extent.join(a, place[a]);
       }
+      store(here.at(step) + 1 + u, select(good, NearBlock::pack(place[0], place[1], place[2]), none));
     }
   }
-  if (bits_of_lanes(far) != 0) return false;
+  bool fits = true;
+  for (int a = 0; a < 3; ++a) {
+    const int32_t low = lowest_lane<int32_t>(extent.low[a]), high = highest_lane<int32_t>(extent.high[a]);
+    fits = fits && NearBlock::fits(a, low, high);
+    if (low + view.camera[a] <= -kBlocksPerSide || high + view.camera[a] >= kBlocksPerSide) return Reach::kFar;
+  }
+  return fits ? Reach::kNear : Reach::kWide;
+}
+
+// Write each pixel's blocks that are not those of the pixel to the left, of the one above, or of the same pixel one offset
+// before; return how many. There must be room for a register more.
+inline int64_t find_new(const TouchingView& view, const Row& above, const Row& here, int32_t* found) {
+  int64_t count = 0;
   for (int64_t step = 0; step < view.num_offsets; ++step) {
-    const int64_t before = step == 0 ? 0 : step - 1;
-    const int32_t *x = here.at(step, 0), *y = here.at(step, 1), *z = here.at(step, 2);
+    const int32_t *own = here.at(step), *other = above.at(step), *before = here.at(std::max<int64_t>(0, step - 1));
+    const int32_t first = step == 0 ? -1 : 0;  // turns every bit over: before the first offset nothing was found
     for (int64_t u = 1; u <= view.width; u += kLanes) {
-      IntLanes is_new = IntLanes{} - 1;
-      const auto compare = [&](const Row& other, int64_t other_step, int64_t shift) {
-        IntLanes differs = {};
-        for (int a = 0; a < 3; ++a)
-          differs |= load<IntLanes>(here.at(step, a) + u) ^ load<IntLanes>(other.at(other_step, a) + u - shift);
-        is_new &= differs != 0;
-      };
-      compare(here, step, 1);
-      compare(above, step, 0);
-      if (before != step) compare(here, before, 0);
-      is_new &= load<IntLanes>(x + u) != Row::kNone;
-      for (uint32_t bits = bits_of_lanes(is_new); bits != 0; bits &= bits - 1) {
-        const int64_t i = u + __builtin_ctz(bits);
-        found(x[i], y[i], z[i]);
-      }
+      const auto packed = load<IntLanes>(own + u);
+      const Truth is_new = unequal(packed, load<IntLanes>(own + u - 1)) & unequal(packed, load<IntLanes>(other + u)) &
+                           unequal(packed, load<IntLanes>(before + u) ^ first) &
+                           unequal(packed, IntLanes{} + NearBlock::kNone);
+      count += store_chosen(found + count, packed, is_new);
     }
   }
-  return true;
+  return count;
+}
+
+// Most of these are found again and again, by neighbouring pixels in turn: leave out what was met lately.
+class Recent {
+ public:
+  Recent() { std::fill(std::begin(packed_), std::end(packed_), NearBlock::kNone); }
+
+  int64_t drop_known(int32_t* blocks, int64_t count) {
+    int64_t kept = 0;
+    for (int64_t i = 0; i < count; ++i) {
+      const int32_t block = blocks[i];
+      int32_t& last = packed_[static_cast<uint32_t>(block) * 0x9E3779B1u >> 21];
+      blocks[kept] = block;
+      kept += last != block;  // without a branch, which nothing would foresee
+      last = block;
+    }
+    return kept;
+  }
+
+ private:
+  int32_t packed_[1 << 11];
+};
+
+// For a row whose blocks do not fit: call found(x, y, z) for all.
+template <class Found>
+void find_all(const TouchingView& view, int64_t row, Found&& found) {
+  for (int64_t u = 0; u < view.width; ++u) {
+    const int64_t at = row * view.width + u;
+    const float depth = view.depth[at], x = view.rays[at], y = view.rays[view.height * view.width + at];
+    for (int64_t step = 0; step < view.num_offsets; ++step) {
+      const float z = depth + view.offsets[step];
+      if (!(depth > 0 && z > 0)) continue;
+      int64_t place[3];
+      for (int a = 0; a < 3; ++a) {
+        const float* m = view.turn + 3 * a;
+        place[a] = static_cast<int64_t>(std::floor(((m[0] * x + m[1] * y) + m[2]) * z + view.fraction[a]));
+      }
+      found(place[0], place[1], place[2]);
+    }
+  }
 }
 
 struct KeyItem {
@@ -102,25 +179,45 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   struct Own {
     PackedVoxel* keys;
     Row rows[2], none;
+    int32_t* found;
     VoxelTable<PackedVoxel> table;
+    Recent recent{};
     bool used = false;
   };
   std::vector<Own> own;
   for (size_t t = 0; t < threads; ++t)
     own.push_back({scratch.take<PackedVoxel>(most), {Row(scratch, view), Row(scratch, view)}, Row(scratch, view),
+                   scratch.take<int32_t>(view.width * view.num_offsets + 2 * kLanes),
                    VoxelTable<PackedVoxel>(scratch, most)});
   std::atomic<bool> far{false};
   parallel_for(context, view.height, kRows, [&](int64_t begin, int64_t end, int64_t thread) {
     Own& mine = own[static_cast<size_t>(thread)];
     if (!mine.used) mine.table.start(mine.keys);
     mine.used = true;
-    const auto add = [&](int64_t x, int64_t y, int64_t z) {
+    const auto key_of = [&](int64_t x, int64_t y, int64_t z) {
       const BlockPlace block{x + view.camera[0], y + view.camera[1], z + view.camera[2]};
-      mine.table.number({static_cast<uint64_t>(block.key())});
+      return PackedVoxel{static_cast<uint64_t>(block.key())};
     };
-    for (int64_t row = begin; row < end; ++row)
-      if (!walk(view, row, row == begin ? mine.none : mine.rows[(row + 1) % 2], mine.rows[row % 2], add))
-        far.store(true, std::memory_order_relaxed);
+    const auto near_key = [&](int32_t packed) {
+      return key_of(NearBlock::x(packed), NearBlock::y(packed), NearBlock::z(packed));
+    };
+    const Row* above = &mine.none;
+    for (int64_t row = begin; row < end; ++row) {
+      const Row& here = mine.rows[row % 2];
+      const Reach reach = locate(view, row, here);
+      if (reach == Reach::kFar) far.store(true, std::memory_order_relaxed);
+      if (reach == Reach::kWide)
+        find_all(view, row, [&](int64_t x, int64_t y, int64_t z) { mine.table.number(key_of(x, y, z)); });
+      const Row& last = *above;
+      above = reach == Reach::kNear ? &here : &mine.none;
+      if (reach != Reach::kNear) continue;
+      const int64_t count = mine.recent.drop_known(mine.found, find_new(view, last, here, mine.found));
+      constexpr int64_t kAhead = 8;
+      for (int64_t i = 0; i < count; ++i) {
+        if (i + kAhead < count) mine.table.prefetch(near_key(mine.found[i + kAhead]));
+        mine.table.number(near_key(mine.found[i]));
+      }
+    }
   });
   if (far) return -1;
   int64_t total = 0;
@@ -137,6 +234,33 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   return count;
 }
 
+// -- finding the rows of blocks -----------------------------------------------------------------------------------
+
+// Rows of blocks by their keys: open addressing, at most half full. A slot holds a row, or -1.
+struct RowTable {
+  const int64_t* keys;  // of all rows
+  int32_t* slots;
+  int64_t num_slots;  // a power of two
+
+  int64_t first(int64_t key) const {
+    const int shift = 64 - __builtin_ctzll(static_cast<uint64_t>(num_slots));
+    return static_cast<int64_t>(PackedVoxel::mixed(static_cast<uint64_t>(key)) >> shift);
+  }
+  void add(int64_t row) {
+    int64_t at = first(keys[row]);
+    while (slots[at] >= 0) at = (at + 1) & (num_slots - 1);
+    slots[at] = static_cast<int32_t>(row);
+  }
+  int64_t find(int64_t key) const {
+    int64_t at = first(key);
+    while (slots[at] >= 0 && keys[slots[at]] != key) at = (at + 1) & (num_slots - 1);
+    return slots[at];
+  }
+  // A look leads from a slot to a key, both somewhere in memory: go a step at a time.
+  void prefetch_slot(int64_t key) const { __builtin_prefetch(slots + first(key)); }
+  void prefetch_key(int64_t key) const { __builtin_prefetch(keys + std::max<int32_t>(0, slots[first(key)])); }
+};
+
 }  // namespace
 }  // namespace pc
 
@@ -148,5 +272,37 @@ PC_EXPORT int32_t pc_tsdf_touched(const pc_context* context, const float* depth,
                                   const float* offsets, int64_t num_offsets, int64_t* found, int64_t* count) {
   return pc::guarded([&] {
     *count = pc::touched(*context, {depth, rays, height, width, turn, fraction, camera, offsets, num_offsets}, found);
+  });
+}
+
+// Bring a table of rows (num_slots,) up to date, from the first num_known rows of keys (num_blocks,) to all, and look up
+// wanted (num_wanted,): rows (num_wanted,), -1 where there is no block; missing (*count,) are the keys of these.
+PC_EXPORT int32_t pc_tsdf_find(const pc_context*, const int64_t* keys, int64_t num_blocks, int32_t* slots,
+                               int64_t num_slots, int64_t num_known, const int64_t* wanted, int64_t num_wanted,
+                               int64_t* rows, int64_t* missing, int64_t* count) {
+  return pc::guarded([&] {
+    constexpr int64_t kSlots = 24, kKeys = 12;  // ahead
+    pc::RowTable table{keys, slots, num_slots};
+    for (int64_t row = num_known; row < num_blocks; ++row) {
+      if (row + kSlots < num_blocks) table.prefetch_slot(keys[row + kSlots]);
+      table.add(row);
+    }
+    int64_t none = 0;
+    for (int64_t i = 0; i < num_wanted; ++i) {
+      if (i + kSlots < num_wanted) table.prefetch_slot(wanted[i + kSlots]);
+      if (i + kKeys < num_wanted) table.prefetch_key(wanted[i + kKeys]);
+      rows[i] = table.find(wanted[i]);
+      missing[none] = wanted[i];
+      none += rows[i] < 0;
+    }
+    *count = none;
+  });
+}
+
+// colors (count, 3) -> packed (count,): r | g << 10 | b << 20, in steps of a stored colour.
+PC_EXPORT int32_t pc_tsdf_pack_colors(const pc_context*, const uint8_t* colors, int64_t count, int32_t* packed) {
+  return pc::guarded([&] {
+    for (int64_t i = 0; i < count; ++i)
+      packed[i] = colors[3 * i] << 2 | colors[3 * i + 1] << 12 | colors[3 * i + 2] << 22;
   });
 }
