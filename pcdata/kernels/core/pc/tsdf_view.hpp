@@ -46,7 +46,7 @@ inline float highest(const Corners& x) {
 struct SeenBlock {
   int64_t row;
   float first[3];     // its first voxel, as View::pose maps it
-  bool inside;        // every voxel is in front of the camera and falls on a pixel
+  bool inside;        // every voxel falls on a pixel, further away than no reading (0) could be near
   int32_t entries;    // of the table that holds these pixels; 0 where they are too many for one
   int32_t u, v;       // the first pixel of the table
   int32_t shift;      // rows of the table are 1 << shift pixels apart
@@ -123,7 +123,7 @@ class Sight {
     const float top = lowest(v) - margin, bottom = highest(v) + margin;
     const auto width = static_cast<float>(view_.width), height = static_cast<float>(view_.height);
     if (!(left < width && right >= 0 && top < height && bottom >= 0)) return kNothing;
-    seen.inside = left >= 0 && right < width && top >= 0 && bottom < height;
+    seen.inside = left >= 0 && right < width && top >= 0 && bottom < height && nearest > truncation();
     const auto first_u = static_cast<int32_t>(std::max(left, 0.0f)), first_v = static_cast<int32_t>(std::max(top, 0.0f));
     const auto last_u = static_cast<int32_t>(std::min(right, width - 1));
     const auto last_v = static_cast<int32_t>(std::min(bottom, height - 1));
@@ -165,12 +165,13 @@ class Sight {
     return {lowest_lane<float>(low), highest_lane<float>(high)};
   }
 
+  float truncation() const { return kTsdfScale / view_.scale * 1.00001f; }
+
   // By the truncation, and a little more than rounding may cost.
   Range widened(Range depth) const {
     if (!(depth.high > 0)) return kNothing;
-    const float truncation = kTsdfScale / view_.scale * 1.00001f;
-    const float low = view_.carve ? 0 : depth.low - depth.low * 1e-6f - truncation;
-    return {low, depth.high + depth.high * 1e-6f + truncation};
+    const float low = view_.carve ? 0 : depth.low - depth.low * 1e-6f - truncation();
+    return {low, depth.high + depth.high * 1e-6f + truncation()};
   }
 
   void mark(Range range, SeenBlock& seen) const {

@@ -145,29 +145,29 @@ void measure(const View& view, const VoxelPlanes& planes, Waiting& turn) {
     const FloatLanes inverse = 1.0f / z;
     FloatLanes u = (first_u + load<FloatLanes>(steps + at)) * inverse;
     FloatLanes v = (first_v + load<FloatLanes>(steps + kVoxels + at)) * inverse;
-    Truth inside = all_lanes();
+    Truth counts = all_lanes();
     if constexpr (kBent) {
       const float fx = view.pinhole[0], skew = view.pinhole[1], cx = view.pinhole[2], fy = view.pinhole[3];
       const FloatLanes radius = u * u + v * v;
-      inside = less(radius, zero + view.lens[12]);
+      counts = less(radius, zero + view.lens[12]);
       bend(view.lens, u, v, radius);
       u = ((u * fx + v * skew) + cx) + 0.5f;
       v = (v * fy + view.pinhole[4]) + 0.5f;
     }
     if constexpr (!kInside) {
-      inside = inside & less(zero, z) & at_most(zero, u) & less(u, zero + width) & at_most(zero, v) &
+      counts = counts & less(zero, z) & at_most(zero, u) & less(u, zero + width) & at_most(zero, v) &
                less(v, zero + height);
-      u = select(inside, u, zero);
-      v = select(inside, v, zero);
+      u = select(counts, u, zero);
+      v = select(counts, v, zero);
     }
     const IntLanes place = places.of(truncated(u), truncated(v));
     const FloatLanes reading = depth.at(place);
-    const FloatLanes scaled = (reading - z) * scale;
-    inside = inside & less(zero, reading);
-    store(turn.distance + at, select(inside, scaled, zero + Waiting::kNothing));
+    FloatLanes scaled = (reading - z) * scale;
+    if constexpr (!kInside) scaled = select(counts & less(zero, reading), scaled, zero + Waiting::kNothing);
+    store(turn.distance + at, scaled);
     store(turn.place + at, place);
     // Without branches: which groups these are, no processor foresees.
-    const bool is_near = (inside & at_most(scaled, furthest) & at_most(-most, scaled)).any();
+    const bool is_near = (at_most(scaled, furthest) & at_most(-most, scaled)).any();
     kept[at / kLanes / 32] |= static_cast<uint32_t>(is_near) << at / kLanes % 32;
     last = is_near ? at : last;
     __builtin_prefetch(tsdfs + last, 1);
