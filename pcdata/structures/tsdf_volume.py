@@ -112,7 +112,7 @@ class TSDFVolume:
         return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
 
     def _found(self, touched: list[Tensor]) -> tuple[list[Tensor], Tensor]:
-        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of all that are missing."""
+        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of those."""
         if self.blocks is None:
             found, missing = [], touched
         else:
@@ -156,7 +156,7 @@ class TSDFVolume:
                 f"TSDFVolume: every frame needs the images of the first, which had colours: {had.colors}, labels: "
                 f"{had.labels}; {frame!r} has colours: {has.colors}, labels: {has.labels}"
             )
-        if frame.labels is not None and int(frame.labels.abs().max()) >= 2**31:
+        if frame.labels is not None and not tsdf.fit_labels(frame.labels):
             raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
 
     def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
@@ -178,7 +178,7 @@ class TSDFVolume:
             world_from_camera=frame.world_from_camera[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
             color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
-            label=None if frame.labels is None else frame.labels[index].int(),
+            label=None if frame.labels is None else tsdf.pack_labels(frame.labels[index]),
         )
 
     def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> tuple[Tensor, Tensor]:

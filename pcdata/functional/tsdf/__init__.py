@@ -5,7 +5,7 @@ from pcdata.functional.tsdf.blocks import Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.marching import find_triangles
 from pcdata.functional.tsdf.surface import Crossings
-from pcdata.functional.tsdf.views import FusionView, Weighting, weight_image
+from pcdata.functional.tsdf.views import FusionView, Weighting, fit_labels, pack_labels, weight_image
 
 __all__ = [
     "Crossings",
@@ -17,8 +17,10 @@ __all__ = [
     "find_blocks",
     "find_crossings",
     "find_triangles",
+    "fit_labels",
     "integrate_view",
     "pack_colors",
+    "pack_labels",
     "touched_blocks",
     "weight_image",
 ]

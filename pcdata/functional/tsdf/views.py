@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,6 +50,19 @@ def pack_colors(colors: Tensor) -> Tensor:
     """Pack (..., 3) uint8 RGB into (...) int32, as voxels store it."""
     r, g, b = (colors.int() * COLOR_SCALE).unbind(-1)
     return r | (g << 10) | (b << 20)
+
+
+def fit_labels(labels: Tensor) -> bool:
+    """Say whether int64 labels fit the 32 bits of a voxel."""
+    found = labels.numpy() if labels.device.type == "cpu" else labels  # see pcdata.checks on NumPy
+    return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
+
+
+def pack_labels(labels: Tensor) -> Tensor:
+    """Convert int64 labels that fit to int32, as voxels store them."""
+    if labels.device.type == "cpu":
+        return torch.from_numpy(labels.numpy().astype(np.int32))
+    return labels.int()
 
 
 def weight_image(
