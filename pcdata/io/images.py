@@ -75,7 +75,7 @@ def read_depth(
         depth = table[raw]
     else:
         depth = _clean_float_depth(where, raw, unit, invalid_values)
-    _check_plausible(where, depth, unit)
+    check_plausible(where, depth, unit)
     return torch.from_numpy(depth)
 
 
@@ -138,7 +138,8 @@ def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Coll
     return depth
 
 
-def _check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
+def check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
+    """Require readings, and half of them at distances that depth cameras see."""
     valid = depth[depth > 0]
     if not len(valid):
         raise NoReadingError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
