@@ -1,5 +1,5 @@
-// The grid of a truncated signed distance field and what a view needs to be averaged into it. The layout of keys, blocks
-// and planes is that of pcdata/functional/tsdf; results equal that reference bit for bit.
+// The grid of a truncated signed distance field and what a view needs to be averaged into it. The layout of keys,
+// blocks and planes is that of pcdata/functional/tsdf; results equal that reference bit for bit.
 #pragma once
 
 #include <cmath>
@@ -73,8 +73,8 @@ inline IntLanes truncated(const FloatLanes& lanes) { return __builtin_convertvec
 // The greatest integer that is not above; INT32_MIN for what no int32 holds.
 inline IntLanes floored(const FloatLanes& x) {
 #if defined(__AVX512DQ__)
-  return reinterpret_cast<IntLanes>(
-      _mm512_cvt_roundps_epi32(reinterpret_cast<__m512>(x), _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC));
+  constexpr int down = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+  return reinterpret_cast<IntLanes>(_mm512_maskz_cvt_roundps_epi32(0xffff, reinterpret_cast<__m512>(x), down));
 #elif defined(__AVX2__)
   return reinterpret_cast<IntLanes>(_mm256_cvtps_epi32(_mm256_floor_ps(reinterpret_cast<__m256>(x))));
 #else
@@ -86,7 +86,7 @@ inline IntLanes floored(const FloatLanes& x) {
 // The nearest integer, the even one of two; for values below 2^22.
 inline IntLanes rounded(const FloatLanes& x) {
 #if defined(__AVX512DQ__)
-  return reinterpret_cast<IntLanes>(_mm512_cvtps_epi32(reinterpret_cast<__m512>(x)));
+  return reinterpret_cast<IntLanes>(_mm512_maskz_cvtps_epi32(0xffff, reinterpret_cast<__m512>(x)));
 #elif defined(__AVX2__)
   return reinterpret_cast<IntLanes>(_mm256_cvtps_epi32(reinterpret_cast<__m256>(x)));
 #else

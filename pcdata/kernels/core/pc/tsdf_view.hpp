@@ -108,23 +108,26 @@ class Sight {
     }
   }
 
-  // The depths at which voxels of a block may be updated. The pixels of a block are those between its corners'; rounding
-  // moves them by less than the margin as long as the block is not much deeper than it is near.
+  // The depths at which voxels of a block may be updated. The pixels of a block are those between its corners';
+  // rounding moves them by less than the margin as long as the block is not much deeper than it is near.
   Range look(SeenBlock& seen) const {
     constexpr float margin = 1.0f / 16, everything = std::numeric_limits<float>::infinity();
     constexpr int64_t widest = int64_t{1} << 15;
     const Corners z = seen.first[2] + corners_[2];
     const float nearest = lowest(z), furthest = highest(z);
     if (!(furthest > 0)) return kNothing;
-    if (!(nearest > 0.25f * furthest) || view_.width > widest || view_.height > widest) return {-everything, everything};
+    if (!(nearest > 0.25f * furthest)) return {-everything, everything};
+    if (view_.width > widest || view_.height > widest) return {-everything, everything};
     const Corners inverse = 1.0f / z;
     const Corners u = (seen.first[0] + corners_[0]) * inverse, v = (seen.first[1] + corners_[1]) * inverse;
     const float left = lowest(u) - margin, right = highest(u) + margin;
     const float top = lowest(v) - margin, bottom = highest(v) + margin;
     const auto width = static_cast<float>(view_.width), height = static_cast<float>(view_.height);
     if (!(left < width && right >= 0 && top < height && bottom >= 0)) return kNothing;
-    seen.inside = left >= 0 && right < width && top >= 0 && bottom < height && nearest > truncation();
-    const auto first_u = static_cast<int32_t>(std::max(left, 0.0f)), first_v = static_cast<int32_t>(std::max(top, 0.0f));
+    const bool on_pixels = left >= 0 && right < width && top >= 0 && bottom < height;
+    seen.inside = on_pixels && nearest > truncation();
+    const auto first_u = static_cast<int32_t>(std::max(left, 0.0f));
+    const auto first_v = static_cast<int32_t>(std::max(top, 0.0f));
     const auto last_u = static_cast<int32_t>(std::min(right, width - 1));
     const auto last_v = static_cast<int32_t>(std::min(bottom, height - 1));
     if (kHasTables && seen.inside) choose_table(first_u, last_u, first_v, last_v, seen);
@@ -150,7 +153,7 @@ class Sight {
   // The range of the readings in some pixels; it may take more pixels in.
   Range readings(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v) const {
     constexpr float everything = std::numeric_limits<float>::infinity();
-    constexpr int32_t most = 64;  // pixels each way: then there are several per voxel, and looking costs more than it saves
+    constexpr int32_t most = 64;  // pixels each way: looking at more costs more than it saves
     const int64_t pixels = view_.width * view_.height;
     if (last_u - first_u >= most || last_v - first_v >= most || pixels < kLanes) return {0, everything};
     const FloatLanes none = FloatLanes{} + everything;
@@ -178,7 +181,8 @@ class Sight {
     seen.clear();
     if (range.low > range.high) return;
     for (int g = 0; g < kGroups; g += kLanes) {
-      const FloatLanes low = seen.first[2] + load<FloatLanes>(low_ + g), high = seen.first[2] + load<FloatLanes>(high_ + g);
+      const FloatLanes low = seen.first[2] + load<FloatLanes>(low_ + g);
+      const FloatLanes high = seen.first[2] + load<FloatLanes>(high_ + g);
       const uint32_t bits = bits_of_lanes((low <= range.high) & (high >= range.low) & (high > 0));
       seen.groups[g / 32] |= bits << g % 32;
     }
