@@ -7,6 +7,8 @@ Both average signed distances along z at the nearest pixel, so they can only dif
   before).
 * Open3D opens the blocks along every fourth pixel's ray, pcdata along every pixel's: at rims and on thin things some
   voxels near the surface belong to no block, or to none that this view touches.
+* Open3D does not read an image's last column and row: it asks that the coordinate of a pixel's corner, with its
+  fraction, be at most the width less one.
 
 ``edges_by_cause`` computes both averages anew from the images, in float64, at the two ends of the edges on which
 pcdata's points lie, and says in which of these ways the two differ there. The share of ends at which the average so
@@ -55,7 +57,7 @@ class Averages:
     open3d_sum: Tensor  # of those that Open3D averages
     open3d: Tensor
     free: Tensor  # of these, how many are free space
-    missed: Tensor  # how many within the truncation fall in blocks that Open3D does not open for the view
+    missed: Tensor  # how many within the truncation Open3D does not read: no block open for the view, or the last pixel
 
 
 def averages_at(
@@ -75,14 +77,15 @@ def averages_at(
         x, y, z = (places @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
         k, depth = frame.camera.intrinsics[0], frame.depth[0]
         height, width = depth.shape
-        u = (x / z * k[0, 0] + k[0, 2]).add(0.5).floor().long()
-        v = (y / z * k[1, 1] + k[1, 2]).add(0.5).floor().long()
+        right, down = x / z * k[0, 0] + k[0, 2] + 0.5, y / z * k[1, 1] + k[1, 2] + 0.5
+        u, v = right.floor().long(), down.floor().long()
         inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         reading = depth[v.clamp(0, height - 1), u.clamp(0, width - 1)].double()
         distance = (reading - z) / truncation
         read = inside & (reading > 0)
         near = read & (distance.abs() <= 1)
         is_open = keys[torch.searchsorted(keys, blocks).clamp(max=len(keys) - 1)] == blocks
+        is_open &= (right <= width - 1) & (down <= height - 1)
         joins = read & (distance >= -1) & is_open
         found.near_sum += torch.where(near, distance, 0)
         found.near += near

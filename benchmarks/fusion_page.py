@@ -11,7 +11,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "fusion.md"
 CAUSES = {
     "same": "the same readings",
     "free": "free space too",
-    "missed": "fewer readings: no block was open",
+    "missed": "fewer readings",
 }
 
 
@@ -112,6 +112,11 @@ def _causes(runs: list[dict[str, Any]]) -> str:
     return _markdown(header, rows)
 
 
+def _predicted(runs: list[dict[str, Any]]) -> str:
+    header = ["voxel", "truncation", "points with the distances and weights that Open3D stores"]
+    return _markdown(header, [[*_lengths(run), f"{100 * run['causes']['predicted']:.1f} %"] for run in runs])
+
+
 def _against(rows: dict[str, dict[str, Any]], name: str, kind: str, form: str) -> str:
     """A value, and how many times that of pcdata it is."""
     value, ours = rows[name][kind], rows["pcdata"][kind]
@@ -138,5 +143,6 @@ _TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "legacy speed": lambda result: _speed(result["legacy"]),
     "legacy memory": lambda result: _memory(result["legacy"]),
     "agreement": lambda result: _agreement(result["recording"]),
+    "predicted": lambda result: _predicted(result["recording"]),
     "causes": lambda result: _causes(result["recording"]),
 }

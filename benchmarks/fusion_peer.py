@@ -61,6 +61,7 @@ class Open3DGrid:
     num_blocks: int = 10_000  # room for so many, then it doubles
 
     def __post_init__(self) -> None:
+        self.multiple = float(self.multiple)  # its bindings take no integer there
         self.grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
             attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
@@ -108,13 +109,20 @@ class Open3DGrid:
 _PLANES = ("tsdf", "weight")
 
 
-def count_blocks(views: Iterable[Open3DView], voxel_size: float, multiple: float) -> int:
-    """How many blocks a grid of these views needs, so that it can be given that room from the start."""
+def room_for(views: Iterable[Open3DView], voxel_size: float, multiple: float) -> int:
+    """How many blocks a grid of these views must have room for so that it never grows, which copies them all.
+
+    The blocks that it will hold, and once more those of the view that touches most: before it opens the blocks of a
+    view it makes room for all of them, the known ones too.
+    """
     grid = Open3DGrid(voxel_size, multiple, num_blocks=1)
     found: set[tuple[int, ...]] = set()
+    most = 0
     for view in views:
-        found.update(map(tuple, grid.touched(view).numpy().tolist()))
-    return len(found)
+        blocks = grid.touched(view).numpy().tolist()
+        found.update(map(tuple, blocks))
+        most = max(most, len(blocks))
+    return len(found) + most
 
 
 def positions(cloud: Any) -> Tensor:
