@@ -62,12 +62,7 @@ class Library(ABC):
     def row(self) -> dict[str, Any]:
         """What was measured."""
         cpu, wall = (1000 * statistics.median(times) for times in zip(*self.times[1:], strict=True))
-        return {"cpu ms": cpu, "wall ms": wall, **self.found, "stored MiB": self.num_bytes / 2**20}
-
-    @property
-    @abstractmethod
-    def num_bytes(self) -> int:
-        """What the voxels take."""
+        return {"cpu ms": cpu, "wall ms": wall, **self.found}
 
     @abstractmethod
     def _integrate(self, number: int) -> None: ...
@@ -92,13 +87,14 @@ class Ours(Library):
     def _integrate(self, number: int) -> None:
         self._volume.integrate(self._frames[number])
 
+    def extract(self, once: bool) -> None:
+        """Extract the surface and let go of the volume."""
+        super().extract(once)
+        self.found["stored MiB"] = self._volume.num_bytes / 2**20
+        del self._volume
+
     def _extract(self) -> None:
         self.cloud = self._volume.extract_points().points
-
-    @property
-    def num_bytes(self) -> int:
-        """What the voxels take."""
-        return self._volume.num_bytes
 
 
 class Theirs(Library):
@@ -124,12 +120,7 @@ class Theirs(Library):
         self.cloud = torch.empty(0, 3)
         super().extract(once)
         self.cloud = positions(self._found)
-        self.found["points"] = len(self.cloud)
-
-    @property
-    def num_bytes(self) -> int:
-        """What the voxels take."""
-        return self.grid.num_bytes
+        self.found |= {"points": len(self.cloud), "stored MiB": self.grid.num_bytes / 2**20}
 
 
 class Legacy(Library):
@@ -153,18 +144,9 @@ class Legacy(Library):
         """Extract the surface; the memory is measured there too, as the process holds nothing else."""
         answer = self._volume.extract()
         self.found |= {"extract cpu s": answer["cpu"], "extract wall s": answer["wall"], "points": answer["points"]}
-        self.found |= {"version": self._volume.version}
+        self.found |= {"version": self._volume.version, "stored MiB": None}  # it does not tell
         self.found |= {"peak MiB": answer["integrated"] / 2**20, "peak extracting MiB": answer["extracted"] / 2**20}
         self._volume.close()
-
-    def row(self) -> dict[str, Any]:
-        """What was measured; it does not tell what its voxels take."""
-        return {**super().row(), "stored MiB": None}
-
-    @property
-    def num_bytes(self) -> int:
-        """Unknown."""
-        return 0
 
     def _integrate(self, number: int) -> None: ...
 

@@ -15,6 +15,9 @@ CAUSES = {
 }
 
 
+LENGTHS = ("voxel", "truncation", "frames")
+
+
 def tables(result: dict[str, Any]) -> dict[str, str]:
     """Every table, as Markdown, by the name that it has on the page."""
     return {name: make(result) for name, make in _TABLES.items()}
@@ -63,7 +66,7 @@ def _workspace(result: dict[str, Any]) -> str:
 
 
 def _speed(runs: list[dict[str, Any]]) -> str:
-    header = ["voxel", "truncation", "library", "a frame", "on two threads", "extraction", "on two threads"]
+    header = [*LENGTHS, "library", "a frame", "on two threads", "extraction", "on two threads"]
     rows = []
     for run in runs:
         for name in run["libraries"]:
@@ -78,7 +81,7 @@ def _speed(runs: list[dict[str, Any]]) -> str:
 
 
 def _memory(runs: list[dict[str, Any]]) -> str:
-    header = ["voxel", "truncation", "library", "stored voxels", "the process grows by", "and extracting"]
+    header = [*LENGTHS, "library", "stored voxels", "the process grows by", "and extracting"]
     rows = []
     for run in runs:
         for name, row in run["memory"].items():
@@ -89,7 +92,7 @@ def _memory(runs: list[dict[str, Any]]) -> str:
 
 
 def _agreement(runs: list[dict[str, Any]]) -> str:
-    header = ["voxel", "truncation", "pcdata", "a quarter voxel", "ours to theirs", "theirs to ours"]
+    header = [*LENGTHS, "pcdata", "a quarter voxel", "ours to theirs", "theirs to ours"]
     header += ["our points", "theirs"]
     rows = []
     for run in runs:
@@ -102,7 +105,7 @@ def _agreement(runs: list[dict[str, Any]]) -> str:
 
 
 def _causes(runs: list[dict[str, Any]]) -> str:
-    header = ["voxel", "truncation", "Open3D averaged, next to the point", "points of pcdata"]
+    header = [*LENGTHS, "Open3D averaged, next to the point", "points of pcdata"]
     header += ["Open3D has one on the same edge", "median distance to Open3D's nearest"]
     rows = []
     for run in runs:
@@ -113,7 +116,7 @@ def _causes(runs: list[dict[str, Any]]) -> str:
 
 
 def _predicted(runs: list[dict[str, Any]]) -> str:
-    header = ["voxel", "truncation", "points with the distances and weights that Open3D stores"]
+    header = [*LENGTHS, "points with the distances and weights that Open3D stores"]
     return _markdown(header, [[*_lengths(run), f"{100 * run['causes']['predicted']:.1f} %"] for run in runs])
 
 
@@ -124,7 +127,7 @@ def _against(rows: dict[str, dict[str, Any]], name: str, kind: str, form: str) -
 
 
 def _lengths(run: dict[str, Any]) -> list[str]:
-    return [f"{run['voxel mm']:g} mm", f"{run['truncation voxels']:g} voxels"]
+    return [f"{run['voxel mm']:g} mm", f"{run['truncation voxels']:g} voxels", str(run["frames"])]
 
 
 def _length(millimetres: float) -> str:

@@ -98,3 +98,16 @@ def test_every_difference_to_open3d_has_a_known_cause(benchmark, frames) -> None
     assert row["same, Open3D crosses"] > 0.99
     assert row["same, mm"] < 0.01
     assert row["free, mm"] > 1.0
+
+
+@pytest.mark.open3d
+def test_carving_gives_the_surface_of_open3d(benchmark, frames) -> None:
+    """Like with like: both count free space, up to which voxels it is counted in."""
+    pytest.importorskip("open3d")
+    agreement, peer = benchmark("fusion_agreement"), benchmark("fusion_peer")
+    theirs = peer.open3d_surface(frames, VOXEL)
+    volume = TSDFVolume(voxel_size=VOXEL, carve=True)
+    for frame in frames:
+        volume.integrate(frame)
+    row = agreement.surfaces_apart(volume.extract_points().points, theirs, VOXEL)
+    assert max(row["ours to theirs, mm"], row["theirs to ours, mm"]) < 1000 * VOXEL / 4

@@ -59,7 +59,7 @@ def in_place(volume: TSDFVolume) -> dict[str, Tensor]:
 steps = st.integers(-600, 600)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.tuples(steps, steps, steps), st.integers(0, 3))
 def test_moving_the_world_by_whole_blocks_moves_the_field_and_changes_no_bit_of_it(shift, seed):
     """On either side of the origin, whatever the readings."""
@@ -75,7 +75,7 @@ def test_moving_the_world_by_whole_blocks_moves_the_field_and_changes_no_bit_of_
         assert one.fields()[name].equal(other.fields()[name]), name
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.tuples(*[st.integers(-40, 40)] * 3))
 def test_moving_the_world_by_whole_voxels_moves_every_point_by_exactly_that(shift):
     """Wherever the borders of the blocks cut a surface, its points are the same, away from the rim of the image."""
