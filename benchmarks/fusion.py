@@ -19,6 +19,7 @@ import os
 import platform
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def main() -> None:
     result: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     if not arguments.kept:
         torch.set_num_threads(1)
-        result |= {"machine": machine(), "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__}}
+        packages = {name: version(name) for name in ("torch", "open3d")}
+        result |= {"machine": machine(), "versions": {"pcdata": pcdata.__version__, **packages}}
         if not arguments.skip_truth:
             result |= {"truth": truth_rows(), "workspace": workspace_rate()}
         if "PCDATA_TEST_DATA" in os.environ and not arguments.skip_open3d:
@@ -59,7 +61,8 @@ def main() -> None:
 
 
 def machine() -> dict[str, Any]:
-    return {"cores": os.cpu_count(), "processor": platform.processor() or platform.machine()}
+    load = os.getloadavg()[0]  # beyond 1, others were at work and the wall clock is theirs too
+    return {"cores": os.cpu_count(), "processor": platform.processor() or platform.machine(), "load": load}
 
 
 def tensor(voxel_size: float, multiple: float, frames: int) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ CAUSES = {
 }
 
 
+_END = "<!-- end -->"
 LENGTHS = ("voxel", "truncation", "frames")
 
 
@@ -38,10 +38,20 @@ def shown(name: str) -> str:
 
 
 def _parted(text: str, name: str) -> tuple[str, str, str]:
-    parts = re.split(rf"(?<=<!-- table: {name} -->\n)(.*?)(?=<!-- end -->)", text, flags=re.DOTALL)
-    if len(parts) != 3:
-        raise ValueError(f"{PAGE} must have one table named {name!r}, found {(len(parts) - 1) // 2}")
-    return parts[0], parts[1], parts[2]
+    """The page before, in and after a table."""
+    start = f"<!-- table: {name} -->\n"
+    before, found, rest = text.partition(start)
+    table, ended, after = rest.partition(_END)
+    if not found or not ended or start in after:
+        raise ValueError(f"{PAGE} must have one table named {name!r}, from {start.strip()} to {_END}")
+    return before + start, table, _END + after
+
+
+def _machine(result: dict[str, Any]) -> str:
+    header = ["cores", "processor", "load average at the start", *result["versions"]]
+    machine = result["machine"]
+    cells = [str(machine["cores"]), machine["processor"], f"{machine['load']:.1f}"]
+    return _markdown(header, [[*cells, *result["versions"].values()]])
 
 
 def _truth(result: dict[str, Any]) -> str:
@@ -139,6 +149,7 @@ def _markdown(header: list[str], rows: list[list[str]]) -> str:
 
 
 _TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "machine": _machine,
     "truth": _truth,
     "workspace": _workspace,
     "speed": lambda result: _speed(result["recording"]),
