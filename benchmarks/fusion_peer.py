@@ -12,9 +12,8 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import open3d as o3d
@@ -28,8 +27,7 @@ _FAR = 10.0  # metres, beyond every reading
 _SEEN = 0.5  # views: keep whatever was seen once
 
 
-@dataclass(frozen=True)
-class Open3DView:
+class Open3DView(NamedTuple):
     """One view in the types that Open3D's kernels read."""
 
     depth: Any
@@ -52,23 +50,22 @@ class Open3DView:
         )
 
 
-@dataclass(eq=False)
 class Open3DGrid:
-    """A tensor grid with distance, weight and colour."""
+    """A tensor grid with distance, weight and colour; ``multiple`` is its truncation in voxels.
 
-    voxel_size: float
-    multiple: float  # truncation in voxels
-    num_blocks: int = 10_000  # room for so many, then it doubles
+    It takes room for ``num_blocks`` at once, and doubles that when it is used up.
+    """
 
-    def __post_init__(self) -> None:
-        self.multiple = float(self.multiple)  # its bindings take no integer there
+    def __init__(self, voxel_size: float, multiple: float, num_blocks: int = 10_000) -> None:
+        self.voxel_size = voxel_size
+        self.multiple = float(multiple)  # its bindings take no integer there
         self.grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
             attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
             attr_channels=((1), (1), (3)),
-            voxel_size=self.voxel_size,
+            voxel_size=voxel_size,
             block_resolution=BLOCK,
-            block_count=self.num_blocks,
+            block_count=num_blocks,
             device=o3d.core.Device("CPU:0"),
         )
 
