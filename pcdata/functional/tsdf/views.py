@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.functional import rigid
 from pcdata.functional.lens import fold_radius
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
 
@@ -34,11 +35,7 @@ class FusionView:
     @property
     def camera_from_world(self) -> Tensor:
         """The pose the other way, (4, 4) float64."""
-        rotation = self.world_from_camera[:3, :3]
-        inverse = self.world_from_camera.clone()
-        inverse[:3, :3] = rotation.T
-        inverse[:3, 3] = -(rotation.T @ self.world_from_camera[:3, 3])
-        return inverse
+        return rigid.invert_rigid(self.world_from_camera)
 
     @property
     def fold(self) -> float:
