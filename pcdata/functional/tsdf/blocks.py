@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,7 +63,7 @@ class Chunk:
 
     @staticmethod
     def empty(planes: Planes, device: torch.device) -> Chunk:
-        """Reserve a chunk of zeros; on the CPU a page takes memory only once it is written."""
+        """Reserve a chunk of zeros; on the CPU a page, of 2 MB if possible, takes memory once it is written."""
         room = _zeros(CHUNK * planes.bytes_per_block, device).reshape(CHUNK, planes.bytes_per_block)
         found, start = {}, 0
         for name, dtype in planes.dtypes.items():
@@ -72,11 +74,14 @@ class Chunk:
 
 
 def _zeros(count: int, device: torch.device) -> Tensor:
-    if device.type != "cpu" or not hasattr(mmap, "MADV_HUGEPAGE"):
+    if device.type != "cpu":
         return torch.zeros(count, dtype=torch.uint8, device=device)
-    # A volume grows by tens of megabytes per view. Page faults of 4 KB would take longer than filling these.
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return torch.from_numpy(np.zeros(count, np.uint8))
+    # A volume grows by tens of megabytes per view: page faults of 4 KB would take longer than filling these.
     pages = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    pages.madvise(mmap.MADV_HUGEPAGE)
+    with contextlib.suppress(OSError):  # advice only: a system may be built without huge pages
+        pages.madvise(mmap.MADV_HUGEPAGE)
     return torch.frombuffer(pages, dtype=torch.uint8)
 
 
