@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -12,7 +12,8 @@ from pcdata.functional.depth import project_points
 from pcdata.functional.depth_patches import MIN_COSINE, DepthPatches, fit_depth_patches, patch_normals
 from pcdata.functional.neighbors import ball_query, knn
 
-_FLOOR_SIGMA = 5e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_FLOOR_SIGMA = 2e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_LEAST_DIRECTIONS = 8  # a table holds its three of the six unknowns with an eighth; more of it would add noise alone
 _FLOOR_NORMAL_SIGMA = 0.005  # radians, 0.3 degrees; likewise for normals
 
 
@@ -49,6 +50,10 @@ class Surface(Protocol):
     @property
     def knows_visibility(self) -> bool:
         """Whether the view can tell a sample that it could not see from one that it sees elsewhere."""
+        ...
+
+    def with_samples(self, samples: Samples) -> Surface:
+        """Return the same surface with other samples."""
         ...
 
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
@@ -91,6 +96,10 @@ class DepthSurface:
             patches.normal_sigma.flatten()[rows].clamp(min=_FLOOR_NORMAL_SIGMA),
         )
         return cls(patches, intrinsics.double(), distortion, (depth.shape[0], depth.shape[1]), samples)
+
+    def with_samples(self, samples: Samples) -> DepthSurface:
+        """Return the same surface with other samples."""
+        return replace(self, samples=samples)
 
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Project samples into the image and measure them against the patch whose centre is nearest."""
@@ -181,6 +190,10 @@ class CloudSurface:
         picked = (patches.points, patches.normals, patches.sigma, patches.normal_sigma)
         return cls(patches, Samples(*(values[kept] for values in picked)))
 
+    def with_samples(self, samples: Samples) -> CloudSurface:
+        """Return the same surface with other samples."""
+        return replace(self, samples=samples)
+
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Measure samples against the plane of the nearest patch; the side that a normal points to is ignored."""
         index, distance = knn(self.patches.points.float(), k=1, queries=points.float())
@@ -211,7 +224,7 @@ def evenly_by_direction(
     """Choose at most ``count`` rows so that the directions share them equally, evenly spaced within each.
 
     A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0. Where the preferred rows
-    of a direction fill its share, it takes only those.
+    of a direction fill its share, it takes only those. No direction gets more than an eighth of ``count``.
 
     Source: normal-space sampling, Rusinkiewicz & Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
     """
@@ -223,6 +236,7 @@ def evenly_by_direction(
     for size in sorted(size for size in sizes.tolist() if size):
         share = max(share, left // waiting)
         left, waiting = left - min(size, share), waiting - 1
+    share = min(share, max(1, count // _LEAST_DIRECTIONS))
     chosen = [normals.new_empty(0, dtype=torch.int64)]
     for one in sizes.nonzero().squeeze(1).tolist():
         rows = (box == one).nonzero().squeeze(1)
