@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional import rigid
-from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights
+from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights, unexplained_spread
 from pcdata.functional.small_motions import (
     PlaneSystem,
     TwistSolution,
@@ -26,7 +26,6 @@ from pcdata.functional.surfaces import Surface
 _SHARED_DATA = 2.0
 _WITHIN_NOISE = 0.25  # standard deviations
 _SETTLED = 5e-5  # metres and radians: a hundredth of what fails
-_MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class PairFit:
     num_visible: int  # of them, that the target could see
     knows_visibility: bool  # of the target; False: every sample counts as visible
     system: PlaneSystem  # 6x6, of moving the source, whitened
-    scale: float  # standard deviation of the whitened residuals: 1 where the noise model is right
+    unexplained: float  # metres, spread of the residuals beyond the sensors' noise: waves and bias in their depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,15 +196,15 @@ def _measure(
     row, residual, points, normals, sigma, tilt = (torch.cat(part) for part in zip(*parts))
     points = points @ world_from_target[:3, :3].T + world_from_target[:3, 3]
     normals = normals @ world_from_target[:3, :3].T
-    scale = robust_scale(residual / sigma).clamp(min=_MIN_SCALE)
+    unexplained = unexplained_spread(residual, sigma)
     # Tukey's cut is the distance of this scale, not the spread of the residuals: most of them lie on the table, which
     # fits however far the view slid along it, and would have the sides of the objects thrown out as outliers.
     cut = residual.new_tensor(max_distance / TUKEY_CUT)
-    weights = robust_weights(residual, cut, "tukey") / (sigma * scale).square()
+    weights = robust_weights(residual, cut, "tukey") / (sigma.square() + unexplained.square())
     system = plane_system(points, normals, residual, weights, pivot=pivot, normal_sigma=tilt)
     knows_visibility = all(capture[target].knows_visibility for capture in captures)
     return PairFit(
-        source, target, row, residual, points, num_samples, num_visible, knows_visibility, system, float(scale)
+        source, target, row, residual, points, num_samples, num_visible, knows_visibility, system, float(unexplained)
     )
 
 
