@@ -237,8 +237,10 @@ def _check(
     for camera, found in zip(cameras, judged.cameras):
         if found.unmeasurable:
             reasons.append(
-                f"{camera.name}: the scene does not determine its pose: {'; '.join(found.unmeasurable)}; put objects "
-                "with upright sides where the cameras overlap, or give several captures"
+                f"{camera.name}: the scene does not determine its pose: {'; '.join(found.unmeasurable)} (standard "
+                f"deviations up to {1e3 * found.shift_sigma:.2g} mm and {found.rotation_sigma_degrees:.2g} degrees, at "
+                f"most {1e3 * limits.max_shift_sigma:g} mm and {limits.max_rotation_sigma_degrees:g} degrees are "
+                "allowed); put objects with upright sides where the cameras overlap, or give several captures"
             )
             continue
         if camera.shift > max_shift or camera.rotation_degrees > max_rotation_degrees:

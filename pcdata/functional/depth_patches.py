@@ -71,7 +71,9 @@ def fit_depth_patches(
         fit = _fit(depth, wider, first, stride)
         freedom = (fit.count - 6).clamp(min=1)
         good = fit.holds & holds & (fit.variance <= allowed * (1 + _MAX_EXCESS * (2 / freedom).sqrt()))
-        taken = _Fit(*(torch.where(good.reshape(good.shape + (1,) * (old.ndim - 2)), new, old) for old, new in zip(taken, fit)))
+        taken = _Fit(
+            *(torch.where(good.reshape(good.shape + (1,) * (old.ndim - 2)), new, old) for old, new in zip(taken, fit))
+        )
         half = torch.where(good, wider, half)
     inverse_depth = taken.coefficients[..., 0]
     holds = holds & (inverse_depth > 0)
@@ -125,21 +127,22 @@ def _fit(depth: Tensor, half: int, first: int, stride: int) -> _Fit:
     weight = _window_moments(valid, half, first, stride, 4)
     moment = _window_moments(inverse, half, first, stride, 2)
     square = _window_moments(inverse.square(), half, first, stride, 0)[..., 0, 0]
-    normal = torch.stack(
-        [torch.stack([weight[..., v + b, u + a] for a, b in _POWERS], -1) for u, v in _POWERS], -2
-    )
-    right = torch.stack([moment[..., v, u] for u, v in _POWERS], -1)
+    # Moment (v, u) of degree 4 and of degree 2, in the order of the unknowns.
+    pairs = torch.tensor([[5 * (v + b) + u + a for a, b in _POWERS] for u, v in _POWERS], device=depth.device)
+    singles = torch.tensor([3 * v + u for u, v in _POWERS], device=depth.device)
+    normal = weight.flatten(-2)[..., pairs.flatten()].unflatten(-1, (6, 6))
+    right = moment.flatten(-2)[..., singles]
     count = normal[..., 0, 0]
     holds = count >= _MIN_VALID * (2 * half + 1) ** 2
     one = torch.eye(6, dtype=torch.float64, device=depth.device)
     factor, failed = torch.linalg.cholesky_ex(torch.where(holds[..., None, None], normal, one))
     holds = holds & (failed == 0)
-    inverted = torch.cholesky_inverse(torch.where(holds[..., None, None], factor, one))
-    solution = (inverted @ right[..., None])[..., 0]
+    factor = torch.where(holds[..., None, None], factor, one)
+    solution = torch.cholesky_solve(right[..., None], factor)[..., 0]
     residual = (square - (solution * right).sum(-1)).clamp(min=0)
     # The moments were taken over offsets in half windows, so that high powers stay near 1.
     scale = solution.new_tensor([half ** -(u + v) for u, v in _POWERS])
-    slope = torch.maximum(inverted[..., 1, 1], inverted[..., 2, 2]).sqrt() / half
+    slope = torch.minimum(normal[..., 1, 1], normal[..., 2, 2]).clamp(min=1e-12).rsqrt() / half
     return _Fit(solution * scale, residual / (count - 6).clamp(min=1), slope, count, holds)
 
 
@@ -151,7 +154,9 @@ def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: i
     if height <= 2 * first or width <= 2 * first:
         return image.new_zeros(max(0, height - 2 * first), max(0, width - 2 * first), degree + 1, degree + 1)
     # Row i of the padded image is row i - half of the image: the window about centre c starts at row c.
-    padded = torch.nn.functional.pad(image, (half,) * 4)[first : height - first + 2 * half, first : width - first + 2 * half]
+    padded = torch.nn.functional.pad(image, (half,) * 4)[
+        first : height - first + 2 * half, first : width - first + 2 * half
+    ]
     along_u = padded.unfold(1, 2 * half + 1, stride) @ powers
     return (along_u.unfold(0, 2 * half + 1, stride) @ powers).transpose(-1, -2)
 

@@ -119,7 +119,9 @@ class DepthSurface:
         index = line * width + column
         u, v = (pixels[rows] - patches.first - patches.stride * cell[rows]).unbind(1)
         a, b, c, d, e, f = patches.coefficients.reshape(-1, 6)[index].unbind(1)
-        inverse = torch.stack([a + u * (b + d * u + e * v) + v * (c + f * v), b + 2 * d * u + e * v, c + e * u + 2 * f * v], 1)
+        inverse = torch.stack(
+            [a + u * (b + d * u + e * v) + v * (c + f * v), b + 2 * d * u + e * v, c + e * u + 2 * f * v], 1
+        )
         # Behind the surface by more than a calibration could be wrong: hidden by something nearer.
         seen = torch.where((patches.depth.flatten()[index] > 0) & (inverse[:, 0] > 0), 1 / inverse[:, 0], 0.0)
         behind = z[rows] - seen

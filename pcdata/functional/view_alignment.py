@@ -66,7 +66,7 @@ def align_views(
     fixed: int = 0,
     max_distances: Sequence[float] = (0.06, 0.03, 0.015, 0.008, 0.004),
     max_angle: float = 0.6,
-    max_iterations: int = 12,
+    max_iterations: int = 20,
 ) -> ViewAlignment:
     """Move all views but one so that their surfaces meet, over all pairs and captures in one least-squares.
 
