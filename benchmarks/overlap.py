@@ -180,7 +180,7 @@ def two_views(a: DepthFrame, b: DepthFrame) -> DepthFrame:
 
 
 def real_pairs() -> dict[str, Any]:
-    """Every pair of successive frames: gaps within 30 mm, over the same samples before and after, left out of the fit."""
+    """Every pair of successive frames: gaps of the samples left out of the fit, the same before and after."""
     frames = recording()
     rows = []
     for index in range(len(frames) - 1):

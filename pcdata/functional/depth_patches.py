@@ -24,7 +24,7 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v, in the
 
 @dataclass(frozen=True, eq=False)
 class DepthPatches:
-    """A grid of patches of one depth image, 1/z = a + b u + c v + d u^2 + e u v + f v^2, u and v pixels from a centre."""
+    """A grid of patches 1/z = a + b u + c v + d u^2 + e u v + f v^2, u and v pixels from the centre of each."""
 
     coefficients: Tensor  # (h, w, 6) float64, 1/metre
     points: Tensor  # (h, w, 3) float64, where the ray of the window's centre meets the patch
@@ -69,7 +69,7 @@ def fit_depth_patches(
     half = torch.where(holds, halves[0], 0)
     for wider in halves[1:]:
         fit = _fit(depth, wider, first, stride)
-        freedom = (fit.count - 6).clamp(min=1)
+        freedom = (fit.pixels - 6).clamp(min=1)
         good = fit.holds & holds & (fit.variance <= allowed * (1 + _MAX_EXCESS * (2 / freedom).sqrt()))
         taken = _Fit(
             *(torch.where(good.reshape(good.shape + (1,) * (old.ndim - 2)), new, old) for old, new in zip(taken, fit))
@@ -116,7 +116,7 @@ class _Fit(NamedTuple):
     coefficients: Tensor  # (h, w, 6)
     variance: Tensor  # (h, w) of 1/z about the patch
     slope_spread: Tensor  # (h, w) standard deviation of the steeper of b and c for pixels of unit variance
-    count: Tensor  # (h, w) pixels
+    pixels: Tensor  # (h, w) that have a reading
     holds: Tensor  # (h, w) bool, enough pixels
 
 

@@ -81,11 +81,33 @@ def test_a_camera_knocked_over_is_refused():
         refine_extrinsics([rig(0)], names=NAMES, max_shift=0.005)
 
 
+def test_poses_that_are_right_are_not_made_worse():
+    frame = rig(0, millimetres=0.0, degrees=0.0)
+    try:
+        found = refine_extrinsics([frame], names=NAMES, fixed="left")
+    except CalibrationError as error:
+        assert "as well as these captures can tell" in str(error)
+    else:
+        assert found.median_gap[1] < found.median_gap[0]
+        assert found.rmse_gap[1] < found.rmse_gap[0]
+        assert max(camera.shift for camera in found.cameras) < 1e-3
+
+
+def test_gaps_are_those_of_samples_left_out_and_fall():
+    found = refine_extrinsics([rig(0)], names=NAMES)
+    assert found.rmse_gap[1] < found.rmse_gap[0] / 2
+    assert found.median_gap[1] < found.median_gap[0]
+    assert "left out of the fit" in found.text()
+    assert found.to_json()["rmse_gap"] == list(found.rmse_gap)
+
+
 def test_a_bare_table_is_refused_as_undetermined():
     bare = tabletop(0, 0, 3, noise="stereo", floor=False, size=(360, 480)).frame
     depth = torch.zeros_like(bare.depth)
     depth[:, 120:240, 150:330] = bare.depth[:, 120:240, 150:330]
-    with pytest.raises(CalibrationError, match=r"does not determine its pose: shift along .*upright sides"):
+    with pytest.raises(
+        CalibrationError, match=r"does not determine its pose: shift along .*at most 1 mm.*upright sides"
+    ):
         refine_extrinsics([replace(bare, depth=depth)], names=NAMES, fixed="left")
 
 
