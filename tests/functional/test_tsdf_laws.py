@@ -89,6 +89,15 @@ def test_moving_the_world_by_whole_voxels_moves_every_point_by_exactly_that(shif
     assert found[0] == found[1]
 
 
+def test_a_pose_that_is_a_rotation_to_four_digits_puts_the_surface_where_it_puts_the_points():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] *= 1 - 4e-4  # R R^T is 8e-4 off the identity: readers accept it
+    depth = torch.full((1, 24, 32), 2.0)
+    volume = fused(DepthFrame(depth=depth, camera=CAMERA, world_from_camera=pose[None], frame_id="world"))
+    z = volume.extract_points().points[:, 2]
+    assert float((z - 2.0 * (1 - 4e-4)).abs().max()) < 1e-5
+
+
 def test_the_order_of_views_changes_nothing_but_the_rounding():
     frames = [frame_at((step, 0, -step), rough(step)) for step in range(4)]
     first = fused(*frames)
