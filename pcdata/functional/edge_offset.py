@@ -33,8 +33,7 @@ _COLOR_NOISE = 12.0  # grey levels of 255: colour steps below this are noise and
 _NOISE_STEPS = 4  # steps of that height, summed along a normal, have half a vote
 _MIN_EDGES = 150  # rim points; fewer come from a single small object
 _LEAST_SPREAD = 0.25  # pixels: nobody knows a shift better than that from rims of whole pixels
-# 95 % of Fisher's F with 3 (two components of the shift, and the bias) and 1 to 7 (parts but one) degrees of freedom.
-_F_95 = (215.7, 19.16, 9.28, 6.59, 5.41, 4.76, 4.35)
+_CHANCE = 0.05  # that the true shift is ruled out
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,8 @@ def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
         float(shifts[across]) + _GRID_STEP * _vertex(total[:, down, which], across),
         float(shifts[down]) + _GRID_STEP * _vertex(total[across, :, which], down),
     )
-    possible = shifts[_not_ruled_out(scores, best, votes.histogram).any(2).nonzero().cpu()]  # (N, 2)
+    kept = _not_ruled_out(scores, best, votes.histogram).cpu()  # (X, Y, B)
+    possible = shifts[kept.any(2).nonzero()]  # (N, 2)
     spread = (possible - torch.tensor(shift)).abs().amax(0).clamp_min(_LEAST_SPREAD)
     lengths = possible.norm(dim=1)
     bias = float(biases[which])
@@ -130,6 +130,8 @@ def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
         problem = f"depth and colour disagree by {abs(bias):g} pixels or more on how large the objects are"
     elif bool((possible.abs() >= SHIFT_LIMIT).any()):
         problem = f"a shift of {SHIFT_LIMIT} pixels fits nearly as well as any other"
+    elif bool(kept[:, :, [0, -1]].any()):
+        problem = f"objects that are {_BIAS_LIMIT * votes.scale} pixels larger or smaller in depth fit nearly as well"
     return EdgeOffset(
         shift=shift,
         spread=(float(spread[0]), float(spread[1])),
@@ -146,8 +148,9 @@ def _not_ruled_out(scores: Tensor, best: int, histogram: Tensor) -> Tensor:
 
     The score is no likelihood, so the scale of its drops comes from the image itself. The best offset without one part
     of the image scores a little less in the whole image; summed over the parts, with the jackknife's factor, that is
-    how far the true offset is expected to score below the best one. Drops relative to that follow Fisher's F, with as
-    many parts as there are in effect: one large object is one part, though others hold a stray rim.
+    how far the true offset (three numbers) is expected to score below the best one. With the bias profiled out, drops
+    relative to two thirds of that follow Fisher's F with 2 degrees of freedom over those of the parts, of which there
+    are as many as there are in effect: one large object is one part, though others hold a stray rim.
 
     That holds around the best offset. Far from it, where another peak may lie, the parts are asked directly: what is
     refuted by no more than a single part's worth of votes, (sum d)^2 <= sum d^2 for the parts' drops d, stays possible.
@@ -163,9 +166,10 @@ def _not_ruled_out(scores: Tensor, best: int, histogram: Tensor) -> Tensor:
     expected = float(drop.flatten()[best_without].sum()) * (num_parts - 1) / num_parts
     votes = histogram.sum((1, 2))
     in_effect = float(votes.sum().square() / votes.square().sum().clamp_min(1e-9))
-    freedom = min(max(int(in_effect) - 1, 1), len(_F_95))
+    freedom = max(in_effect - 1, 1.0)
+    fisher = 0.5 * freedom * (_CHANCE ** (-2 / freedom) - 1)  # the quantile, in closed form for 2 degrees of freedom
     by_one_part = drop.square() <= (scores.flatten(0, 2)[best] - scores).square().sum(3)
-    return (drop <= max(_F_95[freedom - 1] * expected, _drop_nearby(drop, best))) | by_one_part
+    return (drop <= max(2 / 3 * fisher * expected, _drop_nearby(drop, best))) | by_one_part
 
 
 def _drop_nearby(drop: Tensor, best: int) -> float:

@@ -20,14 +20,13 @@ def frame_votes(frame: DepthFrame) -> list[EdgeVotes]:
 def registration_check(votes: EdgeVotes, limits: Limits, view: int) -> Check:
     """Judge the shift between colour and depth at the rims of near surfaces.
 
-    It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it, is no longer
-    than 3 pixels at most and known so well that one of 3 pixels would fail, and says "not measurable" otherwise.
+    It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it and one of 3
+    pixels can be ruled out, and says "not measurable" otherwise.
     """
     offset = offset_from_votes(votes)
-    is_sharp = offset.greatest_length < TELLABLE and max(offset.spread) <= TELLABLE - limits.color_shift
     if offset.problem is None and offset.least_length > limits.color_shift:
         verdict, advice = Verdict.FAIL, _mend(offset)
-    elif offset.problem is None and offset.length <= limits.color_shift and is_sharp:
+    elif offset.problem is None and offset.length <= limits.color_shift and offset.greatest_length < TELLABLE:
         verdict, advice = Verdict.PASS, ""
     else:
         verdict = Verdict.WARN
