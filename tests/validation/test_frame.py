@@ -134,7 +134,7 @@ def test_without_colour_or_poses_their_checks_are_left_out() -> None:
     assert not {"color_registration", "pose", "pose_direction"} & {check.name for check in validate_frame(bare)}
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.75, 1.25, 1.5])
+@pytest.mark.parametrize("scale", [0.5, 0.75, 0.8, 1.25, 1.5])
 def test_intrinsics_of_another_resolution_fail_and_its_size_is_told(scale: float) -> None:
     frame = scene(num_views=1).frame
     other = frame.camera.resized((round(HEIGHT * scale), round(WIDTH * scale)))
