@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pcdata.models.batch import ModelBatch
 from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.models.images import size_step
 from pcdata.structures import METRE
 from pcdata.validation import Check, Verdict
 
@@ -115,7 +116,7 @@ def _count(batch: ModelBatch, contract: ModelContract) -> Check:
         if tensor is not None and tensor.ndim == len(spec.axes):
             size = (tensor.shape[spec.axes.index("H")], tensor.shape[spec.axes.index("W")])
         fault = "" if size == contract.image_size else f"images of {size}, not (height, width) {contract.image_size}"
-        return verdict("count", fault, f"put ResizeDepth(size={contract.image_size}) last", found=str(size))
+        return verdict("count", fault, f"end with {size_step(contract)}", found=str(size))
     if not sizes:
         return verdict("count", "the counts are not known", "give whole clouds", found="", unknown=True)
     low, high = min(sizes), max(sizes)

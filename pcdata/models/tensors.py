@@ -57,8 +57,8 @@ def _category(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) 
 
 
 def _cells_of_batch(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(S, 4) int32: the cloud's number and its cell, cut towards zero as RISE's cast does."""
-    cells = (clouds.points / _CELL).to(torch.int32)
+    """(S, 4) int32: the cloud's number and its cell, cut towards zero as RISE's cast does, from float64 as there."""
+    cells = (clouds.points.double() / _CELL).to(torch.int32)
     return torch.cat([cloud_of_rows(clouds.ptr)[:, None].to(torch.int32), cells], dim=1)
 
 
@@ -75,14 +75,19 @@ def _offset(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) ->
 
 
 def _voxel_grid(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(B, C, X, Y, Z): per cell the mean of the points' channels, the cell's index / 100, and 1 where occupied."""
+    """(B, C, X, Y, Z): per cell the mean of the points' channels, the cell's index / 100, and 1 where occupied.
+
+    Points outside the box are left out; cells are counted as PerAct counts them, from a border of one cell around it.
+    """
     assert contract.crop is not None
     lower, upper = clouds.points.new_tensor(contract.crop)
-    cell = torch.floor((clouds.points - lower) / (upper - lower) * GRID_CELLS).long().clamp(0, GRID_CELLS - 1)
-    owner = cloud_of_rows(clouds.ptr)
+    edge = (upper - lower) / GRID_CELLS
+    cell = torch.floor((clouds.points - (lower - edge)) / edge).long() - 1
+    inside = ((cell >= 0) & (cell < GRID_CELLS)).all(dim=1)
+    cell, owner = cell[inside], cloud_of_rows(clouds.ptr)[inside]
     flat = ((owner * GRID_CELLS + cell[:, 0]) * GRID_CELLS + cell[:, 1]) * GRID_CELLS + cell[:, 2]
     occupied, inverse = torch.unique(flat, return_inverse=True)
-    values = torch.cat([clouds.points, COLUMNS["rgb_signed"](clouds, contract)], dim=1)
+    values = torch.cat([clouds.points, COLUMNS["rgb_signed"](clouds, contract)], dim=1)[inside]
     grid = values.new_zeros((clouds.num_clouds * GRID_CELLS**3, tensor.width))
     grid[occupied, : values.shape[1]] = voxel_mean(values, inverse, len(occupied))
     grid[occupied, -1] = 1.0
