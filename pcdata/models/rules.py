@@ -87,8 +87,8 @@ def _frame(batch: ModelBatch, contract: ModelContract) -> Check:
     # Files that others wrote do not say whether they are centred: there the values decide, under normalisation.
     whole = batch.steps is not None
     ours, theirs = (batch.frame_id, wanted) if whole else (batch.frame_id.split("/")[0], wanted.split("/")[0])
-    fault = "" if ours == theirs else f"the data are in {batch.frame_id!r}, the model works in {wanted!r}"
-    steps = ["ToFrame(frame=...)"] if ours.split("/")[0] != theirs.split("/")[0] else []
+    fault = "" if ours == theirs else f"the data are in {ours!r}, the model works in {theirs!r}"
+    steps = [f"ToFrame(frame={contract.frame!r})"] if ours.split("/")[0] != theirs.split("/")[0] else []
     steps += ["the preset's centring"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
     return verdict(
         "frame", fault, f"add {' and '.join(steps)}, or use the preset. {contract.wrong_frame}", found=batch.frame_id

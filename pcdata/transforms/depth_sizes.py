@@ -40,7 +40,7 @@ class CropCenter(Transform):
         top, left = (rows - height) // 2, (columns - width) // 2
         names = ("depth", "colors", "labels", "confidence", "mask")
         images = {name: getattr(data, name) for name in names}
-        window = {
+        window: dict[str, Any] = {
             name: None if image is None else image[:, top : top + height, left : left + width].contiguous()
             for name, image in images.items()
         }

@@ -267,7 +267,7 @@ def test_ggcnn_finds_depth_colour_and_grasps_under_cornells_names(tmp_path):
         assert corners.tolist() == [[[6, 5], [6, 9], [10, 9], [10, 5]]]  # rows y, x; halves to even
 
 
-@pytest.mark.parametrize("holes", ["smooth", "nearest"])
+@pytest.mark.parametrize("holes", ["inpainted", "smooth", "nearest"])
 def test_ggcnn_holes_are_filled_and_readings_stay(tmp_path, holes):
     source = captures(1)
     export_dataset(source, "ggcnn", tmp_path / "out", grasps={"view 0": GRASP}, any_size=True, holes=holes)

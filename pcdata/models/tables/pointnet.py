@@ -144,7 +144,7 @@ POINTNET2_PART = replace(
     checked=(
         "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 data_utils/ShapeNetDataLoader.py: mean and largest norm of the "
         "whole "
-        "shape, then np.random.choice with replacement.",
+        "shape, then a draw with replacement.",
         "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 models/pointnet2_part_seg_ssg.py: the forward pass takes points and "
         "cls_label as they are, with normals and without.",
     ),
@@ -169,7 +169,7 @@ POINTNET_SEMSEG = ModelContract(
         "z is not centred: it says how high above the floor a point is.",
         "Its columns of 1 m stand on a fixed grid, 0.5 m apart, and those with fewer than 100 points are left out; the "
         "preset draws columns around random points, as the PyTorch port does.",
-        "Of a column with more than 4096 points it draws with replacement (np.random.choice); of a smaller one it "
+        "Of a column with more than 4096 points it draws with replacement; of a smaller one it "
         "keeps all and adds duplicates, where the preset draws anew.",
         "Colours are stored 0-255 and divided by 255 in the loader.",
     ),

@@ -157,9 +157,10 @@ RISE = ModelContract(
     "or nothing.",
     checked=(
         "rise-policy/RISE 418178a dataset/realworld.py, 76d94ae utils/constants.py: Open3D's voxels, then the closed "
-        "box, ImageNet colours, cells cut towards zero in float64, the cloud's number first. Its load_point_cloud and the "
-        "preset gave the same voxels on two noisy synthetic captures: as many, the same cells, 1 in 7,000 averages off "
-        "by up to 0.4 mm where rounding puts a point into the next voxel. The network needs MinkowskiEngine: not run.",
+        "box, ImageNet colours, cells cut towards zero in float64, the cloud's number first. Its load_point_cloud and "
+        "the preset gave the same voxels on two noisy synthetic captures: as many, in the same cells; 1 in 7,000 "
+        "averages is off by up to 0.4 mm, where rounding puts a point into the next voxel. The network needs "
+        "MinkowskiEngine: not run.",
     ),
 )
 

@@ -12,7 +12,7 @@ POINTCEPT = ModelContract(
     tensors=(
         InputTensor("coord", "S C", (XYZ,)),
         InputTensor("grid_coord", "S C", (Channel("cells", 3, Role.OTHER),), "int64", "grid_cells"),
-        InputTensor("feat", "S C", (RGB_UNIT, replace(NORMALS, optional=True))),
+        InputTensor("feat", "S C", (replace(RGB_UNIT, optional=True), replace(NORMALS, optional=True))),
         InputTensor("offset", "B", (), "int64", "offset"),
     ),
     frame="",
@@ -23,6 +23,7 @@ POINTCEPT = ModelContract(
     normalise="before sampling",
     max_duplicates=0.1,
     traps=(
+        "feat is what feat_keys name; the ScanNet weights want colours and normals.",
         "Colours are stored 0-255 and divided by 255 in the loader: files with 0-1 are nearly black.",
         "A random point of each voxel is kept, not the mean.",
         "Its pipeline centres x and y once more after the voxels, on their own box: at most a voxel off the preset's.",
