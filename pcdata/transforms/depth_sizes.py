@@ -90,7 +90,9 @@ class ResizeDepth(Transform):
     max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
-        """Resize every image and rewrite the intrinsics."""
+        """Resize every image and rewrite the intrinsics; images of that size stay."""
+        if data.size == self.size:
+            return replace(data)
         depth, pixel_index = resize_depth(data.depth, size=self.size, max_jump=self.max_jump)
         colors = None
         if data.colors is not None:

@@ -94,6 +94,13 @@ def test_the_counts_that_the_code_is_used_with_can_be_chosen():
     assert made.collate([made.pipeline(capture())])["point_cloud"].shape == (1, 1024, 6)
 
 
+def test_a_view_of_nothing_inside_the_box_does_not_stop_a_preset():
+    frame = tabletop(3, num_objects=4, num_views=3, size=(120, 160), sample_id="scene").frame
+    blind = replace(frame, depth=frame.depth * torch.tensor([1.0, 1.0, 4.0])[:, None, None])
+    made = preset("dp3_guide", frame="base", crop=answers("dp3_guide")["crop"])
+    assert made.pipeline(blind).fields()["view"].unique().tolist() == [0, 1]
+
+
 def test_optional_channels_can_be_left_out_but_others_cannot():
     made = preset("pointnet2_cls", frame="base", channels=["xyz"])
     assert made.collate([made.pipeline(capture(), generator=seeded(0))])["points"].shape == (1, 3, 1024)

@@ -135,3 +135,10 @@ def test_the_window_in_the_middle_keeps_every_pixel_and_its_ray(scene):
 def test_a_window_larger_than_the_image_is_refused(scene):
     with pytest.raises(ShapeError, match=r"300 x 300 .* does not fit into images of 120 x 160"):
         CropCenter(size=(300, 300))(scene.frame)
+
+
+def test_images_of_the_wanted_size_are_not_copied(scene):
+    frame = ResizeDepth(size=scene.frame.size)(scene.frame)
+    for name in ("depth", "colors", "labels"):
+        assert getattr(frame, name).data_ptr() == getattr(scene.frame, name).data_ptr()
+    assert torch.equal(frame.camera.intrinsics, scene.frame.camera.intrinsics)
