@@ -5,9 +5,9 @@
 Method: one synthetic 640x480 capture of a table, one sample per batch, one thread. Parts are the pipeline's steps, each
 timed inside the same run by stepping through it, and making the tensors. After a warm-up, medians of ``--repeats`` runs
 of the process's CPU time: with one thread that is the time on a core of one's own. What the whole takes beyond its
-parts is the cost of composing, recording and refusing (collate runs the cheap check). Of every part the bytes are counted
-that its torch operations newly allocate (what NumPy, OpenCV and the compiled core allocate inside is not seen), and of
-every step how often it runs: more than once is an error here.
+parts is the cost of composing, recording and refusing (collate runs the cheap check). Of every part the bytes are
+counted that its torch operations newly allocate (what NumPy, OpenCV and the compiled core allocate inside is not seen),
+and of every step how often it runs: more than once is an error here.
 """
 
 from __future__ import annotations
