@@ -52,7 +52,7 @@ class Allocations(TorchDispatchMode):
     """Counts the bytes of every tensor that an operation returns in storage that it was not given."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.bytes = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

@@ -34,8 +34,9 @@ def contract_tensor(clouds: PointCloud, contract: ModelContract, tensor: InputTe
 
 
 def columns(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(N, C): the channels of all points in the contract's order."""
-    return torch.cat([COLUMNS[channel.name](clouds, contract) for channel in tensor.channels], dim=1)
+    """(N, C): the channels of all points in the contract's order; one channel alone is not copied."""
+    parts = [COLUMNS[channel.name](clouds, contract) for channel in tensor.channels]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
 def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
@@ -43,7 +44,10 @@ def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: Inpu
     if tensor.layout == "S C":
         return rows
     counts = clouds.counts.tolist()
-    padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
+    if min(counts) == max(counts):  # packed rows are the batch already
+        padded = rows.reshape(len(counts), counts[0], tensor.width)
+    else:
+        padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
     return padded.transpose(1, 2).contiguous() if tensor.layout == "B C N" else padded
 
 
@@ -88,13 +92,15 @@ def _voxel_grid(clouds: PointCloud, contract: ModelContract, tensor: InputTensor
     flat = ((owner * GRID_CELLS + cell[:, 0]) * GRID_CELLS + cell[:, 1]) * GRID_CELLS + cell[:, 2]
     occupied, inverse = torch.unique(flat, return_inverse=True)
     values = torch.cat([clouds.points, COLUMNS["rgb_signed"](clouds, contract)], dim=1)[inside]
-    grid = values.new_zeros((clouds.num_clouds * GRID_CELLS**3, tensor.width))
-    grid[occupied, : values.shape[1]] = voxel_mean(values, inverse, len(occupied))
-    grid[occupied, -1] = 1.0
-    grid = grid.reshape(clouds.num_clouds, GRID_CELLS, GRID_CELLS, GRID_CELLS, tensor.width)
+    # Filled where it stays: one grid is 40 MB, and cells are few.
+    grid = values.new_zeros((clouds.num_clouds, tensor.width, GRID_CELLS**3))
+    batch, place = occupied // GRID_CELLS**3, occupied % GRID_CELLS**3
+    grid[batch, : values.shape[1], place] = voxel_mean(values, inverse, len(occupied))
+    grid[batch, -1, place] = 1.0
+    grid = grid.reshape(clouds.num_clouds, tensor.width, GRID_CELLS, GRID_CELLS, GRID_CELLS)
     steps = torch.arange(GRID_CELLS, device=clouds.device) / GRID_CELLS
-    grid[..., 6:9] = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
-    return grid.permute(0, 4, 1, 2, 3).contiguous()
+    grid[:, 6], grid[:, 7], grid[:, 8] = steps[:, None, None], steps[:, None], steps
+    return grid
 
 
 def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:

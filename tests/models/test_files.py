@@ -6,6 +6,7 @@ import bz2
 import gzip
 import json
 import lzma
+import re
 import zlib
 from pathlib import Path
 
@@ -231,6 +232,15 @@ def test_the_models_are_listed_and_shown(capsys):
 @pytest.mark.parametrize("name", CONTRACTS)
 def test_the_page_of_a_model_says_what_its_contract_says(name):
     assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == contract_page(CONTRACTS[name])
+
+
+@pytest.mark.parametrize("name", [name for name in CONTRACTS if "guide" not in name])
+def test_every_contract_names_the_commits_that_it_was_held_against(name):
+    made = CONTRACTS[name]
+    assert made.checked
+    for line in made.checked:
+        assert re.match(r"[\w-]+/[\w-]+ [0-9a-f]{7} \S+\.(py|yaml)", line), line
+        assert f"- {line}\n" in (DOCS / f"{name}.md").read_text(encoding="utf-8")
 
 
 def test_there_is_a_page_for_every_model_and_no_other():

@@ -216,6 +216,7 @@ def test_a_larger_window_is_resized_and_a_smaller_camera_may_choose_one():
     assert steps == ["CropCenter", "InpaintDepth"]
     made = preset("ggcnn", window=200)
     assert made.collate([made.pipeline(capture())])["x"].shape == (1, 1, 300, 300)
+    assert Preset.from_yaml(made.to_yaml()).contract == made.contract
     for window in (0, 2.5, True, (3, 3)):
         with pytest.raises(ConfigError, match="window must be edge length in pixels"):
             preset("ggcnn", window=window)

@@ -25,7 +25,8 @@ GGCNN = ModelContract(
     traps=(
         _NO_CLOUD,
         "The window is cut from the image pixel for pixel, never squeezed: a pixel's angle is part of what the network "
-        "has learnt. window=N takes a larger square, and resizes it.",
+        "has learnt. window=N takes another square and resizes it; its code blends depth across edges then, this does "
+        "not.",
         "Holes are inpainted before the mean is taken: a 0 left in would drag it and be clipped to the closest "
         "surface. The training loader fills nothing in: its files must be whole.",
         "In millimetres the clip to [-1, 1] turns the image into two values.",
