@@ -158,6 +158,21 @@ def test_a_dp3_zarr_passes_and_one_in_millimetres_fails(tmp_path):
     assert {name for (name, _), entry in bad.checks.items() if entry.counts[Verdict.FAIL]} == {"scale"}
 
 
+@pytest.mark.parametrize("dtype", ["<f8", ">f4", ">f8", "<f2"])
+def test_a_file_is_read_as_the_loaders_read_it_whatever_the_width_of_its_numbers(tmp_path, dtype):
+    """DP3's convert_real_robot_data.py stores float64; its data sets say astype(np.float32)."""
+    cloud = correct_batch("dp3_real")["point_cloud"].numpy().astype(dtype)
+    write_zarr(tmp_path / "store" / "data" / "point_cloud", cloud, (100, 1024, 6), "zlib")
+    keys = {"point_cloud": "data/point_cloud"}
+    summary = check_files(tmp_path / "store", "dp3_real", keys, frame_id="base", unit="m", frame="base")
+    failed = {name for (name, _), entry in summary.checks.items() if entry.counts[Verdict.FAIL]}
+    assert failed <= ({"duplicates"} if dtype == "<f2" else set())
+    huge = np.full((1, 1024, 6), 1e300)
+    write_zarr(tmp_path / "huge" / "data" / "point_cloud", huge, (100, 1024, 6))
+    summary = check_files(tmp_path / "huge", "dp3_real", keys, frame_id="base", unit="m", frame="base")
+    assert summary.checks["finite", None].counts[Verdict.FAIL] == 1
+
+
 @pytest.mark.parametrize("kind", ["npz", "h5"])
 def test_points_and_colours_by_role_are_joined_in_the_models_order(tmp_path, kind):
     cloud = correct_batch("dp3_real")["point_cloud"].numpy()
