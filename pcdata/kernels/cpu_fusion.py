@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import torch
 from torch import Tensor
 
 from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.tsdf import integrate
 from pcdata.functional.tsdf.backends import BODIES
-from pcdata.functional.tsdf.blocks import TSDF_SCALE, VoxelBlocks
+from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView
-from pcdata.kernels.native import call
+from pcdata.kernels.native import call, room_for
 
-_MARK_BYTES = 192  # per block: a bit per edge
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
@@ -73,27 +70,44 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
     del kept  # until here the addresses are good
 
 
-def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid) -> Crossings:
-    """Mark the edges that cross zero, then write every block's points where they belong."""
+def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False) -> Crossings:
+    """Count the edges of every block that cross zero, then write their points where they belong."""
     count = len(blocks)
     planes, kept = plane_addresses(blocks)
-    field = (blocks.sorted_keys, blocks.sorted_rows, count, planes)
-    marks, counts = torch.empty((count, _MARK_BYTES), dtype=torch.uint8), torch.empty(count, dtype=torch.int64)
-    call("pc_tsdf_mark", *field, marks, counts)
+    field = (blocks.sorted_keys, blocks.sorted_rows, count, planes, min(min_weight - 1, MAX_WEIGHT))
+    counts, dropped = torch.empty(count, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
+    call("pc_tsdf_count_crossings", *field, counts, dropped)
     starts = ptr_from_counts(counts)
-    total = int(starts[-1])
-    found = Crossings(
-        edge=torch.empty(total, dtype=torch.int64),
-        points=torch.empty((total, 3)),
-        normals=torch.empty((total, 3)),
-        weight=torch.empty(total, dtype=torch.int32),
-        views=torch.empty(total, dtype=torch.int32),
-        colors=torch.empty((total, 3)) if blocks.planes.colors else None,
-        labels=torch.empty(total, dtype=torch.int64) if blocks.planes.labels else None,
-    )
-    call("pc_tsdf_points", *field, marks, starts, grid.voxel_size, *(getattr(found, f.name) for f in fields(found)))
+    found = _room_for_crossings(int(starts[-1]), int(dropped), blocks, edges)
+    columns = (found.points, found.normals, found.weight, found.views, found.colors, found.labels)
+    edge = found.edge if edges else None
+    call("pc_tsdf_write_crossings", *field, starts, grid.voxel_size, edge, *columns)
     del kept  # until here the addresses are good
     return found
+
+
+def _room_for_crossings(total: int, dropped: int, blocks: VoxelBlocks, edges: bool) -> Crossings:
+    triples = ((total, 3), torch.float32)
+    number = ((total,), torch.int64)
+    edge, points, normals, weight, views, colors, labels = room_for(
+        number if edges else ((0,), torch.int64),
+        triples,
+        triples,
+        ((total,), torch.float32),
+        number,
+        triples if blocks.planes.colors else ((0,), torch.float32),
+        number if blocks.planes.labels else ((0,), torch.int64),
+    )
+    return Crossings(
+        edge=edge,
+        points=points,
+        normals=normals,
+        weight=weight,
+        views=views,
+        colors=colors if blocks.planes.colors else None,
+        labels=labels if blocks.planes.labels else None,
+        dropped=dropped,
+    )
 
 
 def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:

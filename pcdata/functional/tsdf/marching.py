@@ -11,7 +11,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.apron import SIDE, Neighbourhood
+from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
 from pcdata.functional.tsdf.surface import Crossings
@@ -100,8 +100,7 @@ def _triangles_of(
     count = len(some.corner)
     seen = some.plane("weight").reshape(count, -1) >= min_weight
     inside = some.plane("tsdf").reshape(count, -1) < 0
-    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=seen.device)] * 3, indexing="ij")
-    own = (((z + 1) * SIDE + (y + 1)) * SIDE + (x + 1)).flatten()
+    own = own_places(seen.device)
     case = torch.zeros((count, VOXELS), dtype=torch.int64, device=seen.device)
     complete = torch.ones_like(case, dtype=torch.bool)
     for corner in range(8):
