@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.ragged import ptr_from_counts
-from pcdata.functional.tsdf import integrate
+from pcdata.functional.tsdf import integrate, marching
 from pcdata.functional.tsdf.backends import BODIES
 from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
@@ -110,6 +110,23 @@ def _room_for_crossings(total: int, dropped: int, blocks: VoxelBlocks, edges: bo
     )
 
 
+def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) -> tuple[Tensor, Tensor]:
+    """Pack the signs of every block into words, count its triangles, then write them where they belong."""
+    count, keys = len(blocks), blocks.sorted_keys
+    planes, kept = plane_addresses(blocks)
+    signs, edges = torch.empty((count, 16), dtype=torch.int64), torch.empty((count, 32), dtype=torch.int64)
+    bound = min(min_weight - 1, MAX_WEIGHT)
+    call("pc_tsdf_index_mesh", keys, blocks.sorted_rows, count, planes, bound, edge, len(edge), signs, edges)
+    del kept  # until here the addresses are good
+    mesh = (keys, count, signs, edges, *marching.tensor_tables(edge.device))
+    counts, is_used = torch.empty(count, dtype=torch.int64), torch.zeros(len(edge), dtype=torch.bool)
+    call("pc_tsdf_count_triangles", *mesh, counts, is_used)
+    starts = ptr_from_counts(counts)
+    (triangles,) = room_for(((int(starts[-1]), 3), torch.int64))
+    call("pc_tsdf_write_triangles", *mesh, starts, is_used.cumsum(0) - 1, triangles)
+    return is_used.nonzero().squeeze(1), triangles
+
+
 def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
     """Return the core's table of planes, (6,) addresses of arrays of chunk addresses, and what keeps these alive."""
     kept = []
@@ -125,3 +142,4 @@ def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
 BODIES["touched_blocks", "cpu"] = touched_blocks
 BODIES["integrate_view", "cpu"] = integrate_view
 BODIES["find_crossings", "cpu"] = find_crossings
+BODIES["find_triangles", "cpu"] = find_triangles

@@ -211,12 +211,9 @@ class TSDFVolume:
         """
         found = self._surface(min_weight, edges=True)
         assert self.blocks is not None
-        triangles = tsdf.find_triangles(self.blocks, found, self._least_weight(min_weight), backend=self.backend)
-        used = torch.zeros(len(found.points), dtype=torch.bool, device=triangles.device)
-        used[triangles] = True
-        number = used.cumsum(0) - 1
-        vertices = self._cloud(found.select(used.nonzero().squeeze(1)), min_weight)
-        return SurfaceMesh(vertices=vertices, triangles=number[triangles])
+        least = self._least_weight(min_weight)
+        used, triangles = tsdf.find_triangles(self.blocks, found.edge, min_weight=least, backend=self.backend)
+        return SurfaceMesh(vertices=self._cloud(found.select(used), min_weight), triangles=triangles)
 
     def _least_weight(self, min_weight: float) -> int:
         if not (math.isfinite(min_weight) and min_weight >= 0):

@@ -50,10 +50,12 @@ def find_crossings(
     return found
 
 
-def find_triangles(blocks: VoxelBlocks, vertices: Crossings, min_weight: int, *, backend: str = "auto") -> Tensor:
+def find_triangles(
+    blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
     """See :func:`pcdata.functional.tsdf.marching.find_triangles`."""
-    triangles: Tensor = _body("find_triangles", backend, blocks.device)(blocks, vertices, min_weight)
-    return triangles
+    used, triangles = _body("find_triangles", backend, blocks.device)(blocks, edge, min_weight=min_weight)
+    return used, triangles
 
 
 def _body(step: str, backend: str, device: torch.device) -> Callable[..., Any]:

@@ -9,7 +9,7 @@ constexpr int64_t kGrain = 64;                  // blocks
 constexpr int kSlab = kEdge * kEdge;            // voxels of one z
 constexpr int16_t kUnseen = -32768;             // no stored distance: those end at -32767
 constexpr int kMost = 3 * kVoxels + 16;         // edges of a block, and a line so that columns do not share cache sets
-constexpr int kVoxelStep[3] = {1, kEdge, kSlab};
+constexpr int kVoxelStep[3] = {1, kEdge, kSlab}, kShift[3] = {0, 3, 6};  // of the coordinates in a voxel's number
 
 struct Field {
   SortedBlocks blocks;
@@ -20,6 +20,7 @@ struct Field {
 constexpr int16_t kNothing[kVoxels] = {};
 
 struct Distances {
+  typedef int16_t Line __attribute__((vector_size(2 * kEdge)));
   const int16_t *tsdf, *weight;
 
   static Distances of(const Field& field, int64_t place) {
@@ -27,10 +28,14 @@ struct Distances {
     const int64_t row = field.blocks.rows[place];
     return {field.planes.tsdf.block(row), field.planes.weight.block(row)};
   }
-  // Copy some distances, those of weights that are not above `bound` as kUnseen.
-  template <int kCount>
-  void copy(int from, int16_t* to, int16_t bound) const {
-    for (int i = 0; i < kCount; ++i) to[i] = weight[from + i] > bound ? tsdf[from + i] : kUnseen;
+  // Distances, those of weights that are not above `bound` as kUnseen: one, or a line of eight.
+  int16_t at(int voxel, int16_t bound) const {
+    const auto seen = static_cast<int16_t>(-static_cast<int16_t>(weight[voxel] > bound));
+    return static_cast<int16_t>((tsdf[voxel] & seen) | (kUnseen & ~seen));
+  }
+  void copy_line(int voxel, int16_t* to, int16_t bound) const {
+    const auto seen = load<Line>(weight + voxel) > bound;
+    store(to, (load<Line>(tsdf + voxel) & seen) | (kUnseen & ~seen));
   }
 };
 
@@ -55,16 +60,16 @@ class EdgeEnds {
   Marks marks(const Distances& own, const Distances& right, const Distances& below, const Distances& behind,
               int16_t bound) {
     for (int z = 0; z < kEdge; ++z) {
-      own.copy<kSlab>(kSlab * z, value_ + kPitch * z, bound);
-      below.copy<kEdge>(kSlab * z, value_ + kPitch * z + kSlab, bound);
+      for (int y = 0; y < kEdge; ++y) own.copy_line(kSlab * z + kEdge * y, value_ + kPitch * z + kEdge * y, bound);
+      below.copy_line(kSlab * z, value_ + kPitch * z + kSlab, bound);
     }
-    behind.copy<kSlab>(0, value_ + kPitch * kEdge, bound);
+    for (int y = 0; y < kEdge; ++y) behind.copy_line(kEdge * y, value_ + kPitch * kEdge + kEdge * y, bound);
     Marks marks;
     for (int z = 0; z < kEdge; ++z) {
       const int16_t* here = value_ + kPitch * z;
       int16_t next[kSlab];
       std::memcpy(next, here + 1, sizeof next);
-      for (int y = 0; y < kEdge; ++y) right.copy<1>(kSlab * z + kEdge * y, next + kEdge * y + kEdge - 1, bound);
+      for (int y = 0; y < kEdge; ++y) next[kEdge * y + kEdge - 1] = right.at(kSlab * z + kEdge * y, bound);
       marks.along[z][0] = crossing(here, next);
       marks.along[z][1] = crossing(here, here + kEdge);
       marks.along[z][2] = crossing(here, here + kPitch);
@@ -152,9 +157,10 @@ class Neighbourhood {
         const int line = (z & 7) * kSlab + (y & 7) * kEdge;
         int16_t* to = value_ + kBefore + place_of(0, y, z);
         // In this order: what runs over the end of a line is overwritten by the next.
-        three[-1].copy<2>(line + kEdge - 2, to - 2, 0);
-        three[0].copy<kEdge>(line, to, 0);
-        three[1].copy<kEdge>(line, to + kEdge, 0);
+        to[-2] = three[-1].at(line + kEdge - 2, 0);
+        to[-1] = three[-1].at(line + kEdge - 1, 0);
+        three[0].copy_line(line, to, 0);
+        three[1].copy_line(line, to + kEdge, 0);
       }
   }
 
@@ -218,31 +224,23 @@ struct Points {
   int64_t* labels;  // or null
 };
 
-// One plane of a block and of the next ones, to read at both ends of an edge.
+// One plane of a block and of the next ones along x, y and z, to read at both ends of an edge.
 template <class T>
-struct EndsOf {
-  const T *own, *next[3];
+struct PlaneAround {
+  const T* of[4];
 
-  static EndsOf of(const Plane<T>& plane, const SortedBlocks& blocks, const int64_t places[27]) {
-    EndsOf ends{};
-    if (!plane) return ends;
-    constexpr int after[3] = {14, 16, 22};
-    ends.own = plane.block(blocks.rows[places[13]]);
-    for (int a = 0; a < 3; ++a) ends.next[a] = places[after[a]] < 0 ? nullptr : plane.block(blocks.rows[places[after[a]]]);
-    return ends;
+  PlaneAround(const Plane<T>& plane, const SortedBlocks& blocks, const int64_t places[27]) {
+    constexpr int around[4] = {13, 14, 16, 22};
+    for (int i = 0; i < 4; ++i)
+      of[i] = places[around[i]] < 0 ? nullptr : plane.block(blocks.rows[places[around[i]]]);
   }
-  T first(int voxel) const { return own[voxel]; }
-  T second(int voxel, int axis) const {
-    const bool is_last = (voxel >> 3 * axis & 7) == kEdge - 1;
-    return is_last ? next[axis][voxel - (kEdge - 1) * kVoxelStep[axis]] : own[voxel + kVoxelStep[axis]];
-  }
-  T least(int voxel, int axis) const { return std::min(first(voxel), second(voxel, axis)); }
 };
 
 // The crossings of one block, column by column, so that compilers vectorise the arithmetic.
 struct Crossings {
   int count;
   int32_t voxel[kMost], axis[kMost], start[kMost];
+  int32_t end_block[kMost], end_voxel[kMost];  // of the second end: 0 is the block itself, 1 + axis the next
   float before[kMost], after[kMost], fraction[kMost], place[kMost];
   int32_t corner[kMost];  // coordinate of the first end, in voxels, along the axis
   int32_t first[3][kMost], second[3][kMost];
@@ -273,7 +271,10 @@ struct Crossings {
       const int end = start[i] + kStride[a];
       before[i] = static_cast<float>(near.value(start[i]));
       after[i] = static_cast<float>(near.value(end));
-      corner[i] = corners[a] + (v >> 3 * a & 7);
+      const int inner = v >> kShift[a] & 7;
+      corner[i] = corners[a] + inner;
+      end_block[i] = inner == kEdge - 1 ? 1 + a : 0;
+      end_voxel[i] = v + (inner == kEdge - 1 ? -(kEdge - 1) : 1) * kVoxelStep[a];
       for (int b = 0; b < 3; ++b) {
         first[b][i] = near.slope(b, start[i]);
         second[b][i] = near.slope(b, end);
@@ -316,10 +317,23 @@ struct Crossings {
   }
   static int32_t rise_in(int32_t both) { return static_cast<int32_t>(static_cast<uint32_t>(both) << 8) >> 8; }
 
-  void mix_colors(const EndsOf<int32_t>& color) {
+  template <class T>
+  T first_of(const PlaneAround<T>& plane, int i) const {
+    return plane.of[0][voxel[i]];
+  }
+  template <class T>
+  T second_of(const PlaneAround<T>& plane, int i) const {
+    return plane.of[end_block[i]][end_voxel[i]];
+  }
+  template <class T>
+  T least_of(const PlaneAround<T>& plane, int i) const {
+    return std::min(first_of(plane, i), second_of(plane, i));
+  }
+
+  void mix_colors(const PlaneAround<int32_t>& color) {
     for (int i = 0; i < count; ++i) {
-      packed[0][i] = color.first(voxel[i]);
-      packed[1][i] = color.second(voxel[i], axis[i]);
+      packed[0][i] = first_of(color, i);
+      packed[1][i] = second_of(color, i);
     }
     for (int c = 0; c < 3; ++c)
       for (int i = 0; i < count; ++i) {
@@ -337,7 +351,7 @@ struct Crossings {
         grid[a][j] = static_cast<float>(static_cast<double>(corners[a] + j) * voxel_size);
     for (int i = 0; i < count; ++i) {
       float* point = points + 3 * i;
-      for (int a = 0; a < 3; ++a) point[a] = grid[a][voxel[i] >> 3 * a & 7];
+      for (int a = 0; a < 3; ++a) point[a] = grid[a][voxel[i] >> kShift[a] & 7];
       point[axis[i]] = place[i];
       float* normal = normals + 3 * i;
       for (int a = 0; a < 3; ++a) normal[a] = gradient[a][i];
@@ -356,25 +370,39 @@ void write_block(const Field& field, int64_t number, const int64_t places[27], c
   found.locate(voxel_size);
   found.find_gradients(near);
   found.write(block, voxel_size, out.points + 3 * row, out.normals + 3 * row);
-  const auto weight = EndsOf<int16_t>::of(field.planes.weight, field.blocks, places);
-  const auto views = field.planes.views ? EndsOf<int16_t>::of(field.planes.views, field.blocks, places) : weight;
+  const PlaneAround<int16_t> weight(field.planes.weight, field.blocks, places);
+  const PlaneAround<int16_t> views(field.planes.views ? field.planes.views : field.planes.weight, field.blocks, places);
   for (int i = 0; i < found.count; ++i) {
-    out.weight[row + i] = static_cast<float>(weight.least(found.voxel[i], found.axis[i]));
-    out.views[row + i] = views.least(found.voxel[i], found.axis[i]);
+    out.weight[row + i] = static_cast<float>(found.least_of(weight, i));
+    out.views[row + i] = found.least_of(views, i);
   }
   if (out.edge != nullptr)
     for (int i = 0; i < found.count; ++i) out.edge[row + i] = 3 * (kVoxels * number + found.voxel[i]) + found.axis[i];
   if (out.colors != nullptr) {
-    found.mix_colors(EndsOf<int32_t>::of(field.planes.color, field.blocks, places));
+    found.mix_colors({field.planes.color, field.blocks, places});
     for (int i = 0; i < found.count; ++i)
       for (int c = 0; c < 3; ++c) out.colors[3 * (row + i) + c] = found.channel[c][i];
   }
   if (out.labels != nullptr) {
-    const auto label = EndsOf<int32_t>::of(field.planes.label, field.blocks, places);
+    const PlaneAround<int32_t> label(field.planes.label, field.blocks, places);
     for (int i = 0; i < found.count; ++i)
-      out.labels[row + i] = found.fraction[i] <= 0.5f ? label.first(found.voxel[i])
-                                                      : label.second(found.voxel[i], found.axis[i]);
+      out.labels[row + i] = found.fraction[i] <= 0.5f ? found.first_of(label, i) : found.second_of(label, i);
   }
+}
+
+template <class T>
+void fetch(const T* block) {
+  for (size_t at = 0; at < kVoxels * sizeof(T); at += 64) __builtin_prefetch(reinterpret_cast<const char*>(block) + at);
+}
+
+// Start loading what will be read of the next block: the rest is around the blocks before it.
+void fetch(const Field& field, const int64_t places[27], bool colors) {
+  for (const int64_t place : {places[13], places[14]}) {
+    const Distances distances = Distances::of(field, place);
+    fetch(distances.tsdf);
+    fetch(distances.weight);
+  }
+  if (colors) fetch(field.planes.color.block(field.blocks.rows[places[13]]));
 }
 
 void write_all(const pc_context& context, const Field& field, int16_t bound, const int64_t* starts, double voxel_size,
@@ -384,12 +412,24 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
     EdgeEnds ends;
     auto near = std::make_unique<Neighbourhood>();
     const std::unique_ptr<Crossings> found(new Crossings);
-    for (int64_t i = begin; i < end; ++i) {
-      if (starts[i] == starts[i + 1]) continue;
+    const auto next_from = [&](int64_t i) {
+      while (i < end && starts[i] == starts[i + 1]) ++i;
+      return i;
+    };
+    int64_t ahead[27];
+    int64_t next = next_from(begin);
+    if (next < end) around.look(field.blocks.keys[next], ahead);
+    while (next < end) {
+      const int64_t i = next;
       int64_t places[27];
       Distances distances[27];
-      around.look(field.blocks.keys[i], places);
+      std::memcpy(places, ahead, sizeof places);
       for (int b = 0; b < 27; ++b) distances[b] = Distances::of(field, places[b]);
+      next = next_from(i + 1);
+      if (next < end) {
+        around.look(field.blocks.keys[next], ahead);
+        fetch(field, ahead, out.colors != nullptr);
+      }
       const Marks marks = ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
       const Range lines = Range::of(marks);
       near->fill(distances, lines.wider(2, 2));
