@@ -111,19 +111,21 @@ def _room_for_crossings(total: int, dropped: int, blocks: VoxelBlocks, edges: bo
 
 
 def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) -> tuple[Tensor, Tensor]:
-    """Pack the signs of every block into words, count its triangles, then write them where they belong."""
+    """Pack the signs of every block into words, count its triangles, then write them, and number the vertices in use."""
     count, keys = len(blocks), blocks.sorted_keys
     planes, kept = plane_addresses(blocks)
     signs, edges = torch.empty((count, 16), dtype=torch.int64), torch.empty((count, 32), dtype=torch.int64)
     bound = min(min_weight - 1, MAX_WEIGHT)
     call("pc_tsdf_index_mesh", keys, blocks.sorted_rows, count, planes, bound, edge, len(edge), signs, edges)
     del kept  # until here the addresses are good
-    mesh = (keys, count, signs, edges, *marching.tensor_tables(edge.device))
+    first, corner, axis = marching.tensor_tables(edge.device)
+    mesh = (keys, count, signs, edges, first, 3 * corner + axis)
     counts, is_used = torch.empty(count, dtype=torch.int64), torch.zeros(len(edge), dtype=torch.bool)
-    call("pc_tsdf_count_triangles", *mesh, counts, is_used)
+    call("pc_tsdf_count_triangles", *mesh, counts)
     starts = ptr_from_counts(counts)
     (triangles,) = room_for(((int(starts[-1]), 3), torch.int64))
-    call("pc_tsdf_write_triangles", *mesh, starts, is_used.cumsum(0) - 1, triangles)
+    call("pc_tsdf_write_triangles", *mesh, starts, triangles, is_used)
+    call("pc_tsdf_renumber", triangles, triangles.numel(), is_used.cumsum(0) - 1)
     return is_used.nonzero().squeeze(1), triangles
 
 

@@ -33,13 +33,27 @@ struct BlockEdges {
   }
 };
 
+// An edge of the cube: 3 * the corner at which it starts + the axis that it runs along.
+constexpr int kCubeEdges = 24;
+
 struct Mesh {
   SortedBlocks blocks;
   const BlockSigns* signs;  // (count,)
   const BlockEdges* edges;  // (count,)
-  // Per case of the cube its first triangle (257,); per corner of a triangle the corner of the cube at which the cut
-  // edge starts and the axis that it runs along, (K, 3).
-  const int64_t *table, *corner, *axis;
+  const int64_t* table;     // (257,) the first triangle of every case of the cube
+  const int64_t* corners;   // (K, 3) per triangle the edges of the cube on which its corners lie
+  uint32_t cut[256] = {};   // a bit per edge of the cube: those that a case has corners on
+
+  Mesh(const SortedBlocks& sorted, const int64_t* all_signs, const int64_t* all_edges, const int64_t* first,
+       const int64_t* edges_of_cube)
+      : blocks(sorted),
+        signs(reinterpret_cast<const BlockSigns*>(all_signs)),
+        edges(reinterpret_cast<const BlockEdges*>(all_edges)),
+        table(first),
+        corners(edges_of_cube) {
+    for (int number = 0; number < 256; ++number)
+      for (int64_t c = 3 * table[number]; c < 3 * table[number + 1]; ++c) cut[number] |= uint32_t{1} << corners[c];
+  }
 };
 
 void find_signs(const pc_context& context, const SortedBlocks& blocks, const VoxelPlanes& planes, int16_t bound,
@@ -145,38 +159,75 @@ struct CornerBits {
   }
 };
 
-// Where a cut edge of a cube has its vertex: a block among the octet, a voxel and an axis.
-struct CutEdge {
-  int block, voxel, axis;
+// The cubes of one slab that hold triangles.
+struct SlabCubes {
+  CornerBits inside;
+  uint64_t cubes;    // those with corners on both sides, all seen
+  uint64_t lacking;  // those with a cut edge that has no vertex
 
-  CutEdge(const Mesh& mesh, int cube, int64_t which) : axis(static_cast<int>(mesh.axis[which])) {
-    const auto corner = static_cast<int>(mesh.corner[which]);
-    const int x = (cube & 7) + (corner & 1), y = (cube >> 3 & 7) + (corner >> 1 & 1), z = (cube >> 6) + (corner >> 2);
-    block = x >> 3 | y >> 3 << 1 | z >> 3 << 2;
-    voxel = (z & 7) * kSlab + (y & 7) * kEdge + (x & 7);
+  SlabCubes(const Mesh& mesh, const Octet& places, int z)
+      : inside(places, z, [&](int64_t place, int at) { return mesh.signs[place].inside[at]; }),
+        cubes(inside.any() & ~inside.all()),
+        lacking(0) {
+    if (cubes == 0) return;
+    cubes &= CornerBits(places, z, [&](int64_t place, int at) { return mesh.signs[place].seen[at]; }).all();
+    if (cubes == 0) return;
+    for (int axis = 0; axis < 3; ++axis) {
+      const CornerBits has(places, z, [&](int64_t place, int at) { return mesh.edges[place].along[at][axis]; });
+      for (int c = 0; c < 8; ++c)
+        if ((c >> axis & 1) == 0) lacking |= (inside.of[c] ^ inside.of[c | 1 << axis]) & ~has.of[c];
+    }
   }
 };
 
-// Call body(rows of the three vertices) for every triangle of a block whose vertices are all there.
-template <class Body>
-void each_triangle(const Mesh& mesh, const Octet& places, const Body& body) {
+// Rows of the vertices on the cut edges of one cube; -1 where there is none.
+struct CubeRows {
+  int64_t of[kCubeEdges];
+
+  void find(const Mesh& mesh, const Octet& places, int cube, uint32_t cut, bool lacks) {
+    for (; cut != 0; cut &= cut - 1) {
+      const int edge = __builtin_ctz(cut), axis = edge % 3, corner = edge / 3;
+      const int x = (cube & 7) + (corner & 1), y = (cube >> 3 & 7) + (corner >> 1 & 1), z = (cube >> 6) + (corner >> 2);
+      const int voxel = (z & 7) * kSlab + (y & 7) * kEdge + (x & 7);
+      const BlockEdges& edges = mesh.edges[places[x >> 3 | y >> 3 << 1 | z >> 3 << 2]];
+      of[edge] = lacks && !edges.has(voxel, axis) ? -1 : edges.row(voxel, axis);
+    }
+  }
+};
+
+int64_t count_triangles(const Mesh& mesh, const Octet& places) {
+  int64_t total = 0;
+  CubeRows rows;
   for (int z = 0; z < kEdge; ++z) {
-    const CornerBits seen(places, z, [&](int64_t place, int at) { return mesh.signs[place].seen[at]; });
-    uint64_t left = seen.all();
-    if (left == 0) continue;
-    const CornerBits inside(places, z, [&](int64_t place, int at) { return mesh.signs[place].inside[at]; });
-    for (left &= inside.any() & ~inside.all(); left != 0; left &= left - 1) {
-      const int number = __builtin_ctzll(left), corners = inside.cube(number);
-      for (int64_t t = mesh.table[corners]; t < mesh.table[corners + 1]; ++t) {
-        int64_t rows[3];
-        bool complete = true;
+    const SlabCubes slab(mesh, places, z);
+    for (uint64_t left = slab.cubes; left != 0; left &= left - 1) {
+      const int number = __builtin_ctzll(left), sides = slab.inside.cube(number);
+      total += mesh.table[sides + 1] - mesh.table[sides];
+      if ((slab.lacking >> number & 1) == 0) continue;
+      rows.find(mesh, places, kSlab * z + number, mesh.cut[sides], true);
+      for (int64_t t = mesh.table[sides]; t < mesh.table[sides + 1]; ++t) {
+        const int64_t* at = mesh.corners + 3 * t;
+        total -= std::min({rows.of[at[0]], rows.of[at[1]], rows.of[at[2]]}) < 0;
+      }
+    }
+  }
+  return total;
+}
+
+void write_triangles(const Mesh& mesh, const Octet& places, int64_t* to, uint8_t* used) {
+  CubeRows rows;
+  for (int z = 0; z < kEdge; ++z) {
+    const SlabCubes slab(mesh, places, z);
+    for (uint64_t left = slab.cubes; left != 0; left &= left - 1) {
+      const int number = __builtin_ctzll(left), sides = slab.inside.cube(number);
+      rows.find(mesh, places, kSlab * z + number, mesh.cut[sides], slab.lacking >> number & 1);
+      for (int64_t t = mesh.table[sides]; t < mesh.table[sides + 1]; ++t) {
+        const int64_t* at = mesh.corners + 3 * t;
+        if (std::min({rows.of[at[0]], rows.of[at[1]], rows.of[at[2]]}) < 0) continue;
         for (int c = 0; c < 3; ++c) {
-          const CutEdge cut(mesh, kSlab * z + number, 3 * t + c);
-          const BlockEdges& edges = mesh.edges[places[cut.block]];
-          complete = complete && edges.has(cut.voxel, cut.axis);
-          rows[c] = edges.row(cut.voxel, cut.axis);
+          *to++ = rows.of[at[c]];
+          __atomic_store_n(used + rows.of[at[c]], uint8_t{1}, __ATOMIC_RELAXED);  // threads may meet at a border
         }
-        if (complete) body(rows);
       }
     }
   }
@@ -210,40 +261,38 @@ PC_EXPORT int32_t pc_tsdf_index_mesh(const pc_context* context, const int64_t* k
   });
 }
 
-// The table of cases (257,), (K, 3), (K, 3) -> counts (count,): the triangles of each block; used (num_edges,), all zero
-// before: 1 where a vertex is in one.
+// The table of cases (257,), (K, 3) -> counts (count,): the triangles of each block.
 PC_EXPORT int32_t pc_tsdf_count_triangles(const pc_context* context, const int64_t* keys, int64_t count,
                                           const int64_t* signs, const int64_t* edges, const int64_t* table,
-                                          const int64_t* corner, const int64_t* axis, int64_t* counts, uint8_t* used) {
+                                          const int64_t* corners, int64_t* counts) {
   return pc::guarded([&] {
-    const pc::Mesh mesh{{keys, nullptr, count}, reinterpret_cast<const pc::BlockSigns*>(signs),
-                        reinterpret_cast<const pc::BlockEdges*>(edges), table, corner, axis};
+    const pc::Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
     pc::each_block(*context, mesh, [&](int64_t block, const pc::Octet& places) {
-      int64_t found = 0;
-      pc::each_triangle(mesh, places, [&](const int64_t rows[3]) {
-        for (int c = 0; c < 3; ++c) __atomic_store_n(used + rows[c], uint8_t{1}, __ATOMIC_RELAXED);
-        ++found;
-      });
-      counts[block] = found;
+      counts[block] = pc::count_triangles(mesh, places);
     });
   });
 }
 
-// The same with starts (count + 1,): where each block's triangles go, and the number (num_edges,) of each vertex among
-// those used -> triangles (T, 3).
+// The same with starts (count + 1,): where each block's triangles go -> triangles (T, 3); used (num_edges,), all zero
+// before: 1 where a vertex is in one.
 PC_EXPORT int32_t pc_tsdf_write_triangles(const pc_context* context, const int64_t* keys, int64_t count,
                                           const int64_t* signs, const int64_t* edges, const int64_t* table,
-                                          const int64_t* corner, const int64_t* axis, const int64_t* starts,
-                                          const int64_t* number, int64_t* triangles) {
+                                          const int64_t* corners, const int64_t* starts, int64_t* triangles,
+                                          uint8_t* used) {
   return pc::guarded([&] {
-    const pc::Mesh mesh{{keys, nullptr, count}, reinterpret_cast<const pc::BlockSigns*>(signs),
-                        reinterpret_cast<const pc::BlockEdges*>(edges), table, corner, axis};
+    const pc::Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
     pc::each_block(*context, mesh, [&](int64_t block, const pc::Octet& places) {
-      int64_t* to = triangles + 3 * starts[block];
-      if (starts[block] == starts[block + 1]) return;
-      pc::each_triangle(mesh, places, [&](const int64_t rows[3]) {
-        for (int c = 0; c < 3; ++c) *to++ = number[rows[c]];
-      });
+      if (starts[block] < starts[block + 1])
+        pc::write_triangles(mesh, places, triangles + 3 * starts[block], used);
+    });
+  });
+}
+
+// Number (count,) entries anew, in place.
+PC_EXPORT int32_t pc_tsdf_renumber(const pc_context* context, int64_t* entries, int64_t count, const int64_t* number) {
+  return pc::guarded([&] {
+    pc::parallel_for(*context, count, int64_t{1} << 16, [&](int64_t begin, int64_t end, int64_t) {
+      for (int64_t i = begin; i < end; ++i) entries[i] = number[entries[i]];
     });
   });
 }
