@@ -111,7 +111,7 @@ def _room_for_crossings(total: int, dropped: int, blocks: VoxelBlocks, edges: bo
 
 
 def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) -> tuple[Tensor, Tensor]:
-    """Pack the signs of every block into words, count its triangles, then write them, and number the vertices in use."""
+    """Pack the signs of every block into words, count its triangles, write them, and number the vertices in use."""
     count, keys = len(blocks), blocks.sorted_keys
     planes, kept = plane_addresses(blocks)
     signs, edges = torch.empty((count, 16), dtype=torch.int64), torch.empty((count, 32), dtype=torch.int64)

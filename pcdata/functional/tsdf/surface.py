@@ -51,7 +51,7 @@ class Crossings:
 
 
 def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False) -> Crossings:
-    """Find every zero crossing between two neighbours along x, y and z that were both seen, with ``min_weight`` at least.
+    """Find every zero crossing between neighbours along x, y and z that were both seen, with ``min_weight`` at least.
 
     Point, colour and gradient are interpolated linearly between the ends; the label is that of the nearer end, of the
     first at equal distance; the normal is the gradient's direction. An edge whose ends differ by more than a truncation
@@ -108,9 +108,9 @@ def _gradient(value: Tensor, block: Tensor, start: Tensor, end: Tensor, fraction
     their weighted steps. Both ends of the edge count by how near they are. Where no pair was seen whole, it is the
     difference to the one neighbour of the nearer end that was.
 
-    A distance is that of the nearest pixel, so the field has stairs a pixel wide: a difference over two voxels alone
-    sees them. Source: Sobel's operator (Sobel & Feldman, A 3x3 Isotropic Gradient Operator, 1968) with the difference of
-    Prewitt's box over two voxels on either side along the axis.
+    A distance is that of the nearest pixel, so the field has stairs a pixel wide, and the difference of the next two
+    voxels alone follows them. Source: the operator of Sobel & Feldman, A 3x3 Isotropic Gradient Operator, 1968, with a
+    difference of boxes of two voxels along the axis.
     """
     slopes = []
     for axis in range(3):
