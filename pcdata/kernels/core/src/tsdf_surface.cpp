@@ -11,6 +11,16 @@ constexpr int kVoxelStep[3] = {1, kEdge, kSlab}, kShift[3] = {0, 3, 6};  // of t
 
 // -- counting -----------------------------------------------------------------------------------------------------
 
+// Start loading a block.
+template <class T>
+void fetch(const T* block) {
+  for (size_t at = 0; at < kVoxels * sizeof(T); at += 64) __builtin_prefetch(reinterpret_cast<const char*>(block) + at);
+}
+void fetch(const Distances& block) {
+  fetch(block.tsdf);
+  fetch(block.weight);
+}
+
 void count_all(const pc_context& context, const Field& field, int16_t bound, int64_t* counts, int64_t* dropped) {
   std::atomic<int64_t> all_dropped{0};
   parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
@@ -208,21 +218,6 @@ void write_block(const Field& field, int64_t number, const int64_t places[27], c
   }
 }
 
-template <class T>
-void fetch(const T* block) {
-  for (size_t at = 0; at < kVoxels * sizeof(T); at += 64) __builtin_prefetch(reinterpret_cast<const char*>(block) + at);
-}
-
-// Start loading what will be read of the next block: the rest is around the blocks before it.
-void fetch(const Field& field, const int64_t places[27], bool colors) {
-  for (const int64_t place : {places[13], places[14]}) {
-    const Distances distances = Distances::of(field, place);
-    fetch(distances.tsdf);
-    fetch(distances.weight);
-  }
-  if (colors) fetch(field.planes.color.block(field.blocks.rows[places[13]]));
-}
-
 void write_all(const pc_context& context, const Field& field, int16_t bound, const int64_t* starts, double voxel_size,
                const Points& out) {
   parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
@@ -246,7 +241,10 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
       next = next_from(i + 1);
       if (next < end) {
         around.look(field.blocks.keys[next], ahead);
-        fetch(field, ahead, out.colors != nullptr);
+        // The rest of what it reads lies around the blocks before it.
+        fetch(Distances::of(field, ahead[13]));
+        fetch(Distances::of(field, ahead[14]));
+        if (out.colors != nullptr) fetch(field.planes.color.block(field.blocks.rows[ahead[13]]));
       }
       const Marks marks = ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
       const Range lines = Range::of(marks);
