@@ -30,6 +30,7 @@ EXTRAS = {
         Extra("cv2", "calib", "calibration boards (pcdata calib intrinsics)", 'pip install "pcdata[calib]"'),
         Extra("small_gicp", "calib", "refining camera poses from clouds", 'pip install "pcdata[calib]"'),
         Extra("numcodecs", "zarr", "zarr chunks packed with Blosc", 'pip install "pcdata[zarr]"'),
+        Extra("rosbags", "ros", "RealSense recordings (.bag)", 'pip install "pcdata[ros]"'),
         Extra("open3d", "open3d", "viewing and comparing with Open3D", 'pip install "pcdata[open3d]"'),
         Extra(
             "torch_cluster",

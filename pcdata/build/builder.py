@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add
 from pcdata.io.manifest import FILE_NAME, Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
 from pcdata.io.record import record_from_cloud
+from pcdata.io.source import CaptureSource, checked_ids
 from pcdata.io.stores import STORES
 from pcdata.io.whole_folders import complete_or_nothing
 from pcdata.structures import DepthFrame, PointCloud
@@ -28,17 +29,6 @@ _OWN = {FILE_NAME, "pipeline.yaml", "load.py", "clouds", "clouds.h5", "raw"}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
-
-
-class Source(Protocol):
-    """Where captures come from; :func:`pcdata.open_source` returns one."""
-
-    @property
-    def ids(self) -> list[str]:
-        """The sample ids."""
-
-    def load(self, sample_id: str) -> DepthFrame | PointCloud:
-        """Load one capture."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +51,7 @@ class BuildReport:
 
 def build_dataset(
     config: BuildConfig,
-    source: Source,
+    source: CaptureSource,
     folder: str | Path,
     *,
     overwrite: bool = False,
@@ -114,7 +104,7 @@ def build_dataset(
 
 
 def _write_samples(
-    config: BuildConfig, source: Source, partial: Path, report: BuildReport, progress: Progress | None
+    config: BuildConfig, source: CaptureSource, partial: Path, report: BuildReport, progress: Progress | None
 ) -> list[Sample]:
     store = STORES[config.output.format](partial, config.output.compression)
     prefix = config.pipeline.deterministic_prefix()
@@ -143,25 +133,19 @@ def _write_samples(
     return written
 
 
-def _check_arguments(config: BuildConfig, source: Source) -> None:
+def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
     if not isinstance(config, BuildConfig):
         raise DTypeError(
             f"build_dataset: config must be a BuildConfig, not {type(config).__name__}; "
             "pcdata.load_config(path) reads one"
         )
-    if not hasattr(source, "ids") or not hasattr(source, "load"):
-        raise DTypeError(
-            f"build_dataset: source must have ids and load(id), got {type(source).__name__}; pcdata.open_source(path) "
-            "makes one of a folder"
+    checked_ids("build_dataset", source)
+    random = [type(step).__name__ for step in config.pipeline.depth if step.is_random]
+    if random:
+        raise ConfigError(
+            f"build_dataset: {random[0]} in the section depth is random, so no cloud is the same in every epoch and "
+            "none can be stored; leave it out here, or load captures on the fly with CloudDataset"
         )
-    ids = list(source.ids)
-    if not ids:
-        raise CaptureError(f"{source!r} has no captures to build from")
-    if len(set(ids)) != len(ids):
-        twice = next(name for name in ids if ids.count(name) > 1)
-        raise CaptureError(f"{source!r}: sample ids must be unique, but {twice!r} comes more than once")
-    if any(step.is_random for step in config.pipeline.depth):
-        raise ConfigError("the section depth has a random step, so there is no cloud to store; move it to augment")
 
 
 def _checked_cloud(data: Any) -> PointCloud:

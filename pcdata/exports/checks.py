@@ -19,7 +19,7 @@ from pcdata.errors import (
     UnitError,
 )
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.structures.point_cloud import METRE, NORMALIZED
+from pcdata.structures.fields import METRE, NORMALIZED
 
 
 def one_cloud(where: str, data: Any) -> PointCloud:

@@ -19,7 +19,7 @@ from PIL import Image
 from pcdata.errors import CaptureError, add_note
 from pcdata.exports.checks import check_size, colors_of, object_ids, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
-from pcdata.io.images import write_color, write_depth
+from pcdata.io.image_writing import write_color, write_depth
 from pcdata.io.manifest import key_of
 from pcdata.structures import DepthFrame
 

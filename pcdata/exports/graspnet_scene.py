@@ -20,7 +20,7 @@ from pcdata.exports.checks import colors_of
 from pcdata.exports.graspnet import GraspNetImages, meta_bytes
 from pcdata.exports.target import Item, Note, Samples
 from pcdata.functional import rigid
-from pcdata.io.images import write_color
+from pcdata.io.image_writing import write_color
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,9 +90,7 @@ def ball_query(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
     """
-    ptr = check_neighbors("ball_query", points, ptr, queries, queries_ptr, grid)
-    require_count("ball_query", "max_neighbors", max_neighbors)
-    require_length("ball_query", "radius", radius)
+    ptr = check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
     num_queries = len(points if queries is None else queries)
     index = torch.empty((num_queries, max_neighbors), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, max_neighbors), dtype=torch.float32, device=points.device)
@@ -120,3 +118,18 @@ def check_neighbors(
         raise ShapeError(f"{where}: queries_ptr was given without queries; pass both, or neither to query the points")
     check_grid(where, grid, points, ptr)
     return ptr
+
+
+def check_ball_query(
+    points: Tensor,
+    ptr: Tensor | None,
+    radius: float,
+    max_neighbors: int,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    grid: ImageGrid | None,
+) -> Tensor:
+    """Require what the spec of ball_query cannot say; return the row pointers."""
+    require_count("ball_query", "max_neighbors", max_neighbors)
+    require_length("ball_query", "radius", radius)
+    return check_neighbors("ball_query", points, ptr, queries, queries_ptr, grid)

@@ -12,7 +12,8 @@ from pcdata.io.capture_camera import (
 )
 from pcdata.io.confidence import read_confidence, write_confidence
 from pcdata.io.detect import LAYOUTS, open_source
-from pcdata.io.images import read_color, read_depth, read_labels, read_mask, write_color, write_depth
+from pcdata.io.image_writing import write_color, write_depth, write_labels, write_mask
+from pcdata.io.images import read_color, read_depth, read_labels, read_mask
 from pcdata.io.pcd import read_pcd, write_pcd
 from pcdata.io.ply import read_ply, write_ply
 from pcdata.io.source import Source
@@ -42,6 +43,8 @@ __all__ = [
     "write_color",
     "write_confidence",
     "write_depth",
+    "write_labels",
+    "write_mask",
     "write_pcd",
     "write_ply",
     "write_pose",

@@ -20,7 +20,7 @@ from pcdata.io.images import check_metres_per_unit
 from pcdata.structures import Camera
 
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("distortion", "metres_per_unit", "frame_id")
+_OPTIONAL = ("distortion", "metres_per_unit", "frame_id", "background_label")
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
 _DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
@@ -40,6 +40,7 @@ class CaptureCamera:
     camera: Camera
     metres_per_unit: float | None = None  # length of one stored depth unit; None = the file does not say
     frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
+    background_label: int | None = None  # what means "no object" in the label images; None = the file does not say
 
 
 def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
@@ -50,8 +51,9 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
 
-    The last three are optional; ``notes``, ``sensor``, ``serial``, ``registered_to`` and ``date`` are free remarks. Any
-    other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
+    The last three are optional, as is ``background_label``, the id that means "no object"; ``notes``, ``sensor``,
+    ``serial``, ``registered_to`` and ``date`` are free remarks. Any other key is an error, because a misspelt
+    ``distortion`` that is ignored bends every cloud.
 
     Raises:
         CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
@@ -66,6 +68,9 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     frame_id = data.get("frame_id")
     if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
         raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r}")
+    background = data.get("background_label")
+    if background is not None and not (type(background) is int and 0 <= background <= 65535):
+        raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r}")
     camera = _camera(
         where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
     )
@@ -73,6 +78,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         camera=camera,
         metres_per_unit=None if unit is None else check_metres_per_unit(where, unit),
         frame_id=frame_id,
+        background_label=background,
     )
 
 

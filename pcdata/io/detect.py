@@ -11,11 +11,13 @@ from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.cloud_files import CloudFilesSource
 from pcdata.io.folder import FolderSource
 from pcdata.io.graspnet import GraspNetSource
+from pcdata.io.realsense_bag import RealSenseBagSource
 from pcdata.io.seven_scenes import SevenScenesSource
 from pcdata.io.source import Source
 
 LAYOUTS: dict[str, type[Source]] = {
-    layout.kind: layout for layout in (FolderSource, GraspNetSource, SevenScenesSource, CloudFilesSource)
+    layout.kind: layout
+    for layout in (FolderSource, GraspNetSource, SevenScenesSource, RealSenseBagSource, CloudFilesSource)
 }
 
 
@@ -29,7 +31,7 @@ def open_source(
     """Open a capture; nothing but names and calibration is read until ``load``.
 
     Args:
-        path: a folder, or a single ``.pcd`` / ``.ply`` file.
+        path: a folder, or a single ``.pcd``, ``.ply`` or ``.bag`` file.
         kind: the layout, one of :data:`LAYOUTS`; None = found by its signs.
         limit: keep the first so many samples only.
         **options: those of the layout's class, e.g. ``metres_per_unit``.

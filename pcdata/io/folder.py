@@ -56,7 +56,8 @@ class FolderSource(Source):
             path: the folder.
             metres_per_unit: length of one stored depth unit, where ``intrinsics.json`` does not state it.
             invalid_values: stored depth values besides 0 that mean "no reading".
-            background_label: the label in the files that means "no object" and becomes -1; None = keep all.
+            background_label: the label in the files that means "no object" and becomes -1, where ``intrinsics.json``
+                does not state it; None = keep all.
             frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
             calibration: a :class:`Calibration` or its file, whose camera replaces that of ``intrinsics.json``. Where it
                 has transforms, the capture has no ``poses`` and a ``frame_id`` is stated, it also gives the pose.
@@ -92,7 +93,12 @@ class FolderSource(Source):
                 f"folder source {path}: camera={camera!r} names one of a calibration; give calibration too"
             )
         self.invalid_values = tuple(invalid_values)
-        self.background_label = background_label
+        if stated.background_label is not None and background_label not in (None, stated.background_label):
+            raise CaptureError(
+                f"{present[0]}: says background_label {stated.background_label}, the argument {background_label}; drop "
+                "one"
+            )
+        self.background_label = stated.background_label if background_label is None else background_label
         if not (path / "depth").is_dir():
             raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
         self._files = {"depth": by_stem(path / "depth", DEPTH_SUFFIXES)}

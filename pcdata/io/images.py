@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from pcdata.checks import check_tensors
-from pcdata.errors import CaptureError, DTypeError, NoReadingError, UnitError
-from pcdata.io.files import existing_file, map_npy, replacing
+from pcdata.errors import CaptureError, NoReadingError, UnitError
+from pcdata.io.files import existing_file, map_npy
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30
@@ -71,12 +70,12 @@ def read_depth(
     if raw.dtype == np.uint16:
         if not all(0 <= value <= 65535 for value in invalid_values):
             raise CaptureError(f"{where}: invalid_values must lie in 0 .. 65535, got {tuple(invalid_values)}")
-        table = _metres_of_value(unit)
+        table = metres_of_value(unit)
         table[[0, *invalid_values]] = 0.0
         depth = table[raw]
     else:
         depth = _clean_float_depth(where, raw, unit, invalid_values)
-    _check_plausible(where, depth, unit)
+    check_plausible(where, depth, unit)
     return torch.from_numpy(depth)
 
 
@@ -116,7 +115,7 @@ def _read_npy(where: str, path: Path) -> NDArray[Any]:
     return np.array(array, dtype=array.dtype.newbyteorder("="))
 
 
-def _metres_of_value(metres_per_unit: float) -> NDArray[np.float32]:
+def metres_of_value(metres_per_unit: float) -> NDArray[np.float32]:
     """Return the nearest float32 metres of each of the 65536 stored values."""
     return (np.arange(1 << 16, dtype=np.float64) * metres_per_unit).astype(np.float32)
 
@@ -139,7 +138,8 @@ def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Coll
     return depth
 
 
-def _check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
+def check_plausible(where: str, depth: NDArray[np.float32], unit: float) -> None:
+    """Require readings, and half of them at distances that depth cameras see."""
     valid = depth[depth > 0]
     if not len(valid):
         raise NoReadingError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
@@ -158,7 +158,7 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
         CaptureError: the file is missing, damaged, grey, palette, CMYK or deeper than 8 bits per channel.
     """
     where = f"read_color: {path}"
-    _check_suffix(where, path, COLOR_SUFFIXES)
+    check_suffix(where, path, COLOR_SUFFIXES)
     mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG, _JPEG))
     if mode not in ("RGB", "RGBA") or bits == 16:
         found = f"{bits}-bit {mode}" if bits else mode
@@ -176,7 +176,7 @@ def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
         CaptureError: the file is missing, damaged, colour, or grey of fewer than 8 bits (which viewers rescale).
     """
     where = f"read_labels: {path}"
-    _check_suffix(where, path, (".png",))
+    check_suffix(where, path, (".png",))
     mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
     if not (mode == "P" or (mode == "L" and bits == 8) or (bits == 16 and mode.startswith("I"))):
         raise CaptureError(
@@ -193,77 +193,15 @@ def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
         CaptureError: the file is missing, damaged, or of another type.
     """
     where = f"read_mask: {path}"
-    _check_suffix(where, path, (".png",))
+    check_suffix(where, path, (".png",))
     mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
     if mode not in ("1", "L"):
         raise CaptureError(f"{where}: a mask must be a 1-bit or 8-bit grey PNG, but this image is {bits}-bit {mode}")
     return torch.from_numpy(pixels != 0)
 
 
-def write_depth(
-    path: str | os.PathLike[str],
-    depth: Tensor,  # (H, W) float32 metres, 0 = no reading
-    *,
-    metres_per_unit: float,
-    round_to_unit: bool = False,
-) -> None:
-    """Write depth as a 16-bit PNG from which :func:`read_depth` returns the same values.
-
-    Args:
-        path: a ``.png`` file; it appears complete or not at all.
-        depth: metres, 0 = no reading.
-        metres_per_unit: length of one stored unit.
-        round_to_unit: accept depths between two units and round them, which loses up to half a unit.
-
-    Raises:
-        CaptureError: a value is negative, above 65535 units, or between two units without ``round_to_unit``.
-        DTypeError, ShapeError, NonFiniteError: the tensor is not a finite float32 (H, W).
-    """
-    where = f"write_depth: {path}"
-    _check_suffix(where, path, (".png",))
-    unit = check_metres_per_unit(where, metres_per_unit)
-    check_tensors(where, {"depth": depth}, {"depth": "H W"})
-    metres = depth.detach().cpu().numpy()
-    units = np.rint(metres.astype(np.float64) / unit)
-    if (metres < 0).any() or (units > 65535).any():
-        raise CaptureError(
-            f"{where}: depth must lie in 0 .. {65535 * unit:g} m, got {metres.min():g} .. {metres.max():g}; "
-            "choose a larger metres_per_unit"
-        )
-    raw = units.astype(np.uint16)
-    # Two float32 steps: depth computed as float32(n) * float32(unit) is n units, though not the float nearest to them.
-    exact = np.abs(_metres_of_value(unit)[raw] - metres) <= 2 * np.spacing(metres)
-    if not round_to_unit and not exact.all():
-        raise CaptureError(
-            f"{where}: {int((~exact).sum())} pixels of {exact.size} are not whole multiples of {unit:g} m; choose the "
-            "unit of the sensor, pass round_to_unit=True to lose up to half a unit, or save float32 .npy"
-        )
-    if ((raw == 0) & (metres > 0)).any():
-        raise CaptureError(f"{where}: depth below half of {unit:g} m would become 'no reading'; use a smaller unit")
-    with replacing(where, path) as temporary:
-        Image.fromarray(raw).save(temporary, format=_PNG)
-
-
-def write_color(
-    path: str | os.PathLike[str],
-    colors: Tensor,  # (H, W, 3) uint8
-) -> None:
-    """Write RGB as an 8-bit PNG, which loses nothing.
-
-    Raises:
-        CaptureError: the path does not end in ``.png``, or cannot be written.
-        DTypeError, ShapeError: the tensor is not uint8 (H, W, 3).
-    """
-    where = f"write_color: {path}"
-    _check_suffix(where, path, (".png",))
-    if isinstance(colors, Tensor) and colors.is_floating_point():
-        raise DTypeError(f"{where}: colors must be uint8 0..255, not {colors.dtype}; (colors * 255).round().byte()")
-    check_tensors(where, {"colors": colors}, {"colors": "H W 3 : uint8"})
-    with replacing(where, path) as temporary:
-        Image.fromarray(colors.detach().cpu().numpy()).save(temporary, format=_PNG)
-
-
-def _check_suffix(where: str, path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> None:
+def check_suffix(where: str, path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> None:
+    """Require that a file name ends as its format demands."""
     if Path(path).suffix.lower() not in suffixes:
         raise CaptureError(f"{where}: the file must end in {' or '.join(suffixes)}, not {Path(path).suffix!r}")
 

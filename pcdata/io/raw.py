@@ -10,12 +10,12 @@ from torch import Tensor
 from pcdata.errors import CaptureError
 from pcdata.io.capture_camera import CaptureCamera, write_capture_camera, write_pose
 from pcdata.io.confidence import write_confidence
-from pcdata.io.images import write_color, write_depth
+from pcdata.io.image_writing import write_color, write_depth, write_labels, write_mask
 from pcdata.structures import DepthFrame
 
 
 def write_capture(frame: DepthFrame, folder: Path) -> None:
-    """Write depth, colour, confidence, pose and calibration of every view to ``folder/view<v>``.
+    """Write every image, the pose and the calibration of every view to ``folder/view<v>``.
 
     Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
 
@@ -32,8 +32,18 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
 def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
     (view / "depth").mkdir(parents=True)
     unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
-    calibration = CaptureCamera(camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id)
+    background = None
+    if frame.labels is not None:
+        background = _free_label(frame.labels[v])
+        (view / "labels").mkdir()
+        write_labels(view / "labels" / "0.png", frame.labels[v], background_label=background)
+    calibration = CaptureCamera(
+        camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id, background_label=background
+    )
     write_capture_camera(view / "intrinsics.json", calibration)
+    if frame.mask is not None:
+        (view / "masks").mkdir()
+        write_mask(view / "masks" / "0.png", frame.mask[v])
     if frame.colors is not None:
         (view / "color").mkdir()
         write_color(view / "color" / "0.png", frame.colors[v])
@@ -43,6 +53,12 @@ def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
     if frame.world_from_camera is not None:
         (view / "poses").mkdir()
         write_pose(view / "poses" / "0.txt", frame.world_from_camera[v])
+
+
+def _free_label(labels: Tensor) -> int:
+    """Return the largest 16-bit id that no pixel has; there is one, or the ids do not fit anyway."""
+    used = set(labels.unique().tolist())
+    return next((label for label in range(65535, -1, -1) if label not in used), 65535)
 
 
 def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:

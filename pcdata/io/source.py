@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from pcdata.errors import CaptureError, PcdataError, add_note, near_matches
+from pcdata.errors import CaptureError, DTypeError, PcdataError, add_note, near_matches
 from pcdata.structures import DepthFrame, PointCloud
 
 _LITTER = ("thumbs.db", "desktop.ini")
@@ -26,6 +26,27 @@ class CaptureSource(Protocol):
 
     def load(self, sample_id: str) -> DepthFrame | PointCloud:
         """Load one sample."""
+
+
+def checked_ids(where: str, source: Any) -> list[str]:
+    """Return the ids of a source that can be read as a whole.
+
+    Raises:
+        DTypeError: it is no source.
+        CaptureError: it has no samples, or two with one id.
+    """
+    if not hasattr(source, "ids") or not hasattr(source, "load"):
+        raise DTypeError(
+            f"{where}: source must have ids and load(id), got {type(source).__name__}; pcdata.open_source(path) makes "
+            "one of a folder or file"
+        )
+    ids = list(source.ids)
+    if not ids:
+        raise CaptureError(f"{where}: {source!r} has no samples")
+    if len(set(ids)) != len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise CaptureError(f"{where}: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    return ids
 
 
 class Source(ABC):

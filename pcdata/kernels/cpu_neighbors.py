@@ -13,7 +13,7 @@ from pcdata.dispatch import kernel
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud, require_points
 from pcdata.functional.nearest import largest_squared
-from pcdata.functional.neighbors import check_neighbors
+from pcdata.functional.neighbors import check_ball_query, check_neighbors
 from pcdata.functional.parameters import check_grid, require_count, require_length, require_positive
 from pcdata.kernels.native import call
 
@@ -52,9 +52,7 @@ def ball_query(
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run the reference's contract in the core."""
-    check_neighbors("ball_query", points, ptr, queries, queries_ptr, grid)
-    require_count("ball_query", "max_neighbors", max_neighbors)
-    require_length("ball_query", "radius", radius)
+    check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
     index, distance, count = _neighbors(
         points, ptr, max_neighbors, float(radius), queries, queries_ptr, grid, counted=True
     )

@@ -11,13 +11,10 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-# The operations must be registered before their kernels.
-import pcdata.functional.neighbors
-import pcdata.functional.sampling  # noqa: F401
 from pcdata.dispatch import kernel
-from pcdata.errors import BackendError, ShapeError
+from pcdata.errors import BackendError
 from pcdata.functional.grid import ImageGrid
-from pcdata.functional.parameters import require_count, require_length
+from pcdata.functional.neighbors import check_ball_query
 from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
 from pcdata.functional.sampling import check_available, counts_per_cloud
 
@@ -77,11 +74,8 @@ def ball_query(
         BackendError: on CUDA.
     """
     _require_cpu("ball_query", points)
-    require_count("ball_query", "max_neighbors", max_neighbors)
-    require_length("ball_query", "radius", radius)
+    check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
     if queries is None:
-        if queries_ptr is not None:
-            raise ShapeError("ball_query: queries_ptr was given without queries; pass both, or neither")
         queries, queries_ptr = points, ptr
     assert queries_ptr is not None  # @op fills it
     query, row = _load().radius(

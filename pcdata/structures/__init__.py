@@ -3,10 +3,11 @@
 from pcdata.structures.camera import Camera
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
-from pcdata.structures.fields import Kind
+from pcdata.structures.fields import METRE, NORMALIZED, Kind
 from pcdata.structures.filled import confidence_of, with_filled_depth
+from pcdata.structures.image_layout import ImageLayout
 from pcdata.structures.padded import PaddedClouds
-from pcdata.structures.point_cloud import METRE, NORMALIZED, ImageLayout, PointCloud
+from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.registration import register_to_color
 from pcdata.structures.surface_mesh import SurfaceMesh
 from pcdata.structures.tsdf_volume import TSDFVolume

@@ -1,8 +1,11 @@
-"""The kinds of per-point fields: what a motion or an average does to each."""
+"""What the numbers of a cloud mean: the kinds of its per-point fields, and its units."""
 
 from __future__ import annotations
 
 from enum import Enum
+
+METRE = "m"
+NORMALIZED = "normalized"
 
 
 class Kind(str, Enum):

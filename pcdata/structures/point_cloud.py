@@ -11,29 +11,20 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_ptr_values, check_tensors
-from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
+from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional import rigid
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.structures.cloud_checks import check_cloud, check_names
 from pcdata.structures.derive import derived
-from pcdata.structures.fields import CORE_KINDS, Kind
+from pcdata.structures.fields import CORE_KINDS, METRE, Kind
+from pcdata.structures.image_layout import ImageLayout, joined_layout, within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.padded import PaddedClouds, padded_clouds
-
-METRE = "m"
-NORMALIZED = "normalized"
 
 Step = dict[str, Any]
 
 _SELECTED = {"points": "N 3", "ptr": "ptr N B"}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImageLayout:
-    """The depth images that the clouds of a batch still lie on, row after row in pixel order."""
-
-    size: tuple[int, int]  # (height, width) of every image
-    intrinsics: Tensor  # (B, 3, 3) float64, pixels
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +55,7 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         self._fill_defaults()
-        self._check()
+        check_cloud(self)
 
     # -- construction ----------------------------------------------------------------------------------------------
 
@@ -83,79 +74,6 @@ class PointCloud:
         fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
         fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
         fill(self, "kinds", {name: Kind(kind) for name, kind in self.kinds.items()})
-
-    def _check(self) -> None:
-        values = {
-            "points": self.points,
-            "ptr": self.ptr,
-            "colors": self.colors,
-            "normals": self.normals,
-            "labels": self.labels,
-            "source_index": self.source_index,
-            "viewpoint": self.viewpoint,
-            "source_from_cloud": self.source_from_cloud,
-        }
-        specs = {
-            "points": "N 3",
-            "colors": "N 3",
-            "normals": "N 3",
-            "labels": "N : int64",
-            "source_index": "N : int64",
-            "viewpoint": "B 3",
-            "source_from_cloud": "B 4 4 : float64",
-            "ptr": "ptr N B",
-        }
-        # Shapes only: values are read where data enters (readers, ops), so that a step on a GPU does not wait here.
-        sizes = check_tensors("PointCloud", values, specs, check_values=False)
-        if self.ptr.device.type == "cpu":
-            check_ptr_values("PointCloud", "ptr", self.ptr, sizes["N"])
-        self._check_extra(sizes["N"])
-        poses = {f"frames[{name!r}]": matrix for name, matrix in self.frames.items()}
-        check_tensors(
-            "PointCloud",
-            {"source_from_cloud": self.source_from_cloud, **poses},
-            dict.fromkeys(["source_from_cloud", *poses], "B 4 4 : float64"),
-            check_values=False,
-        )
-        for name in ("meta", "history"):
-            if len(getattr(self, name)) != self.num_clouds:
-                raise ShapeError(
-                    f"PointCloud: {name} needs an entry per cloud, {self.num_clouds}, got {len(getattr(self, name))}"
-                )
-        self._check_names()
-
-    def _check_names(self) -> None:
-        if not self.frame_id:
-            raise FrameError("PointCloud: frame_id must name the coordinate frame, it is empty")
-        if self.unit not in (METRE, NORMALIZED):
-            raise UnitError(f"PointCloud: unit must be {METRE!r} or {NORMALIZED!r}, got {self.unit!r}")
-
-    def _check_extra(self, num_points: int) -> None:
-        if set(self.extra) != set(self.kinds):
-            raise DTypeError(
-                f"PointCloud: every extra field needs a kind and only those: fields {sorted(self.extra)}, "
-                f"kinds {sorted(self.kinds)}"
-            )
-        for name, value in self.extra.items():
-            if name in CORE_KINDS or not name.isidentifier():
-                raise DTypeError(f"PointCloud: {name!r} cannot name an extra field")
-            if not isinstance(value, Tensor):
-                raise DTypeError(f"PointCloud: extra[{name!r}] must be a torch.Tensor, not {type(value).__name__}")
-            if value.device != self.points.device:
-                raise DeviceError(
-                    f"PointCloud: extra[{name!r}] is on {value.device} but points is on {self.points.device}; "
-                    "move one with .to()"
-                )
-            if name == "viewpoint" and self.kinds[name] is not Kind.POSITION:
-                raise DTypeError(f"PointCloud: extra['viewpoint'] is a position, not {self.kinds[name].value}")
-            if value.shape[:1] != (num_points,):
-                raise ShapeError(f"PointCloud: extra[{name!r}] has {tuple(value.shape)[:1]} rows, not {num_points}")
-            if self.kinds[name] is Kind.MINIMUM and (value.is_floating_point() or value.is_complex()):
-                raise DTypeError(f"PointCloud: extra[{name!r}] is a minimum: it must hold integers, not {value.dtype}")
-            if self.kinds[name] in (Kind.POSITION, Kind.DIRECTION) and (
-                value.shape != (num_points, 3) or not value.is_floating_point()
-            ):
-                raise ShapeError(f"PointCloud: extra[{name!r}] is a {self.kinds[name].value}: it must be float (N, 3)")
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -194,7 +112,7 @@ class PointCloud:
             return None
         height, width = self.layout.size
         return ImageGrid(
-            _within_image(self.source_index, self.ptr, height * width),
+            within_image(self.source_index, self.ptr, height * width),
             self.layout.size,
             self.layout.intrinsics,
             self.source_from_cloud,
@@ -290,7 +208,7 @@ class PointCloud:
             frame_id=self.frame_id if frame_id is None else frame_id,
             unit=self.unit if unit is None else unit,
         )
-        result._check_names()
+        check_names(result)
         return result
 
     def in_source_frame(self) -> PointCloud:
@@ -308,7 +226,7 @@ class PointCloud:
         rows = {name: value[start:stop] for name, value in self.fields().items()}
         return self._with_rows(
             rows,
-            layout=_layout_of([self.layout], slice(b, b + 1)),
+            layout=joined_layout([self.layout], slice(b, b + 1)),
             ptr=torch.tensor([0, stop - start], device=self.device),
             viewpoint=None if self.viewpoint is None else self.viewpoint[b : b + 1],
             source_from_cloud=self.source_from_cloud[b : b + 1],
@@ -332,7 +250,7 @@ class PointCloud:
         known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
         return first._with_rows(
             join_rows(parts),
-            layout=_layout_of([cloud.layout for cloud in clouds]),
+            layout=joined_layout([cloud.layout for cloud in clouds]),
             ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
             viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
             source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
@@ -404,20 +322,3 @@ class PointCloud:
         sizes = f"{counts[0]} points" if len(counts) == 1 else f"{len(counts)} clouds of {min(counts)}-{max(counts)}"
         carried = ", ".join(name for name in self.fields() if name != "points")
         return f"PointCloud({sizes} in {self.frame_id!r} [{self.unit}]{': ' + carried if carried else ''})"
-
-
-def _within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:
-    """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
-    if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
-        last = ptr[1:][ptr[1:] > ptr[:-1]] - 1
-        if bool((source_index[last] < num_pixels).all()):
-            return source_index
-    return source_index % num_pixels
-
-
-def _layout_of(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None)) -> ImageLayout | None:
-    """Join the layouts of batches, or take part of one; None when one has none or the images differ in size."""
-    known = [layout for layout in layouts if layout is not None]
-    if len(known) < len(layouts) or len({layout.size for layout in known}) > 1:
-        return None
-    return ImageLayout(size=known[0].size, intrinsics=torch.cat([layout.intrinsics for layout in known])[clouds])

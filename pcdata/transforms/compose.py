@@ -97,8 +97,8 @@ class Compose(Transform):
             yield step, data
 
     def split(self) -> tuple[Compose, Compose]:
-        """Return the longest deterministic prefix, which a cache may hold, and the rest."""
-        steps = list(self.steps)
+        """Return the longest deterministic prefix, which a cache may hold, and the rest; a chain within is opened."""
+        steps = list(opened(self.steps))
         first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
         with order_checked_before():
             return Compose(steps[:first]), Compose(steps[first:])
@@ -160,11 +160,18 @@ def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Genera
     return generator[:1] if count == 1 else Streams.of(generator[0], count).generators
 
 
-def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
+def opened(steps: Sequence[Transform]) -> Iterator[Transform]:
+    """Yield the steps with those of a chain within in its place: a chain adds nothing to its steps."""
     for step in steps:
         if isinstance(step, Compose):
-            yield from _flatten(list(step.steps))
-        elif isinstance(step, RandomApply):
+            yield from opened(step.steps)
+        else:
+            yield step
+
+
+def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
+    for step in opened(steps):
+        if isinstance(step, RandomApply):
             yield from _flatten([step.transform])
         else:
             yield step

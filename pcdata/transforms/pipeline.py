@@ -12,7 +12,7 @@ import yaml
 from pcdata.errors import ConfigError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform
-from pcdata.transforms.compose import Compose, order_checked_before
+from pcdata.transforms.compose import Compose, opened, order_checked_before
 from pcdata.transforms.config import read_config, steps_from_node
 from pcdata.transforms.sensor_words import SENSOR, sensor_from_node
 from pcdata.yaml_nodes import YamlDocument, yaml_text
@@ -68,10 +68,12 @@ class Pipeline(Transform, abstract=True):
     def deterministic_prefix(self) -> Pipeline:
         """The steps before the first random one: what a cache holds."""
         count = len(self._from_depth.split()[0])
-        depth = list(self.depth)[:count]
-        cloud = list(self.cloud)[: count - len(depth)]
+        kept: dict[str, list[Transform]] = {}
+        for section in SECTIONS:
+            kept[section] = list(opened(getattr(self, section)))[:count]
+            count -= len(kept[section])
         with order_checked_before():
-            return Pipeline(depth=depth, cloud=cloud, augment=list(self.augment)[: count - len(depth) - len(cloud)])
+            return Pipeline(**kept)
 
     def random_suffix(self) -> Compose:
         """The steps from the first random one on: what runs on cached clouds."""

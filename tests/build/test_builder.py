@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pcdata import CachedCloudDataset, PointCloud, open_source
-from pcdata.build import build_dataset
+from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PcdataError
 from pcdata.io.manifest import Manifest, key_of
 
@@ -195,7 +195,7 @@ def test_progress_that_raises_leaves_nothing(tmp_path, source, configure):
 
 
 def test_a_source_without_captures_is_refused(tmp_path, configure):
-    with pytest.raises(CaptureError, match="no captures"):
+    with pytest.raises(CaptureError, match="no samples"):
         build_dataset(configure(), Clouds({}), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -225,6 +225,13 @@ def test_a_pipeline_without_deprojection_is_refused(tmp_path, source):
 
 
 # -- what is there already -----------------------------------------------------------------------------------------
+
+
+def test_random_noise_on_the_depth_is_refused_since_no_cloud_could_be_stored(tmp_path, source):
+    noisy = config_from_yaml("depth: [RandomSensorNoise: {sensor: realsense_d435}, Deproject]\ncloud: []\n")
+    with pytest.raises(ConfigError, match=r"RandomSensorNoise.*CloudDataset"):
+        build_dataset(noisy, source, tmp_path / "dataset")
+    assert not (tmp_path / "dataset").exists()
 
 
 def test_an_existing_folder_is_refused_with_both_ways_out(tmp_path, source, configure):

@@ -12,7 +12,7 @@ from pcdata.functional import rigid
 from pcdata.functional.pose_graph import PairMotion, average_motions
 from pcdata.functional.small_motions import motion_from_twist, twist_from_motion
 from pcdata.io.capture_camera import CaptureCamera, write_capture_camera
-from pcdata.io.images import write_depth
+from pcdata.io.image_writing import write_depth
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 

@@ -275,8 +275,9 @@ def test_the_command_exports_captures(capsys, capture_folder, tmp_path):
     code, text, _ = run(capsys, capture_folder, "--to", "graspnet", "--out", out, *options)
     assert code == 0
     assert f"export  {out}  (graspnet: 1 samples written)" in text
-    assert "note    captures without a mask" in text
-    assert torch.equal(open_source(out).load("0").depth, frame().depth)
+    delivered = open_source(out).load("0")
+    assert torch.equal(delivered.depth, frame().depth)
+    assert torch.equal(delivered.mask, frame().mask)
     code, _, err = run(capsys, capture_folder, "--to", "graspnet", "--out", out, *options)
     assert (code, "exists already" in err) == (1, True)
     assert run(capsys, capture_folder, "--to", "graspnet", "--out", out, *options, "--overwrite")[0] == 0

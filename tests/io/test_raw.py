@@ -23,6 +23,9 @@ def _assert_read_back(frame: DepthFrame, folder) -> None:
         assert (read.colors is None) == (view.colors is None)
         if view.colors is not None:
             assert torch.equal(read.colors, view.colors)
+        for name in ("labels", "mask", "confidence"):
+            mine, theirs = getattr(view, name), getattr(read, name)
+            assert theirs is None if mine is None else torch.equal(theirs, mine), name
         assert read.frame_id == view.frame_id
         if view.world_from_camera is not None:
             assert torch.equal(read.world_from_camera, view.world_from_camera)
@@ -38,6 +41,24 @@ def test_every_view_reads_back_equal(tmp_path):
     frame = tabletop(3, num_objects=2, num_views=2, noise="stereo", size=(24, 32)).frame
     write_capture(frame, tmp_path)
     _assert_read_back(frame, tmp_path)
+
+
+def test_labels_without_an_object_and_masks_read_back(tmp_path):
+    frame = tabletop(1, num_objects=2, size=(24, 32)).frame
+    labels = frame.labels.clone()
+    labels[:, :5] = -1
+    labels[:, 5:7] = 65535  # a full 16 bits of ids: the background takes another one
+    inside = torch.rand(labels.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    marked = replace(frame, labels=labels, mask=inside, confidence=(labels > 0).to(torch.uint8))
+    write_capture(marked, tmp_path)
+    _assert_read_back(marked, tmp_path)
+
+
+@pytest.mark.parametrize("label", [-2, 65536])
+def test_labels_that_16_bits_cannot_hold_are_refused(tmp_path, label):
+    frame = tabletop(1, num_objects=1, size=(24, 32)).frame
+    with pytest.raises(CaptureError, match=r"write_labels.*0 .. 65535"):
+        write_capture(replace(frame, labels=torch.full_like(frame.labels, label)), tmp_path)
 
 
 def test_lens_distortion_reads_back(tmp_path):

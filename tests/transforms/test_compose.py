@@ -113,6 +113,16 @@ def test_prefix_and_suffix_give_what_the_whole_gives(seed):
     assert_same(suffix(prefix(cloud), generator=seeded(seed)), whole(cloud, generator=seeded(seed)))
 
 
+def test_a_split_looks_inside_nested_chains():
+    steps = list(chain().steps)
+    nested = T.Compose([steps[0], T.Compose(steps[1:4]), T.Compose(steps[4:])])
+    prefix, suffix = nested.split()
+    assert [len(prefix), len(suffix)] == [2, 4]
+    assert prefix.fingerprint() == chain().split()[0].fingerprint()
+    cloud = cloud_in_base()
+    assert_same(suffix(prefix(cloud), generator=seeded(1)), chain()(cloud, generator=seeded(1)))
+
+
 def test_a_chain_without_random_steps_is_all_prefix():
     prefix, suffix = T.Compose([T.Center(), T.NormalizeUnitSphere()]).split()
     assert [len(prefix), len(suffix)] == [2, 0]

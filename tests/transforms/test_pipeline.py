@@ -62,6 +62,14 @@ def test_the_prefix_ends_at_the_first_random_step_wherever_it_is():
     assert not fixed.is_random
 
 
+def test_the_prefix_reaches_into_nested_chains_of_a_section():
+    flat = [T.ToFrame(frame="base"), T.Center(), T.RandomPointDropout()]
+    nested = pipeline(cloud=[flat[0], T.Compose(flat[1:])])
+    prefix = nested.deterministic_prefix()
+    assert [len(prefix.depth), len(prefix.cloud), len(prefix.augment)] == [2, 2, 0]
+    assert nested.fingerprint() == pipeline(cloud=flat).fingerprint()
+
+
 def test_the_fingerprint_is_that_of_what_a_cache_holds():
     same = pipeline(augment=[T.RandomScale()])
     assert same.fingerprint() == pipeline().fingerprint()
