@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.functional.ragged import pick_rows
 from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
 from pcdata.functional.tsdf.blocks import COLOR_SCALE, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS, VoxelGrid
@@ -33,11 +34,9 @@ class Crossings:
     dropped: int  # how many more there are whose ends were seen less than asked for
 
     def select(self, rows: Tensor) -> Crossings:
-        """Keep some rows (K,) int64, in their order."""
-        chosen: dict[str, Any] = {
-            name: value.index_select(0, rows) if isinstance(value, Tensor) and len(value) else value
-            for name, value in ((entry.name, getattr(self, entry.name)) for entry in fields(self))
-        }
+        """Keep some rows (K,) int64, without their edges."""
+        columns = {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and name != "edge"}
+        chosen: dict[str, Any] = {**vars(self), "edge": rows[:0], **pick_rows(columns, rows)}
         return Crossings(**chosen)
 
     @staticmethod
