@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=2 PCDATA_TEST_DATA=... python benchmarks/surface.py --voxel 0.005    # results/surface.json
 
 Method: both libraries hold a field of the same frames and extract it in turn, in one process, with the threads that
-OMP_NUM_THREADS gives to both; least of the repeats, by the clock on the wall and by the CPU time of the process. One run
-is kept per voxel size and number of threads. Results are freed before the other library starts.
+OMP_NUM_THREADS gives to both; least of the repeats, by the clock on the wall and by the CPU time of the process. One
+run is kept per voxel size and number of threads. Results are freed before the other library starts.
 """
 
 from __future__ import annotations

@@ -69,9 +69,7 @@ def find_triangles(
     edge: Tensor,  # (M,) int64, rising: the edges with a vertex, numbered as in Crossings
     *,
     min_weight: int = 1,
-) -> tuple[
-    Tensor, Tensor
-]:  # used (K,) int64 rows of the vertices, rising; triangles (T, 3) int64 rows of used
+) -> tuple[Tensor, Tensor]:  # used (K,) int64 rows of the vertices, rising; triangles (T, 3) int64 rows of used
     """Find the surface within the cubes whose eight corners were seen, with ``min_weight`` at least.
 
     Triangles are ordered by cube. One with a corner that has no vertex is left out.

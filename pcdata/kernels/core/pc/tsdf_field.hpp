@@ -77,7 +77,7 @@ class EdgeEnds {
  private:
   static constexpr int kPitch = kSlab + kEdge;
 
-  // Apart in sign, by at most 32767: 16 bits hold the difference. An unseen end is too far from one that is not negative.
+  // Apart in sign, by at most 32767: 16 bits hold the difference. An unseen end is too far from one of the other sign.
   static uint64_t crossing(const int16_t* here, const int16_t* there) {
     int8_t truth[kSlab];
     for (int i = 0; i < kSlab; ++i) {

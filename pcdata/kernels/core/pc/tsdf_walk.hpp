@@ -10,12 +10,12 @@ struct SortedBlocks {
   int64_t count;
 };
 
-// The blocks of one column, (x + dx, y + dy, any z), met while walking through the keys in order: what is asked for only
-// ever rises, so a cursor that moves up finds it.
+// The blocks of one column, (x + dx, y + dy, any z), met while walking through the keys in order: what is asked for
+// only ever rises, so a cursor that moves up finds it.
 class Column {
  public:
   Column(const SortedBlocks& blocks, int64_t first, int dx, int dy)
-      : blocks_(blocks), step_((int64_t{dx} << 42) + (int64_t{dy} << 21)) {
+      : blocks_(blocks), step_(dx * (int64_t{1} << 42) + dy * (int64_t{1} << 21)) {
     at_ = std::lower_bound(blocks.keys, blocks.keys + blocks.count, blocks.keys[first] + step_ - 1) - blocks.keys;
   }
   // Places in the order of keys of the blocks at z - 1, z, z + 1; -1 where there is none. No key of a block is next to

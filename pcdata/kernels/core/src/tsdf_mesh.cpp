@@ -1,7 +1,8 @@
-// Triangles between the zero crossings of a truncated signed distance field: the same as pcdata/functional/tsdf/marching.py.
+// Triangles between the zero crossings of a truncated signed distance field: those of
+// pcdata/functional/tsdf/marching.py, in the same order.
 //
-// Eight words of 64 bits hold one property of a block's voxels, one word per z: corners of all cubes of a slab are words
-// shifted by a voxel, a line or a slab.
+// Eight words of 64 bits hold one property of a block's voxels, one word per z: the corners of all cubes of a slab are
+// words shifted by a voxel, a line or a slab.
 #include "pc/tsdf_walk.hpp"
 
 namespace pc {
@@ -94,7 +95,7 @@ void index_edges(const pc_context& context, int64_t count, const int64_t* edge, 
 
 // -- the cubes of a block -----------------------------------------------------------------------------------------
 
-// A block and those after it: bit 0 of a number is a step along x, bit 1 along y, bit 2 along z; -1 where there is none.
+// A block and those after it: bit 0 of a number is a step along x, bit 1 along y, bit 2 along z; -1 where none is.
 using Octet = int64_t[8];
 
 class OctetWalk {
@@ -249,7 +250,7 @@ void each_block(const pc_context& context, const Mesh& mesh, const Body& body) {
 }  // namespace pc
 
 // Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of a cube's corners must
-// exceed; the edges (num_edges,) of the vertices, rising -> signs (count, 16) and edges (count, 32) for the calls below.
+// exceed; the edges (num_edges,) of the vertices, rising -> signs (count, 16), edges (count, 32) for the calls below.
 PC_EXPORT int32_t pc_tsdf_index_mesh(const pc_context* context, const int64_t* keys, const int64_t* rows, int64_t count,
                                      const int64_t* const* planes, int64_t bound, const int64_t* edge,
                                      int64_t num_edges, int64_t* signs, int64_t* edges) {

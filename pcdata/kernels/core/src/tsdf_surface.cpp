@@ -1,5 +1,5 @@
-// Zero crossings of a truncated signed distance field: the same numbers as pcdata/functional/tsdf/surface.py, the normals
-// up to the last bit of a square root.
+// Zero crossings of a truncated signed distance field: the same numbers as pcdata/functional/tsdf/surface.py, the
+// normals up to the last bit of a square root.
 #include "pc/tsdf_field.hpp"
 
 namespace pc {
@@ -218,13 +218,20 @@ void write_block(const Field& field, int64_t number, const int64_t places[27], c
   }
 }
 
+// What a thread works in.
+struct Desk {
+  EdgeEnds ends;
+  Neighbourhood near;
+  Crossings found;
+};
+
 void write_all(const pc_context& context, const Field& field, int16_t bound, const int64_t* starts, double voxel_size,
                const Points& out) {
-  parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
+  std::vector<std::unique_ptr<Desk>> desks(static_cast<size_t>(std::max(context.threads, 1)));
+  parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t thread) {
+    auto& desk = desks[static_cast<size_t>(thread)];
+    if (!desk) desk.reset(new Desk);
     Surroundings around(field.blocks, begin);
-    EdgeEnds ends;
-    auto near = std::make_unique<Neighbourhood>();
-    const std::unique_ptr<Crossings> found(new Crossings);
     const auto next_from = [&](int64_t i) {
       while (i < end && starts[i] == starts[i + 1]) ++i;
       return i;
@@ -246,12 +253,12 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
         fetch(Distances::of(field, ahead[14]));
         if (out.colors != nullptr) fetch(field.planes.color.block(field.blocks.rows[ahead[13]]));
       }
-      const Marks marks = ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
+      const Marks marks = desk->ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
       const Range lines = Range::of(marks);
-      near->fill(distances, lines.wider(2, 2));
-      near->find_slopes(lines);
-      found->list(marks);
-      write_block(field, i, places, *near, voxel_size, *found, out, starts[i]);
+      desk->near.fill(distances, lines.wider(2, 2));
+      desk->near.find_slopes(lines);
+      desk->found.list(marks);
+      write_block(field, i, places, desk->near, voxel_size, desk->found, out, starts[i]);
     }
   });
 }
@@ -259,8 +266,8 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
 }  // namespace
 }  // namespace pc
 
-// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of both ends must exceed -> counts
-// (count,): how many edges of each block cross zero; dropped (1,): how many more do whose ends were seen less.
+// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of both ends must exceed
+// -> counts (count,): how many edges of each block cross zero; dropped (1,): how many more do, seen less.
 PC_EXPORT int32_t pc_tsdf_count_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
                                           int64_t count, const int64_t* const* planes, int64_t bound, int64_t* counts,
                                           int64_t* dropped) {
