@@ -1,6 +1,6 @@
 """Time surface extraction next to Open3D's tensor grid: points and triangles of the same ten hand-held frames.
 
-    OMP_NUM_THREADS=2 PCDATA_TEST_DATA=... python benchmarks/surface.py --voxel 0.005    # results/surface.json
+    OMP_NUM_THREADS=2 PCDATA_TEST_DATA=... python benchmarks/fusion_surface.py    # results/fusion_surface.json
 
 Method: both libraries hold a field of the same frames and extract it in turn, in one process, with the threads that
 OMP_NUM_THREADS gives to both; least of the repeats, by the clock on the wall and by the CPU time of the process. One
@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fusion_peer import open3d_grid, open3d_integrate
+from fusion_peer import Open3DGrid, Open3DView
 
 import pcdata
 from pcdata.report import text_table
 from pcdata.structures import DepthFrame, TSDFVolume
 
-RESULTS = Path(__file__).parent / "results" / "surface.json"
+RESULTS = Path(__file__).parent / "results" / "fusion_surface.json"
 
 
 def main() -> None:
@@ -51,11 +51,11 @@ def main() -> None:
 
 
 def fields_of(frames: list[DepthFrame], voxel_size: float) -> tuple[TSDFVolume, Any]:
-    volume, grid = TSDFVolume(voxel_size=voxel_size, max_bytes=16 << 30), open3d_grid(voxel_size)
+    volume, peer = TSDFVolume(voxel_size=voxel_size, max_bytes=16 << 30), Open3DGrid(voxel_size, 5)
     for frame in frames:
         volume.integrate(frame)
-        open3d_integrate(grid, frame, voxel_size, 5 * voxel_size)
-    return volume, grid
+        peer.integrate(Open3DView.of(frame))
+    return volume, peer.grid
 
 
 def compare(what: str, ours: Callable[[], Any], theirs: Callable[..., Any], repeats: int) -> dict[str, Any]:
