@@ -104,11 +104,14 @@ def align_views(
         if iterations and distance < TUKEY_CUT * _spread(fits):
             break
         reach, converged = distance, False
+        share, last = 1.0, torch.zeros(num_views, 6, dtype=torch.float64, device=poses.device)
         for _ in range(max_iterations):
             fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
             solution = _solve(fits, num_views, fixed)
             step = solution.twist.reshape(num_views, 6)
-            motions = motion_from_twist(step, pivot) @ motions
+            # Along a weak direction a step may go too far, by as much as it came; a part of it ends the swinging.
+            share, last = 0.5 * share if float((step * last).sum()) < 0 else share, step
+            motions = motion_from_twist(share * step, pivot) @ motions
             iterations += 1
             # The Newton decrement is the step in standard deviations: what is left lies within the noise.
             decrement = float(solution.decrement) / _SHARED_DATA**0.5
