@@ -30,8 +30,9 @@ from torch import Tensor
 
 import pcdata
 from pcdata.structures import DepthFrame, TSDFVolume
+from pcdata.structures.tsdf_volume import Carving
 
-LIBRARIES = ("pcdata", "pcdata, carving", "Open3D tensor", "Open3D legacy")
+LIBRARIES = ("pcdata", "pcdata, no carving", "Open3D tensor", "Open3D legacy")
 
 
 class Library(ABC):
@@ -74,7 +75,7 @@ class Library(ABC):
 class Ours(Library):
     """pcdata's volume."""
 
-    def __init__(self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: bool) -> None:
+    def __init__(self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: Carving) -> None:
         super().__init__()
         self._frames = frames
         self._lengths = {"voxel_size": voxel_size, "truncation": multiple * voxel_size}
@@ -198,7 +199,7 @@ def library(name: str, frames: Sequence[DepthFrame], arguments: argparse.Namespa
         return Theirs(frames, *lengths)
     if name == "Open3D legacy":
         return Legacy(frames, *lengths, arguments.legacy_python)
-    return Ours(frames, *lengths, carve=name == "pcdata, carving")
+    return Ours(frames, *lengths, carve="never" if name == "pcdata, no carving" else "near")
 
 
 def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size: float) -> dict[str, Any]:
@@ -207,7 +208,7 @@ def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size
     apart = {
         name: surfaces_apart(one.cloud, theirs.cloud, voxel_size) for name, one in used.items() if isinstance(one, Ours)
     }
-    causes = edges_by_cause(used["pcdata"].cloud, theirs.cloud, theirs.grid, frames, theirs.views)
+    causes = edges_by_cause(used["pcdata, no carving"].cloud, theirs.cloud, theirs.grid, frames, theirs.views)
     return {"apart": apart, "causes": causes}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -23,19 +23,27 @@ from pcdata.structures.surface_mesh import SurfaceMesh
 _CAMERAS_KEPT = 8  # 7 MB each at 640x480
 _WEIGHTINGS = ("constant", "inverse_square", "angle")
 
+Carving = Literal["never", "near", "everywhere"]
+
 
 @dataclass(eq=False, kw_only=True)
 class TSDFVolume:
     """A sparse truncated signed distance field that averages depth images into one surface.
 
-    The result depends on the frames and their order alone: not on threads, and up to rounding not on the order
-    either, unless ``carve`` is set.
+    The result depends on the frames and their order alone, not on threads; with ``carve="never"`` not on the order
+    either, up to rounding.
+
+    ``carve`` says what a view does that sees past a voxel by more than the truncation: a full truncation joins the
+    voxel's average, so that a surface which others see through is worn away. ``"near"`` the surface it sees, in the
+    blocks the view opens, is how fields are averaged since Curless & Levoy, and merges the sheets that noise and drift
+    leave; ``"everywhere"`` also removes what has moved away, by a pass over all blocks per view; ``"never"`` keeps
+    every surface that any view saw. Voxels that no view saw near a surface stay unseen.
     """
 
     voxel_size: float = 0.002  # metres
     truncation: float | None = None  # metres on either side of a surface; None = 5 voxels
     weighting: tsdf.Weighting = "constant"  # how much a reading counts; see functional.tsdf.weight_image
-    carve: bool = False  # readings behind a surface seen before wear it away; costs a pass over all blocks per view
+    carve: Carving = "near"
     min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
     max_bytes: int = 4 << 30  # refuse to grow beyond
     device: torch.device | str = "cpu"
@@ -48,6 +56,8 @@ class TSDFVolume:
     def __post_init__(self) -> None:
         if self.weighting not in _WEIGHTINGS:
             raise ConfigError(f"TSDFVolume: weighting must be one of {_WEIGHTINGS}, got {self.weighting!r}")
+        if self.carve not in get_args(Carving):
+            raise ConfigError(f"TSDFVolume: carve must be one of {get_args(Carving)}, got {self.carve!r}")
         if self.max_bytes < 1:
             raise ConfigError(f"TSDFVolume: max_bytes must be at least 1, got {self.max_bytes}")
         self.device = torch.device(self.device)
@@ -93,8 +103,9 @@ class TSDFVolume:
         if len(new) or not found:
             found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
         for view, rows in zip(views, found, strict=True):
-            every = torch.arange(len(self.blocks), device=frame.device) if self.carve else rows
-            tsdf.integrate_view(self.blocks, every, view, self.grid, carve=self.carve, backend=self.backend)
+            if self.carve == "everywhere":
+                rows = torch.arange(len(self.blocks), device=frame.device)
+            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
@@ -132,8 +143,8 @@ class TSDFVolume:
             )
 
     def _planes_of(self, frame: DepthFrame) -> tsdf.Planes:
-        counted = self.weighting != "constant" or self.carve
-        return tsdf.Planes(colors=frame.colors is not None, labels=frame.labels is not None, views=counted)
+        images = {"colors": frame.colors is not None, "labels": frame.labels is not None}
+        return tsdf.Planes(**images, views=self.weighting != "constant")
 
     def _check_frame(self, frame: DepthFrame) -> None:
         if not isinstance(frame, DepthFrame):

@@ -130,11 +130,23 @@ def test_labels_are_those_that_most_views_gave(views):
 
 def test_carving_wears_away_what_later_views_see_through():
     frames = [frame_of(wall(0.5))] + [frame_of(wall(0.8))] * 30
-    kept, carved = volume_of(*frames), volume_of(*frames, carve=True)
+    kept, carved = volume_of(*frames, carve="never"), volume_of(*frames, carve="everywhere")
     assert bool((kept.extract_points().points[:, 2] < 0.55).any())
     assert not bool((carved.extract_points().points[:, 2] < 0.55).any())
     assert float((carved.extract_points().points[:, 2] - 0.8).abs().max()) < 1e-4
     assert int(carved.extract_points().extra["num_views"].max()) == 30
+
+
+def test_two_sheets_of_one_wall_become_one_near_it_and_stay_two_without_carving():
+    """The front sheet lies beyond the truncation of the other; the views of the back one are the more."""
+    frames = [frame_of(wall(0.5))] + [frame_of(wall(0.57))] * 20
+    depths = {
+        carve: volume_of(*frames, truncation=0.04, carve=carve).extract_points().points[:, 2]
+        for carve in ("never", "near", "everywhere")
+    }
+    assert float((depths["never"] - 0.5).abs().min()) < 1e-4
+    for carve in ("near", "everywhere"):
+        assert float((depths[carve] - 0.57).abs().max()) < 1e-4
 
 
 def test_readings_below_the_confidence_do_not_count():
@@ -189,7 +201,7 @@ KINDS = {
     "constant": {},
     "inverse_square": {"weighting": "inverse_square"},
     "angle": {"weighting": "angle"},
-    "carving": {"carve": True},
+    "carving": {"carve": "everywhere"},
     "lens": {},
 }
 

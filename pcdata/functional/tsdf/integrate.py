@@ -96,7 +96,7 @@ def _update(chunk: Chunk, rows: Tensor, keys: Tensor, view: FusionView, grid: Vo
     if chunk.label is not None and chunk.votes is not None and view.label is not None:
         _vote(chunk.label, chunk.votes, rows, view.label.flatten()[pixel], near)
     if chunk.views is not None:
-        chunk.views[rows] = torch.where(near, (count.int() + 1).clamp(max=MAX_WEIGHT), count.int()).short()
+        chunk.views[rows] = torch.where(seen, (count.int() + 1).clamp(max=MAX_WEIGHT), count.int()).short()
 
 
 def image_from_world(view: FusionView) -> Tensor:

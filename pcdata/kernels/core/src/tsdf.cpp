@@ -101,7 +101,7 @@ void measure(const View& view, const VoxelPlanes& planes, Waiting& turn) {
   std::copy(std::begin(kept), std::end(kept), block.groups);
 }
 
-// Average what was measured into the voxels. kMore: with weights, labels, views or carving.
+// Average what was measured into the voxels. kMore: with weights, labels or views.
 template <class Pixels, bool kMore>
 void update(const View& view, const VoxelPlanes& planes, const Waiting& turn) {
   const SeenBlock& block = turn.block;
@@ -124,14 +124,14 @@ void update(const View& view, const VoxelPlanes& planes, const Waiting& turn) {
     const Truth near = at_most(scaled, most) & at_most(-most, scaled);
     const IntLanes old_weight = widened(weights + at);
     Truth seen = near;
-    if (kMore && view.carve) seen = seen | (less(most, scaled) & less(IntLanes{}, old_weight));
+    if (view.carve) seen = seen | (less(most, scaled) & less(IntLanes{}, old_weight));
     const FloatLanes old = as_float(old_weight);
     const FloatLanes more = has_weights ? as_float(pixel_weights.at(place)) : zero + 1;
     const FloatLanes sum = old + more;
     const FloatLanes share = more / sum;
     const IntLanes stored = widened(tsdfs + at);
     const FloatLanes before = as_float(stored);
-    const FloatLanes distance = kMore ? least(scaled, most) : scaled;  // of what is near, none is more
+    const FloatLanes distance = least(scaled, most);
     store_short(tsdfs + at, select(seen, rounded(before + (distance - before) * share), stored));
     store_short(weights + at, select(seen, truncated(least(sum, zero + kMaxWeight)), old_weight));
     const IntLanes count = counts != nullptr ? widened(counts + at) : old_weight;
@@ -144,7 +144,7 @@ void update(const View& view, const VoxelPlanes& planes, const Waiting& turn) {
     if constexpr (kMore) {
       if (has_labels)
         vote(planes.label.block(block.row) + at, planes.votes.block(block.row) + at, pixel_labels.at(place), near);
-      if (counts != nullptr) store_short(counts + at, select(near, least(count + 1, IntLanes{} + 32767), count));
+      if (counts != nullptr) store_short(counts + at, select(seen, least(count + 1, IntLanes{} + 32767), count));
     }
   });
 }
@@ -205,7 +205,7 @@ PC_EXPORT int32_t pc_tsdf_integrate(const pc_context* context, const float* dept
     const pc::View view{depth, weight,     color, label,   height, width,
                         pose,  block_size, steps, pinhole, lens,   static_cast<float>(scale), carve != 0};
     const pc::VoxelPlanes voxels(planes);
-    const bool more = weight != nullptr || label != nullptr || carve != 0 || voxels.views;
+    const bool more = weight != nullptr || label != nullptr || voxels.views;
     if (more)
       pc::integrate<true>(*context, view, voxels, rows, num_rows, keys);
     else
