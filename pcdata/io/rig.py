@@ -192,8 +192,8 @@ def _check_poses(where: str, cameras: Mapping[str, FolderSource], calibration: C
     lost = [name for name, camera in cameras.items() if name not in own and camera.world_from_camera is None]
     if lost:
         raise CaptureError(
-            f"{where}: nothing says where {name_some(lost)} is: pass calibration with transforms from every camera to "
-            "a frame, and that frame_id (--calibration and --frame), or store poses/ in every camera's folder"
+            f"{where}: no pose is known of {name_some(lost)}: pass calibration, with transforms from every camera to a "
+            "frame, and that frame as frame_id (--calibration and --frame), or store poses/ in every camera's folder"
         )
     for name in own:
         camera = cameras[name]

@@ -237,7 +237,7 @@ def resize_camera(rig: Path) -> None:
         (gain_times, "left, right has no timestamps, but top has"),
         (lose_sample, "every camera needs the same samples: right lacks f1"),
         (lose_file, "right: every sample needs the same files: confidence is missing for f1"),
-        (lose_poses, "nothing says where left is: pass calibration"),
+        (lose_poses, "no pose is known of left: pass calibration"),
         (lead_elsewhere, "one frame, got left 'table', right 'base', top 'base'"),
         (say_no_frame, "nothing says which frame the poses of left lead to"),
         (resize_camera, r"one size, got left 16x12, right 16x12, top 32x24.*Camera\.resized"),
@@ -277,9 +277,9 @@ def test_folders_and_cameras_of_the_calibration_must_be_the_same(
 def test_a_calibration_must_lead_to_a_frame_that_is_named(calibrated: tuple[Path, Path]) -> None:
     rig, file = calibrated
     known = Calibration.load(file)
-    with pytest.raises(CaptureError, match=r"nothing says where left, right, top is.*frame_id"):
+    with pytest.raises(CaptureError, match=r"no pose is known of left, right, top.*frame_id"):
         open_source(rig, calibration=file)
-    with pytest.raises(CaptureError, match="nothing says where left, right, top is"):
+    with pytest.raises(CaptureError, match="no pose is known of left, right, top"):
         open_source(rig, calibration=Calibration(cameras=known.cameras), frame_id="base")
     with pytest.raises(FrameError, match="no frame 'bse'"):
         open_source(rig, calibration=file, frame_id="bse")
