@@ -222,7 +222,7 @@ def moved(millimetre: float, degrees: float) -> Fault:
 
 FAULTS = [
     *(unit(factor) for factor in (10, 100, 0.1, 0.01)),
-    *(shifted_color(pixels) for pixels in (1, 2, 3, 4, 6)),
+    *(shifted_color(pixels) for pixels in (1, 2, 3, 4, 6, 8)),
     *(missing(percent) for percent in (10, 20, 30, 40, 50)),
     *(resized(scale) for scale in (0.5, 0.75, 0.8, 0.9, 1.1, 1.25, 1.5)),
     posed("inverted", rigid.invert_rigid),

@@ -1,11 +1,14 @@
-"""Time and check fusion: against Open3D's tensor grid on hand-held frames, and against the truth on a rendered table.
+"""Time and check fusion: on rendered tables against the truth, on hand-held frames of a room against Open3D.
 
-    OMP_NUM_THREADS=1 PCDATA_TEST_DATA=... python benchmarks/fusion.py     # tables, and results/fusion.json
+    PCDATA_TEST_DATA=... python benchmarks/fusion.py --legacy-python PYTHON    # results/fusion.json and docs/fusion.md
+    python benchmarks/fusion.py --kept                                         # the page's tables from the kept results
 
-Method: frames are loaded before the clock starts; both libraries integrate the same frames in turn, in one process, on
-one thread. The clock is the CPU time of the process: with one thread that is the time on a core of one's own, whatever
-else the machine does. Medians over the frames are kept, and the memory of the stored voxels. The first frame of each is
-left out of the median: it pays for what is made once.
+Method: every row is a process of its own (benchmarks/fusion_frames.py) with one thread or two. In it the libraries
+integrate the same frames in turn, frame by frame, and medians over the frames are kept. With one thread the clock is
+the CPU time of the process: the time on a core of one's own, whatever else the machine does. With two it is the wall
+clock, worth as much as the machine is quiet. Memory is watched in further processes in which one library works alone.
+``--legacy-python`` names an interpreter with Open3D 0.19, whose ScalableTSDFVolume is then timed on the first ten
+frames (it takes 7 GB for those); that of release 0.20 integrates nothing. At 2 mm all this needs some 14 GB of memory.
 """
 
 from __future__ import annotations
@@ -13,135 +16,84 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
-import time
-from collections.abc import Callable
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
-from fusion_peer import open3d_grid, open3d_integrate
+from fusion_page import tables, update_page
+from fusion_truth import truth_rows, workspace_rate
 
 import pcdata
-from pcdata.functional import rigid
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.neighbors import knn
-from pcdata.report import text_table
-from pcdata.structures import DepthFrame, TSDFVolume
-from pcdata.synthetic import Tabletop, tabletop
-from pcdata.transforms import MaskDepth
 
-RESULTS = Path(__file__).parent / "results"
+RESULT = Path(__file__).parent / "results" / "fusion.json"
+VOXELS = (0.005, 0.002)
+MULTIPLES = (5, 8)  # pcdata's truncation, and that of Open3D unless it is told another
+_LEGACY_FRAMES = 10
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--skip-open3d", action="store_true")
+    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--skip-open3d", action="store_true", help="measure against the truth alone; keep the rest")
+    parser.add_argument("--skip-truth", action="store_true", help="measure against Open3D alone; keep the rest")
+    parser.add_argument("--legacy-python", help="an interpreter with Open3D 0.19")
+    parser.add_argument("--kept", action="store_true", help="measure nothing; write the page from the kept results")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    result: dict[str, Any] = {
-        "machine": {"cores": os.cpu_count(), "threads": 1, "clock": "CPU time of the process"},
-        "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__},
-        "truth": [against_truth(views, noise) for noise in ("none", "stereo") for views in (1, 2, 4, 8)],
-        "workspace": workspace_rate(),
-    }
-    show(result["truth"])
-    show([result["workspace"]])
-    folder = os.environ.get("PCDATA_TEST_DATA")
-    if folder and not arguments.skip_open3d:
-        source = pcdata.open_source(Path(folder) / "seven_scenes", limit=arguments.frames)
-        frames = [source.load(name) for name in source.ids]
-        result["open3d"] = [against_open3d(frames, voxel_size) for voxel_size in (0.005, 0.002)]
-        show(result["open3d"])
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "fusion.json").write_text(json.dumps(result, indent=1) + "\n")
+    result: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    if not arguments.kept:
+        torch.set_num_threads(1)
+        packages = {name: version(name) for name in ("torch", "open3d")}
+        result |= {"machine": machine(), "versions": {"pcdata": pcdata.__version__, **packages}}
+        if not arguments.skip_truth:
+            result |= {"truth": truth_rows(), "workspace": workspace_rate()}
+        if "PCDATA_TEST_DATA" in os.environ and not arguments.skip_open3d:
+            result["recording"] = [tensor(v, m, arguments.frames) for v in VOXELS for m in MULTIPLES]
+            if arguments.legacy_python is not None:
+                result["legacy"] = [legacy(voxel, arguments.legacy_python) for voxel in VOXELS]
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    update_page(result)
+    for name, table in tables(result).items():
+        print(f"\n{name}\n{table}", end="")
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    text = [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()] for row in rows]
-    print(text_table(list(rows[0]), text), flush=True)
+def machine() -> dict[str, Any]:
+    load = os.getloadavg()[0]  # beyond 1, others were at work and the wall clock is theirs too
+    return {"cores": os.cpu_count(), "processor": platform.processor() or platform.machine(), "load": load}
 
 
-def against_truth(num_views: int, noise: str) -> dict[str, Any]:
-    scene = tabletop(1, num_objects=4, num_views=num_views, noise=noise, floor=False)
-    volume = TSDFVolume(voxel_size=0.002)
-    volume.integrate(scene.frame)
-    cloud = volume.extract_points()
-    error = scene.surface_distance(cloud.points)
-    _, distance = knn(cloud.points, queries=visible_surface(scene)[::97], k=1)
-    on_table = (cloud.points[:, 2].abs() < 0.003) & (cloud.labels == 0) & (cloud.points[:, :2].abs().amax(1) < 0.38)
-    angle = torch.rad2deg(torch.acos(cloud.normals[on_table, 2].clamp(-1, 1)))
-    return {
-        "views": num_views,
-        "noise": noise,
-        "points": cloud.num_points,
-        "mean error, mm": 1000 * float(error.mean()),
-        "median error, mm": 1000 * float(error.median()),
-        "covered within 4 mm": float((distance < 0.004).float().mean()),
-        "median normal error, degrees": float(angle.median()),
-    }
+def tensor(voxel_size: float, multiple: float, frames: int) -> dict[str, Any]:
+    """Times, memory and agreement of pcdata and Open3D's tensor grid on the frames of a room."""
+    lengths = ["--voxel-size", str(voxel_size), "--multiple", str(multiple), "--frames", str(frames)]
+    names = ["pcdata", "pcdata, carving", "Open3D tensor"]
+    found = run(1, names, *lengths, "--agreement")
+    found["two threads"] = run(2, names, *lengths)["libraries"]
+    found["memory"] = {name: run(1, [name], *lengths, "--memory")["libraries"][name] for name in names}
+    return found
 
 
-def visible_surface(scene: Tabletop) -> torch.Tensor:
-    truth = scene.truth
-    points, ptr, _ = deproject_depth(truth.depth.float(), truth.camera.intrinsics)
-    return rigid.transform_points(points, ptr, truth.world_from_camera)
+def legacy(voxel_size: float, python: str) -> dict[str, Any]:
+    """Times and memory of pcdata and Open3D's legacy volume."""
+    lengths = ["--voxel-size", str(voxel_size), "--frames", str(_LEGACY_FRAMES), "--legacy-python", python]
+    names = ["pcdata", "Open3D legacy"]
+    found = run(1, names, *lengths)
+    found["two threads"] = run(2, names, *lengths)["libraries"]
+    alone = run(1, ["pcdata"], *lengths, "--memory")["libraries"]
+    found["memory"] = {**alone, "Open3D legacy": found["libraries"]["Open3D legacy"]}
+    return found
 
 
-def workspace_rate() -> dict[str, Any]:
-    """Four cameras on a tabletop at 3 mm: integrate a capture of four views into a running volume."""
-    scene = tabletop(1, num_objects=5, num_views=4, noise="stereo")
-    frames = [MaskDepth(far=1.3)(frame) for frame in scene.noisy_frames(8)]
-    volume = TSDFVolume(voxel_size=0.003)
-    seconds = [timed(lambda frame=frame: volume.integrate(frame)) for frame in frames]
-    extract = [timed(volume.extract_points) for _ in range(5)]
-    typical = statistics.median(seconds[1:])
-    return {
-        "captures": "4 views of 640x480, 3 mm, colour and labels",
-        "first ms": 1000 * seconds[0],
-        "median ms": 1000 * typical,
-        "captures per second": 1 / typical,
-        "extract ms": 1000 * statistics.median(extract),
-        "MiB": volume.num_bytes / 2**20,
-    }
-
-
-def against_open3d(frames: list[DepthFrame], voxel_size: float) -> dict[str, Any]:
-    volume = TSDFVolume(voxel_size=voxel_size, max_bytes=16 << 30)
-    grid = open3d_grid(voxel_size)
-    ours, theirs = [], []
-    for frame in frames:
-        ours.append(timed(lambda frame=frame: volume.integrate(frame)))
-        theirs.append(timed(lambda frame=frame: open3d_integrate(grid, frame, voxel_size, 5 * voxel_size)))
-    clouds: list[Any] = []
-    extract = timed(lambda: clouds.append(volume.extract_points()))
-    extract_again = timed(volume.extract_points)
-    their_extract = timed(lambda: clouds.append(grid.extract_point_cloud(weight_threshold=0.5)))
-    a, b = clouds[0].points, torch.from_numpy(clouds[1].point.positions.numpy().copy())
-    apart = [float(knn(y, queries=x[:: max(1, len(x) // 20000)], k=1)[1].median()) for x, y in ((a, b), (b, a))]
-    bytes_there = sum(grid.attribute(name).numpy().nbytes for name in ("tsdf", "weight", "color"))
-    mine, peer = statistics.median(ours[1:]), statistics.median(theirs[1:])
-    return {
-        "voxel mm": 1000 * voxel_size,
-        "frames": len(frames),
-        "ms": 1000 * mine,
-        "Open3D ms": 1000 * peer,
-        "times faster": peer / mine,
-        "extract ms": 1000 * min(extract, extract_again),
-        "Open3D extract ms": 1000 * their_extract,
-        "extract faster": their_extract / min(extract, extract_again),
-        "MiB": volume.num_bytes / 2**20,
-        "Open3D MiB": bytes_there / 2**20,
-        "ours to theirs, mm": 1000 * apart[0],
-        "theirs to ours, mm": 1000 * apart[1],
-    }
-
-
-def timed(body: Callable[[], Any]) -> float:
-    started = time.process_time()
-    body()
-    return time.process_time() - started
+def run(threads: int, libraries: list[str], *options: str) -> dict[str, Any]:
+    """Measure in a process of its own."""
+    command = [sys.executable, str(Path(__file__).with_name("fusion_frames.py")), "--libraries", *libraries, *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("{"))
+    print(line, flush=True)
+    return dict(json.loads(line))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ EXTRAS = {
     extra.module: extra
     for extra in (
         Extra("matplotlib", "viz", "pictures (pcdata demo, pcdata.report)", 'pip install "pcdata[viz]"'),
-        Extra("cv2", "calib", "calibration boards (pcdata calib intrinsics)", 'pip install "pcdata[calib]"'),
+        Extra("cv2", "calib", "calibration boards and InpaintDepth", 'pip install "pcdata[calib]"'),
         Extra("small_gicp", "calib", "refining camera poses from clouds", 'pip install "pcdata[calib]"'),
         Extra("numcodecs", "zarr", "zarr chunks packed with Blosc", 'pip install "pcdata[zarr]"'),
         Extra("rosbags", "ros", "RealSense recordings (.bag)", 'pip install "pcdata[ros]"'),

@@ -92,6 +92,16 @@ def test_a_calibration_that_cannot_be_is_a_failed_check(capsys, folder: Path, tm
     assert json.loads((tmp_path / "report.json").read_text())["summary"]["verdict"] == "fail"
 
 
+def test_files_that_do_not_pair_up_are_a_failed_check_of_the_whole(capsys, folder: Path, tmp_path: Path) -> None:
+    next(iter(sorted((folder / "color").iterdir()))).unlink()
+    code, out, err = run(capsys, folder, "--json", tmp_path / "report.json")
+    assert (code, err) == (1, "")
+    assert "FAIL readable" in out
+    assert "color is missing for" in out
+    (report,) = json.loads((tmp_path / "report.json").read_text())["samples"]
+    assert report["checks"][0]["verdict"] == "fail"
+
+
 def test_a_wrong_unit_given_on_the_command_line_is_a_failed_check(capsys, folder: Path) -> None:
     facts = json.loads((folder / "intrinsics.json").read_text())
     del facts["metres_per_unit"]

@@ -25,7 +25,8 @@ LAYERS = [
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
     {"datasets", "validation"},
-    {"build", "calibration", "exports", "models"},
+    {"build", "calibration", "models"},
+    {"exports"},  # holds samples to the contracts of models
     {"report"},
     {"demo", "cli", "__main__"},
 ]

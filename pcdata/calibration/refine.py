@@ -12,14 +12,9 @@ from torch import Tensor
 from pcdata.calibration.pairwise import pairwise_motions
 from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matches
 from pcdata.functional import rigid
+from pcdata.functional.held_out import GapChange, gap_change, held_out_change
 from pcdata.functional.pose_graph import average_motions
-from pcdata.functional.view_alignment import (
-    PairFit,
-    ViewAlignment,
-    align_views,
-    assess_motions,
-    measure_pairs,
-)
+from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views, assess_motions
 from pcdata.io.calibration import Calibration, Evidence, FramePair
 from pcdata.structures import DepthFrame
 from pcdata.validation.overlap import judge_alignment
@@ -27,7 +22,6 @@ from pcdata.validation.overlap_result import OverlapLimits, OverlapResult
 from pcdata.validation.surfaces import surfaces_of
 
 METHODS = ("pcdata", "small_gicp", "open3d")
-_REACH = 0.03  # metres: before and after are measured over the same partners
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,8 +35,8 @@ class CameraRefinement:
     shift_sigma: float  # metres, at the scene, against the fixed camera
     rotation_sigma_degrees: float
     overlap: float  # share of its samples that have a partner in another view, 0..1
-    rmse_before: float  # metres, of its point-to-plane distances to all other views
-    rmse_after: float
+    rmse_before: float  # metres, of its point-to-plane gaps to all other views, over samples left out of the fit
+    rmse_after: float  # over the same samples
     fixed: bool
 
 
@@ -54,6 +48,8 @@ class Refinement:
     method: str
     frame_id: str  # the frame that the poses lead to
     overlap: OverlapResult  # as given, measured against the fixed camera
+    median_gap: tuple[float, float]  # metres before and after, of all cameras, over samples left out of the fit
+    rmse_gap: tuple[float, float]  # metres, likewise
     num_captures: int
 
     def applied_to(self, calibration: Calibration) -> Calibration:
@@ -95,7 +91,10 @@ class Refinement:
 
     def text(self) -> str:
         """Return the numbers as lines for a terminal."""
-        lines = [f"refined by {self.method} from {self.num_captures} captures, {self._fixed_name} fixed"]
+        lines = [
+            f"refined by {self.method} from {self.num_captures} captures, {self._fixed_name} fixed",
+            f"  gaps of samples left out of the fit: {_fall(self.median_gap, self.rmse_gap)}",
+        ]
         for camera in self.cameras:
             lines.append(
                 f"  {camera.name}: moved {1e3 * camera.shift:.2f} mm, {camera.rotation_degrees:.3f} degrees "
@@ -112,6 +111,8 @@ class Refinement:
             "frame_id": self.frame_id,
             "num_captures": self.num_captures,
             "cameras": cameras,
+            "median_gap": list(self.median_gap),
+            "rmse_gap": list(self.rmse_gap),
             "overlap_before": self.overlap.to_json(),
         }
 
@@ -181,9 +182,10 @@ def refine_extrinsics(
         alignment = _held(alignment, stays)
     judged = judge_alignment(alignment, names, limits, reference=stays)
     corrections = [torch.tensor(camera.correction, dtype=torch.float64) for camera in judged.cameras]
-    before, after = (
-        measure_pairs(surfaces, moved, alignment.pivot, _REACH) for moved in (poses[0], alignment.motions @ poses[0])
-    )
+    if method == "pcdata":
+        change = held_out_change(surfaces, poses[0])
+    else:
+        change = gap_change(surfaces, poses[0], alignment.motions @ poses[0])
     refined = tuple(
         CameraRefinement(
             name=camera.name,
@@ -192,17 +194,25 @@ def refine_extrinsics(
             rotation_degrees=camera.rotation_degrees,
             shift_sigma=camera.shift_sigma,
             rotation_sigma_degrees=camera.rotation_sigma_degrees,
-            overlap=_overlap_of(view, after),
-            rmse_before=_rmse_of(view, before),
-            rmse_after=_rmse_of(view, after),
+            overlap=_overlap_of(view, alignment.after),
+            rmse_before=change.of(view).rmse[0],
+            rmse_after=change.of(view).rmse[1],
             fixed=view == stays,
         )
         for view, (camera, correction) in enumerate(zip(judged.cameras, corrections))
     )
-    _check(where, refined, judged, alignment, limits, max_shift, max_rotation_degrees)
+    _check(where, refined, judged, alignment, change, limits, max_shift, max_rotation_degrees)
     frame_id = captures[0].frame_id
     assert frame_id is not None  # poses and frame come together
-    return Refinement(cameras=refined, method=method, frame_id=frame_id, overlap=judged, num_captures=len(captures))
+    return Refinement(
+        cameras=refined,
+        method=method,
+        frame_id=frame_id,
+        overlap=judged,
+        median_gap=change.median,
+        rmse_gap=change.rmse,
+        num_captures=len(captures),
+    )
 
 
 def _held(alignment: ViewAlignment, fixed: int) -> ViewAlignment:
@@ -215,6 +225,7 @@ def _check(
     cameras: Sequence[CameraRefinement],
     judged: OverlapResult,
     alignment: ViewAlignment,
+    change: GapChange,
     limits: OverlapLimits,
     max_shift: float,
     max_rotation_degrees: float,
@@ -226,8 +237,10 @@ def _check(
     for camera, found in zip(cameras, judged.cameras):
         if found.unmeasurable:
             reasons.append(
-                f"{camera.name}: the scene does not determine its pose: {'; '.join(found.unmeasurable)}; put objects "
-                "with upright sides where the cameras overlap, or give several captures"
+                f"{camera.name}: the scene does not determine its pose: {'; '.join(found.unmeasurable)} (standard "
+                f"deviations up to {1e3 * found.shift_sigma:.2g} mm and {found.rotation_sigma_degrees:.2g} degrees, at "
+                f"most {1e3 * limits.max_shift_sigma:g} mm and {limits.max_rotation_sigma_degrees:g} degrees are "
+                "allowed); put objects with upright sides where the cameras overlap, or give several captures"
             )
             continue
         if camera.shift > max_shift or camera.rotation_degrees > max_rotation_degrees:
@@ -235,11 +248,11 @@ def _check(
                 f"{camera.name}: would move by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees, "
                 f"more than {1e3 * max_shift:g} mm or {max_rotation_degrees:g} degrees; calibrate it anew"
             )
-        if camera.rmse_after > camera.rmse_before and not camera.fixed and camera.shift > camera.shift_sigma:
-            reasons.append(
-                f"{camera.name}: its surfaces would meet worse than before ({1e3 * camera.rmse_before:.2f} mm, then "
-                f"{1e3 * camera.rmse_after:.2f} mm)"
-            )
+    if not change.fell:
+        reasons.append(
+            f"it would not bring surfaces nearer that it was not fitted to: {_fall(change.median, change.rmse)}; "
+            "the cameras agree as well as these captures can tell"
+        )
     for fit in alignment.after:
         if len(fit.residual) and float(fit.residual.abs().median()) > limits.residual[1]:
             reasons.append(
@@ -255,9 +268,9 @@ def _overlap_of(view: int, fits: Sequence[PairFit]) -> float:
     return max((len(fit.residual) / max(fit.num_samples, 1) for fit in own), default=0.0)
 
 
-def _rmse_of(view: int, fits: Sequence[PairFit]) -> float:
-    residual = torch.cat([fit.residual for fit in fits if view in (fit.source, fit.target)])
-    return float(residual.square().mean().sqrt()) if len(residual) else 0.0
+def _fall(median: tuple[float, float], rmse: tuple[float, float]) -> str:
+    before, after = (f"median {1e3 * one:.2f} mm, RMSE {1e3 * other:.2f} mm" for one, other in zip(median, rmse))
+    return f"{before} before, {after} after"
 
 
 def _steps(calibration: Calibration, frame: str, camera: str) -> int:

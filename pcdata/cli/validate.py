@@ -24,12 +24,12 @@ def add_to(commands: Any) -> None:
     depths.add_argument(
         "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
     )
-    validate.add_argument("--json", metavar="FILE", help="write every check on every capture to a new file")
+    validate.add_argument("--json", metavar="FILE", help="write every check on every capture to FILE, replacing it")
     validate.set_defaults(run=_validate)
 
 
 def _validate(arguments: argparse.Namespace) -> int:
-    from pcdata.errors import IntrinsicsError, PoseError, UnitError
+    from pcdata.errors import CaptureError, PoseError, UnitError
     from pcdata.io.files import replacing
     from pcdata.report.validation import validation_text
     from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict, check_of_error, validate_source
@@ -42,7 +42,9 @@ def _validate(arguments: argparse.Namespace) -> int:
     try:
         source = open_captures(arguments.path, arguments, limit=arguments.limit)
         reports, total = validate_source(source, limits=limits), len(source)
-    except (IntrinsicsError, PoseError, UnitError) as error:  # a calibration that no capture can be read with
+    except (CaptureError, PoseError, UnitError) as error:  # what no capture can be read with
+        if not Path(arguments.path).exists():
+            raise
         reports = iter([SampleReport(WHOLE, (check_of_error(error),))])
     target = replacing("validate --json", arguments.json) if arguments.json else nullcontext()
     with target as temporary, Progress("validate") as progress:

@@ -1,4 +1,4 @@
-"""What the loaders take for granted of a cloud or a capture, asked for before anything is written."""
+"""What the files need of a sample, asked for before anything is written; the models' rules are in ``contracts``."""
 
 from __future__ import annotations
 
@@ -6,24 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from pcdata.errors import (
-    CaptureError,
-    DTypeError,
-    FrameError,
-    IntrinsicsError,
-    ShapeError,
-    TooFewPointsError,
-    UnitError,
-)
+from pcdata.errors import CaptureError, DTypeError, IntrinsicsError, ShapeError, TooFewPointsError
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.structures.fields import METRE, NORMALIZED
 
 
 def one_cloud(where: str, data: Any) -> PointCloud:
-    """Require one cloud of finite coordinates with at least one point, and return it on the CPU."""
+    """Require one cloud with at least one point, and return it on the CPU."""
     if not isinstance(data, PointCloud):
         raise DTypeError(
             f"{where}: clouds are exported, not a {type(data).__name__}; run 'pcdata build' on the captures and export "
@@ -35,62 +25,33 @@ def one_cloud(where: str, data: Any) -> PointCloud:
         )
     if data.num_points == 0:
         raise TooFewPointsError(f"{where}: the cloud is empty; widen the crop, or leave the sample out")
-    if not bool(torch.isfinite(data.points).all()):
-        raise CaptureError(
-            f"{where}: the cloud has coordinates that are not finite; rebuild the dataset from its captures"
-        )
     return data.to("cpu")
 
 
-def check_count(where: str, cloud: PointCloud, *, exactly: int | None = None, at_least: int = 1) -> None:
-    """Require a number of points.
+def check_count(where: str, cloud: PointCloud, at_least: int) -> None:
+    """Require a number of points of a cloud that the loader cuts.
 
     Raises:
-        TooFewPointsError, ShapeError: there are fewer, or more.
+        TooFewPointsError: there are fewer.
     """
-    count, wanted = cloud.num_points, at_least if exactly is None else exactly
-    fix = f"end the pipeline in FarthestPointSample(num_points={wanted}, if_short='repeat')"
-    if count < wanted:
-        raise TooFewPointsError(f"{where}: the loader needs {wanted} points, the cloud has {count}; {fix}")
-    if exactly is not None and count > exactly:
-        raise ShapeError(f"{where}: the loader needs {exactly} points in every cloud, this one has {count}; {fix}")
-
-
-def check_metres(where: str, cloud: PointCloud, why: str) -> None:
-    """Require metres."""
-    if cloud.unit != METRE:
-        raise UnitError(
-            f"{where}: must be in metres, since {why}, but the cloud is {cloud.unit}; build it without "
-            "NormalizeUnitSphere, NormalizeWorkspace or RandomScale"
+    if cloud.num_points < at_least:
+        raise TooFewPointsError(
+            f"{where}: the loader needs {at_least} points, the cloud has {cloud.num_points}; end the pipeline in "
+            f"RandomSample(num_points={at_least}, if_short='repeat')"
         )
 
 
-def check_unit_sphere(where: str, cloud: PointCloud) -> None:
-    """Require coordinates within the unit sphere."""
-    reach = float(torch.linalg.vector_norm(cloud.points.double(), dim=1).max())
-    if cloud.unit != NORMALIZED or reach > 1 + 1e-4:
-        raise UnitError(
-            f"{where}: must lie in the unit sphere, since the loader does not normalise, but the cloud is in "
-            f"{cloud.unit} and reaches {reach:.3g}; add NormalizeUnitSphere() as the last step of the pipeline"
+def check_same_count(where: str, cloud: PointCloud, count: int) -> None:
+    """Require as many points as the samples before have, since they share an array.
+
+    Raises:
+        ShapeError: there are more or fewer.
+    """
+    if cloud.num_points != count:
+        raise ShapeError(
+            f"{where}: the samples before have {count} points, this one has {cloud.num_points}; end the pipeline in "
+            f"FarthestPointSample(num_points={count}, if_short='repeat')"
         )
-
-
-class SameFrame:
-    """Holds all clouds of an export to one coordinate frame: a given one, or that of the first."""
-
-    def __init__(self, frame: str | None) -> None:
-        self._frame, self._given = frame, frame is not None
-
-    def check(self, where: str, cloud: PointCloud) -> None:
-        """Raise a FrameError where the cloud is in another frame."""
-        if self._frame is None:
-            self._frame = cloud.frame_id
-        if cloud.frame_id != self._frame:
-            reason = "frame asks for" if self._given else "the samples before are in"
-            raise FrameError(
-                f"{where}: the cloud is in frame {cloud.frame_id!r}, but {reason} {self._frame!r}; add "
-                f"ToFrame(frame={self._frame!r}) to the pipeline"
-            )
 
 
 def check_channels(where: str, cloud: PointCloud, names: Sequence[str], instead: str = "") -> None:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.exports.checks import object_ids, one_view
+from pcdata.exports.contracts import require_depth
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.io.manifest import key_of
-
-_NEAR, _FAR = 0.2, 1.8  # metres; the default --z_range of inference.py
+from pcdata.models import contract
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +33,8 @@ class ContactGraspNet(Target):
 
     name: ClassVar[str] = "contact_graspnet"
     takes: ClassVar[Literal["captures"]] = "captures"
+    model: ClassVar[str] = "contact_graspnet_api"
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"crop", "count"})
     layout: ClassVar[str] = "one npz per capture: depth (metres), K, and segmap and rgb where the capture has them"
 
     view: int | None = None
@@ -44,9 +46,11 @@ class ContactGraspNet(Target):
 
     def write(self, item: Item, samples: Samples, folder: Path, note: Note) -> None:
         """Write one file."""
+        near, far = _z_range()
         for sample_id, data in samples:
             where = f"contact_graspnet: sample {sample_id!r}"
             frame = one_view(where, data, self.view)
+            require_depth(where, self, frame)
             depth = frame.depth[0].numpy()
             arrays: dict[str, NDArray] = {"depth": depth, "K": frame.camera.intrinsics[0].numpy()}
             if frame.labels is not None:
@@ -58,8 +62,13 @@ class ContactGraspNet(Target):
             if frame.colors is not None:
                 # The loader swaps the channels before it shows the image.
                 arrays["rgb"] = np.ascontiguousarray(frame.colors[0].numpy()[..., ::-1])
-            if not ((depth > _NEAR) & (depth < _FAR)).any():
-                note(
-                    f"some captures have no depth within {_NEAR}..{_FAR} m, which inference.py crops to; use --z_range"
-                )
+            if not ((depth > near) & (depth < far)).any():
+                note(f"some captures have no depth within {near}..{far} m, which inference.py crops to; use --z_range")
             np.savez(folder / item.paths[0], allow_pickle=False, **arrays)
+
+
+def _z_range() -> tuple[float, float]:
+    """The default ``--z_range`` of inference.py, in metres."""
+    crop = contract(ContactGraspNet.model).crop
+    assert crop is not None
+    return crop[0][2], crop[1][2]

@@ -16,13 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.exports.checks import SameFrame, check_channels, check_count, check_metres, one_cloud
+from pcdata.exports.checks import check_channels, check_same_count, one_cloud
+from pcdata.exports.contracts import require_cloud
 from pcdata.exports.episodes import Given, episode_names, read_episodes
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
 from pcdata.structures import PointCloud
 
 _CHUNK = 100  # timesteps, as the original converters have it
+# Of config/dp3.yaml: a sequence of 16 steps may reach 1 before an episode (2 observed) and 7 beyond it (8 acted).
+_SHORTEST = 16 - 1 - 7
 # The loaders ask for img, of any size, read all of it into memory and use none of it: one pixel per timestep will do.
 _IMAGE = (1, 1, 3)
 
@@ -42,6 +45,7 @@ class DP3(Target):
     name: ClassVar[str] = "dp3"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     layout: ClassVar[str] = "zarr v2: data/point_cloud, data/state, data/action, data/img, meta/episode_ends"
+    model: ClassVar[str] = "dp3_sim"
 
     episodes: Given | None = None
     colors: bool = True
@@ -70,22 +74,24 @@ class DP3(Target):
             write_group(group)
         total = len(item.ids)
         self._rows(folder, "img", (total, *_IMAGE), "|u1")
-        frame, ranges = SameFrame(self.frame), _Ranges()
+        ranges, frame = _Ranges(), self.frame
         clouds: RowWriter | None = None
-        count: int | None = None
+        count = 0
+        channels = ["xyz", "rgb_255"] if self.colors else ["xyz"]
         for sample_id, data in samples:
             where = f"dp3: sample {sample_id!r}"
             cloud = one_cloud(where, data)
-            check_metres(where, cloud, "the policy is fed metres of the same frame")
-            frame.check(where, cloud)
-            check_count(where, cloud, exactly=count)
+            if frame is None:  # the policy is fed one frame: that of the first
+                frame = cloud.frame_id
             rows = self._points(where, cloud)
+            require_cloud(where, self, cloud, frame=frame, crop=None, channels=channels)
             if clouds is None:
                 count = cloud.num_points
                 clouds = self._rows(folder, "point_cloud", (total, *rows.shape), "<f4")
+            check_same_count(where, cloud, count)
             clouds.add(rows)
             ranges.add(sample_id, rows)
-        self._write_robot(folder, total)
+        self._write_robot(folder, total, note)
         if (warning := ranges.warning()) is not None:
             note(warning)
 
@@ -97,14 +103,15 @@ class DP3(Target):
         assert cloud.colors is not None
         return np.concatenate([points, cloud.colors.numpy() * np.float32(255)], axis=1)
 
-    def _write_robot(self, folder: Path, total: int) -> None:
+    def _write_robot(self, folder: Path, total: int, note: Note) -> None:
         assert self.episodes is not None
         names = episode_names(self.name, self.episodes)
         ends = RowWriter(folder / "meta" / "episode_ends", (len(names),), "<i8", chunk_rows=_CHUNK, compression="none")
         writers: dict[str, RowWriter] = {}
-        end = 0
+        end, short = 0, []
         for episode in read_episodes(self.name, self.episodes, names):
             end += len(episode.samples)
+            short += [episode.name] if len(episode.samples) < _SHORTEST else []
             ends.add(np.array(end))
             for key, rows in (("state", episode.state), ("action", episode.action)):
                 writer = writers.get(key) or self._rows(folder, key, (total, rows.shape[1]), "<f4")
@@ -113,6 +120,11 @@ class DP3(Target):
                     writer.add(row)
         if end != total:
             raise ConfigError("dp3: the episodes changed while they were exported; export again")
+        if short:
+            note(
+                f"{len(short)} episodes have fewer than {_SHORTEST} steps (first: {short[0]!r}): the loader cuts no "
+                "sequence from them with DP3's horizon of 16, 2 observed and 8 acted steps"
+            )
 
     def _rows(self, folder: Path, key: str, shape: tuple[int, ...], dtype: str) -> RowWriter:
         return RowWriter(folder / "data" / key, shape, dtype, chunk_rows=_CHUNK, compression=self.compression)

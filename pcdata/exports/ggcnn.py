@@ -18,12 +18,13 @@ from PIL import Image
 
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.exports.checks import check_size, colors_of, one_view
+from pcdata.exports.contracts import require_image
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.io.files import read_text
 from pcdata.io.image_writing import write_color
 from pcdata.io.manifest import key_of
 from pcdata.structures import DepthFrame
-from pcdata.transforms import CompleteDepth
+from pcdata.transforms import CompleteDepth, InpaintDepth
 
 _SIZE = (480, 640)  # (height, width) that the loader crops from
 _WHY_SIZE = "the loader crops as if it were"
@@ -38,8 +39,9 @@ class GGCNN(Target):
     Args:
         grasps: the folder of ``<sample>.txt`` files with the corners of good grasps, four lines "x y" each, in pixels
             (as Cornell's cpos files), or a mapping from sample id to (G, 4, 2) corners; None = to be added later.
-        holes: pixels without a reading: "smooth" and "nearest" fill them in (see CompleteDepth), "nan" and "zero" mark
-            them. The loader subtracts the mean of the image: a NaN makes all of it NaN, zeros shift it.
+        holes: pixels without a reading: "inpainted" fills them in as the authors' code does (see InpaintDepth, which
+            needs OpenCV), "smooth" and "nearest" in other ways (see CompleteDepth), "nan" and "zero" mark them. The
+            loader subtracts the mean of the image: a NaN makes all of it NaN, zeros shift it.
         colors: write ``r.png``; False = depth alone (``--use-rgb 0``).
         view: which view, of captures with several.
         any_size: allow other images than 640x480.
@@ -47,10 +49,11 @@ class GGCNN(Target):
 
     name: ClassVar[str] = "ggcnn"
     takes: ClassVar[Literal["captures"]] = "captures"
+    model: ClassVar[str] = "ggcnn"
     layout: ClassVar[str] = "Cornell names: pcdNNNNd.tiff (float32 metres), pcdNNNNr.png, pcdNNNNcpos.txt"
 
     grasps: Path | Mapping[str, Any] | None = None
-    holes: Literal["smooth", "nearest", "nan", "zero"] = "smooth"
+    holes: Literal["inpainted", "smooth", "nearest", "nan", "zero"] = "inpainted"
     colors: bool = True
     view: int | None = None
     any_size: bool = False
@@ -74,6 +77,7 @@ class GGCNN(Target):
             where = f"ggcnn: sample {sample_id!r}"
             frame = one_view(where, data, self.view)
             check_size(where, frame, _SIZE, _WHY_SIZE, self.any_size)
+            require_image(where, self, frame)
             depth_path.parent.mkdir(exist_ok=True)
             if self.colors:
                 write_color(
@@ -89,8 +93,9 @@ class GGCNN(Target):
 
     def _depth(self, where: str, frame: DepthFrame, note: Note) -> NDArray[np.float32]:  # (H, W) metres
         hole = frame.depth[0].numpy() == 0
-        if self.holes in ("smooth", "nearest"):
-            whole = CompleteDepth(completion=self.holes)(replace(frame, mask=None))
+        if self.holes in ("inpainted", "smooth", "nearest"):
+            step = InpaintDepth() if self.holes == "inpainted" else CompleteDepth(completion=self.holes)
+            whole = step(replace(frame, mask=None))
             depth: NDArray[np.float32] = whole.depth[0].numpy()
             if (depth == 0).any():
                 raise CaptureError(f"{where}: holes cannot be filled in where nothing is known; leave the capture out")

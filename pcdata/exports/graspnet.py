@@ -18,6 +18,7 @@ from PIL import Image
 
 from pcdata.errors import CaptureError, add_note
 from pcdata.exports.checks import check_size, colors_of, object_ids, one_view
+from pcdata.exports.contracts import require_depth
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.io.image_writing import write_color, write_depth
 from pcdata.io.manifest import key_of
@@ -42,6 +43,8 @@ class GraspNetImages(Target):
     """
 
     takes: ClassVar[Literal["captures"]] = "captures"
+    model: ClassVar[str] = "graspnet_baseline"
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"count"})
 
     view: int | None = None
     any_size: bool = False
@@ -53,6 +56,7 @@ class GraspNetImages(Target):
         """Return the view to write, of the size that the loader asserts."""
         frame = one_view(where, data, self.view)
         check_size(where, frame, SIZE, _WHY_SIZE, self.any_size)
+        require_depth(where, self, frame)
         return frame
 
     def write_depth(self, path: Path, frame: DepthFrame) -> float:

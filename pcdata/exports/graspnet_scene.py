@@ -22,6 +22,8 @@ from pcdata.exports.target import Item, Note, Samples
 from pcdata.functional import rigid
 from pcdata.io.image_writing import write_color
 
+_API_FACTOR = 1000  # units per metre, fixed in graspnetAPI's loadScenePointCloud
+
 
 @dataclass(frozen=True, kw_only=True)
 class GraspNetScenes(GraspNetImages):
@@ -81,6 +83,12 @@ class GraspNetScenes(GraspNetImages):
                 )
             write_color(scene / "rgb" / f"{stem}.png", torch.from_numpy(colors_of(where, frame)))
             factor = self.write_depth(scene / "depth" / f"{stem}.png", frame)
+            if factor != _API_FACTOR:
+                note(
+                    f"depth is in units of 1/{factor:g} m, as meta says and the baseline's loader reads; graspnetAPI "
+                    f"takes {_API_FACTOR} a metre whatever meta says: for its tools say factor_depth={_API_FACTOR} "
+                    "round_depth=true"
+                )
             self.write_labels(where, scene / "label" / f"{stem}.png", frame)
             (scene / "meta" / f"{stem}.mat").write_bytes(meta_bytes(frame, factor))
             poses.append(frame.world_from_camera[0])

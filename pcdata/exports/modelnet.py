@@ -16,6 +16,7 @@ import annotated_types
 import numpy as np
 
 from pcdata.exports.checks import check_channels, check_count, one_cloud
+from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
 from pcdata.exports.target import Item, Note, Samples, Target
 
@@ -33,6 +34,8 @@ class ModelNet(Target):
 
     name: ClassVar[str] = "modelnet"
     takes: ClassVar[Literal["clouds"]] = "clouds"
+    model: ClassVar[str] = "pointnet2_cls"
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"count", "unit", "scale", "normalisation"})
     layout: ClassVar[str] = "a text per shape: x,y,z,nx,ny,nz; modelnet40_train.txt, modelnet40_test.txt, shape names"
 
     table: Given | None = None
@@ -47,8 +50,9 @@ class ModelNet(Target):
         for sample_id, data in samples:
             where = f"modelnet: sample {sample_id!r}"
             cloud = one_cloud(where, data)
-            check_count(where, cloud, at_least=self.num_points)
+            check_count(where, cloud, self.num_points)
             check_channels(where, cloud, ["normals"])
+            require_cloud(where, self, cloud)
             assert cloud.normals is not None
             path = folder / item.paths[0]
             path.parent.mkdir(exist_ok=True)

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
-from pcdata.exports.checks import SameFrame, check_channels, check_metres, one_cloud
+from pcdata.exports.checks import check_channels, one_cloud
+from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, read_table
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.io.manifest import key_of
@@ -35,6 +36,8 @@ class Pointcept(Target):
 
     name: ClassVar[str] = "pointcept"
     takes: ClassVar[Literal["clouds"]] = "clouds"
+    model: ClassVar[str] = "pointcept"
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"normalisation", "duplicates"})
     layout: ClassVar[str] = "a folder per scene: coord, color, normal, segment, instance .npy"
 
     table: Given | None = None
@@ -56,9 +59,10 @@ class Pointcept(Target):
         for sample_id, data in samples:
             where = f"pointcept: sample {sample_id!r}"
             cloud = one_cloud(where, data)
-            check_metres(where, cloud, "its grids and crops are in metres")
-            if self.frame is not None:
-                SameFrame(self.frame).check(where, cloud)
+            fields = {"rgb": cloud.colors, "normals": cloud.normals}
+            channels = ["xyz", "cells", *(name for name, field in fields.items() if field is not None)]
+            frame = {} if self.frame is None else {"frame": self.frame}
+            require_cloud(where, self, cloud, channels=channels, **frame)
             arrays = {"coord": cloud.points.numpy()}
             if cloud.colors is not None:
                 arrays["color"] = (cloud.colors * 255).round().clamp(0, 255).to(torch.uint8).numpy()

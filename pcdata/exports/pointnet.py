@@ -14,7 +14,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from pcdata.errors import ConfigError
-from pcdata.exports.checks import check_count, check_unit_sphere, one_cloud
+from pcdata.exports.checks import one_cloud
+from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.structures import PointCloud
@@ -36,6 +37,7 @@ class PointNet(Target):
 
     name: ClassVar[str] = "pointnet"
     takes: ClassVar[Literal["clouds"]] = "clouds"
+    model: ClassVar[str] = "pointnet_cls"
     layout: ClassVar[str] = "HDF5: data (B, 2048, 3), label (B, 1); train_files.txt, test_files.txt, shape_names.txt"
     splits: ClassVar[tuple[str, ...]] = ("train", "test")
 
@@ -74,10 +76,9 @@ class PointNet(Target):
                 for number, (sample_id, data) in enumerate(islice(samples, len(chunk))):
                     where = f"{self.name}: sample {sample_id!r}"
                     cloud = one_cloud(where, data)
-                    check_count(where, cloud, exactly=NUM_POINTS)
-                    check_unit_sphere(where, cloud)
                     class_name = rows[sample_id].class_name
                     assert class_name is not None
+                    require_cloud(where, self, cloud, **self.choices(classes.index(class_name)))
                     file["data"][number] = cloud.points.numpy()
                     file["label"][number] = classes.index(class_name)
                     self.add_shape(where, cloud, class_name, file, number, class_of_part)
@@ -85,6 +86,10 @@ class PointNet(Target):
         self.write_names(folder, classes, class_of_part)
 
     # -- what the part segmentation has otherwise ------------------------------------------------------------------
+
+    def choices(self, number: int) -> dict[str, Any]:
+        """Return what the model's contract leaves open, for a shape of the class of this number."""
+        return {"num_points": NUM_POINTS}
 
     def arrays(self) -> Mapping[str, tuple[tuple[int, ...], str, int]]:
         """Return name -> shape of a row, dtype, level of gzip."""

@@ -30,6 +30,7 @@ class PointNetPart(PointNet):
     """
 
     name: ClassVar[str] = "pointnet_part"
+    model: ClassVar[str] = "pointnet_part"
     layout: ClassVar[str] = (
         "HDF5: data (B, 2048, 3), label (B, 1), pid (B, 2048); lists and names of categories and parts"
     )
@@ -43,6 +44,10 @@ class PointNetPart(PointNet):
         if len(classes_of(rows)) > _CLASSES:
             raise ConfigError(f"{self.name}: the loader has {_CLASSES} classes, the table {len(classes_of(rows))}")
         return rows
+
+    def choices(self, number: int) -> dict[str, Any]:
+        """Return what the model's contract leaves open, for a shape of the class of this number."""
+        return {**super().choices(number), "category": number}
 
     def arrays(self) -> Mapping[str, tuple[tuple[int, ...], str, int]]:
         """Return name -> shape of a row, dtype, level of gzip."""

@@ -32,6 +32,8 @@ class Target(ABC):
     name: ClassVar[str]
     takes: ClassVar[Literal["clouds", "captures"]]
     layout: ClassVar[str]  # what is written, in words
+    model: ClassVar[str]  # the contract in pcdata.models of what its loader feeds; samples are held to it
+    left_to_loader: ClassVar[frozenset[str]] = frozenset()  # rules of the contract that the loader itself makes true
 
     @abstractmethod
     def items(self, ids: Sequence[str]) -> list[Item]:

@@ -14,7 +14,7 @@ from pcdata.functional.flying_pixels import flying_pixel_mask
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.lens import distort_normalized, undistort_normalized
 from pcdata.functional.metrics import chamfer_distance
-from pcdata.functional.missing_region import largest_missing_region
+from pcdata.functional.missing_region import largest_missing_block, largest_missing_region
 from pcdata.functional.neighbors import ball_query, knn
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.occlusion_edges import occlusion_edges
@@ -64,6 +64,7 @@ __all__ = [
     "flying_pixel_mask",
     "icp_point_to_plane",
     "knn",
+    "largest_missing_block",
     "largest_missing_region",
     "occlusion_edges",
     "offset_from_votes",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, DTypeError
 from pcdata.functional.depth import check_lengths
 
 # librealsense's persistence rules: a pixel without a reading repeats its last value if it had at least `needed`
@@ -74,6 +74,8 @@ def temporal_filter(
         raise ConfigError(
             f"{where}: needs 0 < alpha <= 1, delta > 0 and persistence 0..8, got {alpha}, {delta}, {persistence!r}"
         )
+    if state is not None and not isinstance(state, TemporalState):
+        raise DTypeError(f"{where}: state must be what the call before returned, or None, not {type(state).__name__}")
     known = {"values": values} if state is None else {"values": values, "last": state.last, "history": state.history}
     check_tensors(where, known, {"values": "V H W", "last": "V H W", "history": "V H W : uint8"})
     check_lengths(where, "values", values)

@@ -6,7 +6,8 @@ inwards and the right one outwards; the bias moves all outwards or inwards, as s
 or thinner, so the two can be told apart wherever an object shows both of two opposite sides.
 
 Votes are kept per direction of the rim, so they add up over the frames of a recording in constant memory, and the
-score of every (shift, bias) is a sum over these few histograms, as in a Radon transform.
+score of every (shift, bias) is a sum over these few histograms, as in a Radon transform. All pairs that do not score
+clearly less than the best one stay possible: a bias that the rims of one axis refute excuses no shift along the other.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from pcdata.checks import check_tensors
 from pcdata.functional.occlusion_edges import occlusion_edges, resolution_scale
 
 SHIFT_LIMIT = 12  # pixels: shifts up to this far, along either axis, are looked for
-TELLABLE = 3.0  # pixels: a shift that must not go unnoticed; an answer less sure than this is none
+TELLABLE = 3.0  # pixels: a shift that must not go unnoticed
 NUM_GROUPS = 8  # parts of the image that vote apart; leaving out one at a time tells how sure the answer is
 _BIAS_LIMIT = 4  # pixels at 640 pixels width; stereo matchers smear an object's rim by half their window
 _NUM_DIRECTIONS = 24  # 15 degrees each: a shift of 12 pixels is blurred by less than 12 sin 7.5 degrees = 1.6
-_GRID_STEP = 1.5  # pixels; the votes are blurred by as much, so nothing falls between two grid points
+_GRID_STEP = 0.5  # pixels; a third of the blur, so that leaving out a part can move the best grid point
 _BLUR = 1.5  # pixels, standard deviation: how ragged rims are
-_BIAS_COST = 0.05  # of the score of chance, per pixel: of equal answers, the one with the smaller bias
 _COLOR_NOISE = 12.0  # grey levels of 255: colour steps below this are noise and compression
 _NOISE_STEPS = 4  # steps of that height, summed along a normal, have half a vote
 _MIN_EDGES = 150  # rim points; fewer come from a single small object
 _LEAST_SPREAD = 0.25  # pixels: nobody knows a shift better than that from rims of whole pixels
+_CHANCE = 0.05  # that the true shift is ruled out
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class EdgeOffset:
 
     shift: tuple[float, float]  # pixels, (right, down)
     spread: tuple[float, float]  # pixels: how far each component may be off
+    least_length: float  # pixels: of the shortest possible shift
+    greatest_length: float  # pixels: of the longest possible one
     bias: float  # pixels by which the colour rims lie outside the depth rims, all around
     num_edges: int
     problem: str | None  # why the shift cannot be trusted at all; None = it can, within its spread
@@ -62,16 +65,6 @@ class EdgeOffset:
     def length(self) -> float:
         """The length of the shift in pixels."""
         return math.hypot(*self.shift)
-
-    @property
-    def least_length(self) -> float:
-        """The length of the shortest shift within the spread."""
-        return math.hypot(*(max(0.0, abs(one) - off) for one, off in zip(self.shift, self.spread)))
-
-    @property
-    def greatest_length(self) -> float:
-        """The length of the longest shift within the spread."""
-        return math.hypot(*(abs(one) + off for one, off in zip(self.shift, self.spread)))
 
 
 def edge_votes(
@@ -107,38 +100,83 @@ def edge_votes(
 
 
 def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
-    """Return the shift that most votes agree on, and how far it may be off.
+    """Return the shift that most votes agree on, and which others are possible.
 
-    The spread is the jackknife's: twice the standard error from leaving out one part of the image at a time. Where
-    an axis shows rims of one side only (the tops of objects that stand on a table, say), shift and bias cannot be
-    told apart along it, so the bias adds to the spread.
-
-    Source: Efron & Stein, The Jackknife Estimate of Variance, 1981.
+    Shift and bias are judged together, at 95 %: possible is what scores so little less than the best that leaving out
+    parts of the image makes as much difference. Objects that show one side only (the tops of what stands on a table)
+    leave open whether they are shifted or fat, unless other rims tell how fat objects are.
     """
     if votes.num_edges < _MIN_EDGES:
         too_few = f"only {votes.num_edges} points on the rims of near surfaces, {_MIN_EDGES} are needed"
-        return EdgeOffset((0.0, 0.0), (math.inf, math.inf), 0.0, votes.num_edges, too_few)
-    histogram = _blurred(votes.histogram)
-    scores = torch.stack([_scores(part, votes.scale) for part in histogram])  # (G, X, Y, B), linear in the votes
-    chance = histogram.mean(2).sum(1)  # (G,) the score of an offset that nothing speaks for
-    total, all_chance = scores.sum(0), chance.sum().clamp_min(1e-9)
-    shift, bias, at_border = _best(total / all_chance, votes.scale)
-    without_one = [
-        _best((total - part) / (all_chance - share).clamp_min(1e-9), votes.scale)[0]
-        for part, share in zip(scores, chance)
-    ]
-    deviation = torch.tensor(without_one) - torch.tensor(without_one).mean(0)
-    error = (deviation.square().sum(0) * (NUM_GROUPS - 1) / NUM_GROUPS).sqrt()
-    one_sided = 1.0 - _balance(votes.histogram).cpu()
-    spread = (2.0 * error).clamp_min(_LEAST_SPREAD) + abs(bias) * one_sided
+        return EdgeOffset((0.0, 0.0), (math.inf, math.inf), 0.0, math.inf, 0.0, votes.num_edges, too_few)
+    shifts, biases, _, _ = _grid(votes.scale)
+    scores = _scores(_blurred(votes.histogram), votes.scale)  # (X, Y, B, G)
+    total = scores.sum(3).cpu()
+    best = int(total.argmax())
+    across, down, which = (int(place) for place in torch.unravel_index(torch.tensor(best), total.shape))
+    shift = (
+        float(shifts[across]) + _GRID_STEP * _vertex(total[:, down, which], across),
+        float(shifts[down]) + _GRID_STEP * _vertex(total[across, :, which], down),
+    )
+    kept = _not_ruled_out(scores, best, votes.histogram).cpu()  # (X, Y, B)
+    possible = shifts[kept.any(2).nonzero()]  # (N, 2)
+    spread = (possible - torch.tensor(shift)).abs().amax(0).clamp_min(_LEAST_SPREAD)
+    lengths = possible.norm(dim=1)
+    bias = float(biases[which])
     problem: str | None = None
-    if bool((2.0 * error > TELLABLE).any()):
-        problem = f"parts of the image disagree by more than {TELLABLE:g} pixels"
-    if at_border:
+    if max(abs(float(shifts[across])), abs(float(shifts[down]))) >= SHIFT_LIMIT:
         problem = f"no shift of up to {SHIFT_LIMIT} pixels brings the rims of near surfaces onto edges of the colour"
     elif abs(bias) >= _BIAS_LIMIT * votes.scale:
         problem = f"depth and colour disagree by {abs(bias):g} pixels or more on how large the objects are"
-    return EdgeOffset(shift, (float(spread[0]), float(spread[1])), bias, votes.num_edges, problem)
+    elif bool((possible.abs() >= SHIFT_LIMIT).any()):
+        problem = f"a shift of {SHIFT_LIMIT} pixels fits nearly as well as any other"
+    elif bool(kept[:, :, [0, -1]].any()):
+        problem = f"objects that are {_BIAS_LIMIT * votes.scale} pixels larger or smaller in depth fit nearly as well"
+    return EdgeOffset(
+        shift=shift,
+        spread=(float(spread[0]), float(spread[1])),
+        least_length=min(float(lengths.min()), math.hypot(*shift)),
+        greatest_length=max(float(lengths.max()), math.hypot(*shift)),
+        bias=bias,
+        num_edges=votes.num_edges,
+        problem=problem,
+    )
+
+
+def _not_ruled_out(scores: Tensor, best: int, histogram: Tensor) -> Tensor:
+    """Mark every (shift x, shift y, bias) that may be the true one for all that the image shows: (X, Y, B) bool.
+
+    The score is no likelihood, so the scale of its drops comes from the image itself. The best offset without one part
+    of the image scores a little less in the whole image; summed over the parts, with the jackknife's factor, that is
+    how far the true offset (three numbers) is expected to score below the best one. With the bias profiled out, drops
+    relative to two thirds of that follow Fisher's F with 2 degrees of freedom over those of the parts, of which there
+    are as many as there are in effect: one large object is one part, though others hold a stray rim.
+
+    That holds around the best offset. Far from it, where another peak may lie, the parts are asked directly: what is
+    refuted by no more than a single part's worth of votes, (sum d)^2 <= sum d^2 for the parts' drops d, stays possible.
+
+    Source: Efron & Stein, The Jackknife Estimate of Variance, 1981; Rotnitzky & Jewell, Hypothesis Testing of
+    Regression Parameters for Cluster Correlated Data, 1990, for scaling the drop; Kish, Survey Sampling, 1965, for the
+    number of parts.
+    """
+    num_parts = scores.shape[3]
+    total = scores.sum(3)
+    drop = total.flatten()[best] - total
+    best_without = (total[..., None] - scores).flatten(0, 2).argmax(0)
+    expected = float(drop.flatten()[best_without].sum()) * (num_parts - 1) / num_parts
+    votes = histogram.sum((1, 2))
+    in_effect = float(votes.sum().square() / votes.square().sum().clamp_min(1e-9))
+    freedom = max(in_effect - 1, 1.0)
+    fisher = 0.5 * freedom * (_CHANCE ** (-2 / freedom) - 1)  # the quantile, in closed form for 2 degrees of freedom
+    by_one_part = drop.square() <= (scores.flatten(0, 2)[best] - scores).square().sum(3)
+    return (drop <= max(2 / 3 * fisher * expected, _drop_nearby(drop, best))) | by_one_part
+
+
+def _drop_nearby(drop: Tensor, best: int) -> float:
+    """Return by how much the score drops within the least spread of the best shift; drops grow with the square."""
+    across, down, which = (int(place) for place in torch.unravel_index(torch.tensor(best), drop.shape))
+    nearby = drop[max(across - 1, 0) : across + 2, max(down - 1, 0) : down + 2, which]
+    return float(nearby.mean()) * (_LEAST_SPREAD / _GRID_STEP) ** 2
 
 
 def _blurred(histogram: Tensor) -> Tensor:
@@ -154,39 +192,31 @@ def _blurred(histogram: Tensor) -> Tensor:
 
 @cache
 def _grid(scale: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return shifts (S,), biases (B,), and where in a histogram each (shift x, shift y, bias, direction) falls."""
+    """Return shifts (S,), biases (B,), and the histogram cells (S * S * B, 48) that each adds up, with their weights.
+
+    The cells are those of a table with one row per direction and offset, where every direction has a column of chance
+    on either side of its offsets: what lies beyond, where nobody could vote, scores that.
+    """
     shifts = torch.arange(-SHIFT_LIMIT, SHIFT_LIMIT + 0.1, _GRID_STEP)
     biases = torch.arange(-_BIAS_LIMIT, _BIAS_LIMIT + 0.1, 0.5) * scale
     angle = torch.arange(_NUM_DIRECTIONS) * (2 * math.pi / _NUM_DIRECTIONS)
     offset = shifts[:, None, None, None] * angle.cos() + shifts[:, None, None] * angle.sin() + biases[:, None]
-    place = offset + (SHIFT_LIMIT + _BIAS_LIMIT * scale)
-    return shifts, biases, place.floor().long(), place - place.floor()
+    reach = SHIFT_LIMIT + _BIAS_LIMIT * scale
+    place = offset.reshape(-1, _NUM_DIRECTIONS) + (reach + 1)
+    below = place.floor()
+    width = 2 * reach + 3
+    row = torch.arange(_NUM_DIRECTIONS) * width
+    cells = torch.cat([(one.clamp(0, width - 1) + row).int() for one in (below, below + 1)], dim=1)
+    return shifts, biases, cells, torch.cat([1 - (place - below), place - below], dim=1)
 
 
 def _scores(histogram: Tensor, scale: int) -> Tensor:
-    """Return how many votes agree with every (shift x, shift y, bias); offsets nobody could vote for score chance."""
-    _, _, low, fraction = (one.to(histogram.device) for one in _grid(scale))
-    chance = histogram.mean(1, keepdim=True)
-    last = histogram.shape[1] - 1
-    # One column of chance on either side: where both neighbours lie outside, so does the score.
-    padded = torch.cat([chance, histogram, chance], dim=1)
-    row = torch.arange(_NUM_DIRECTIONS, device=histogram.device) * padded.shape[1]
-    below = (low + 1).clamp(0, last + 2) + row
-    above = (low + 2).clamp(0, last + 2) + row
-    flat = padded.reshape(-1)
-    return torch.lerp(flat[below], flat[above], fraction).sum(-1)
-
-
-def _best(score: Tensor, scale: int) -> tuple[tuple[float, float], float, bool]:
-    """Return the best shift to a fraction of the grid step, its bias, and whether it lies on the grid's border."""
-    shifts, biases, _, _ = (one.to(score.device) for one in _grid(scale))
-    score = score - _BIAS_COST * biases.abs() / scale
-    over_bias, which = score.max(2)
-    across, down = divmod(int(over_bias.argmax()), len(shifts))
-    x = float(shifts[across]) + _GRID_STEP * _vertex(over_bias[:, down], across)
-    y = float(shifts[down]) + _GRID_STEP * _vertex(over_bias[across], down)
-    at_border = not (0 < across < len(shifts) - 1 and 0 < down < len(shifts) - 1)
-    return (x, y), float(biases[which[across, down]]), at_border
+    """Return how many votes of every part agree with every (shift x, shift y, bias): (S, S, B, G)."""
+    shifts, biases, cells, weights = (one.to(histogram.device) for one in _grid(scale))
+    chance = histogram.mean(2, keepdim=True)
+    table = torch.cat([chance, histogram, chance], dim=2).flatten(1).T.contiguous()  # (24 * width, G)
+    scores = torch.nn.functional.embedding_bag(cells, table, per_sample_weights=weights, mode="sum")
+    return scores.view(len(shifts), len(shifts), len(biases), -1)
 
 
 def _vertex(values: Tensor, peak: int) -> float:
@@ -196,13 +226,3 @@ def _vertex(values: Tensor, peak: int) -> float:
     left, middle, right = values[peak - 1 : peak + 2].tolist()
     bend = left - 2 * middle + right
     return 0.5 * (left - right) / bend if bend < 0 else 0.0
-
-
-def _balance(histogram: Tensor) -> Tensor:
-    """Return, for either axis, the votes of the weaker side over those of the stronger one: (2,), 0 = one side only."""
-    weight = histogram.sum((0, 2))
-    angle = torch.arange(_NUM_DIRECTIONS, device=weight.device) * (2 * math.pi / _NUM_DIRECTIONS)
-    toward = torch.stack([angle.cos(), angle.sin()])
-    ahead = (toward.clamp_min(0).square() * weight).sum(1)
-    behind = (toward.clamp_max(0).square() * weight).sum(1)
-    return torch.minimum(ahead, behind) / torch.maximum(ahead, behind).clamp_min(1e-9)

@@ -48,6 +48,31 @@ def largest_missing_region(
     return MissingRegion(missing / valid.numel(), (top, left, bottom, right))
 
 
+def largest_missing_block(
+    valid: Tensor,  # (H, W) bool, True = has a reading
+) -> float:
+    """Return the share of the image in the longest run of whole rows or columns without readings that ends straight.
+
+    It ends straight where the next line has at least half as many readings as lines with readings have in the median:
+    so does an image of which a part was not stored. Where the scene ends, or a background was cut away, the first lines
+    hold the tips of what is left. 1 = no reading at all, 0 = there is no such run.
+    """
+    check_tensors("largest_missing_block", {"valid": valid}, {"valid": "H W : bool"})
+    return max(_longest_straight_gap(valid.sum(1)), _longest_straight_gap(valid.sum(0)))
+
+
+def _longest_straight_gap(readings: Tensor) -> float:
+    """Return the share of the lines in the longest such run, from the number of readings in each line."""
+    used = readings.nonzero().squeeze(1)
+    if not len(used):
+        return 1.0
+    full = readings >= 0.5 * float(readings[used].float().median())
+    edges = torch.cat([used.new_tensor([-1]), used, used.new_tensor([len(readings)])])
+    is_full = torch.cat([full.new_ones(1), full[used], full.new_ones(1)])  # the image's border is straight
+    gaps = (edges.diff() - 1) * (is_full[:-1] & is_full[1:])
+    return float(gaps.max()) / len(readings)
+
+
 def _connected(mask: Tensor) -> Tensor:
     """Number the 4-connected regions of a small mask 1, 2, ... in row order; 0 is outside."""
     number = torch.arange(1, mask.numel() + 1, dtype=torch.float32, device=mask.device).view(mask.shape)

@@ -121,8 +121,12 @@ def is_rigid(matrix: Tensor, *, tolerance: float = 1e-5) -> bool:
 
 
 def invert_rigid(pose: Tensor) -> Tensor:
-    """Invert (..., 4, 4) rigid poses exactly by transposition."""
-    rotation = pose[..., :3, :3].mT
+    """Invert (..., 4, 4) rigid poses.
+
+    The inverse of what is there, not the transpose: recorded rotations are orthonormal to a few digits only, and 1e-4
+    off moves a point at 2 m by 0.2 mm on the way there and back.
+    """
+    rotation = torch.linalg.inv_ex(pose[..., :3, :3]).inverse  # unlike inv, it does not make a GPU wait
     return from_rotation_translation(rotation, -(rotation @ pose[..., :3, 3:]).squeeze(-1))
 
 

@@ -93,10 +93,13 @@ def solve_observable(system: PlaneSystem) -> TwistSolution:
     directions = (scale[:, None] * (inverse.T @ vectors)).T  # (D, D), one per row
     seen = share > 1 - _MAX_FEIGNED_SHARE
     basis = directions[seen]
-    amount = -(basis @ system.gradient) / share[seen]
-    spread = basis / (2 * share[seen] - 1).sqrt()[:, None]  # the feigned part determines nothing: 1 - 2 (1 - share)
+    # The feigned part determines nothing: it is in the information, and once more in the unit that shares are of.
+    # Left in, it would shorten every step, and the fit would end before it is where the gradient vanishes.
+    real_share = 2 * share[seen] - 1
+    amount = -(basis @ system.gradient) / real_share
+    spread = basis / real_share.sqrt()[:, None]
     unobservable = torch.nn.functional.normalize(directions[~seen], dim=1)
-    decrement = (amount.square() * share[seen]).sum().sqrt()
+    decrement = (amount.square() * real_share).sum().sqrt()
     return TwistSolution(amount @ basis, spread.T @ spread, unobservable, decrement)
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from pcdata.functional.depth import project_points
-from pcdata.functional.depth_planes import MIN_COSINE, DepthPlanes, fit_depth_planes
+from pcdata.functional.depth_patches import MIN_COSINE, DepthPatches, fit_depth_patches, patch_normals
 from pcdata.functional.neighbors import ball_query, knn
 
-_FLOOR_SIGMA = 5e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_FLOOR_SIGMA = 2e-4  # metres; no depth camera's surface is truer than this, however many pixels are averaged
+_LEAST_DIRECTIONS = 8  # a table holds its three of the six unknowns with an eighth; more of it would add noise alone
 _FLOOR_NORMAL_SIGMA = 0.005  # radians, 0.3 degrees; likewise for normals
 
 
@@ -51,6 +52,10 @@ class Surface(Protocol):
         """Whether the view can tell a sample that it could not see from one that it sees elsewhere."""
         ...
 
+    def with_samples(self, samples: Samples) -> Surface:
+        """Return the same surface with other samples."""
+        ...
+
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Compare samples (N, 3), given in this view's frame, with this surface."""
         ...
@@ -60,7 +65,7 @@ class Surface(Protocol):
 class DepthSurface:
     """A depth image: partners are found by projection, and what this camera could not see is left out."""
 
-    planes: DepthPlanes
+    patches: DepthPatches
     intrinsics: Tensor  # (3, 3) float64
     distortion: Tensor | None
     size: tuple[int, int]
@@ -76,57 +81,65 @@ class DepthSurface:
         *,
         max_samples: int,
     ) -> DepthSurface:
-        """Fit planes to the windows of a depth image, and sample them where they are worth most.
+        """Fit patches to the windows of a depth image, and sample them where they are worth most.
 
         Every direction that surfaces face gets an equal share, so the table does not outvote the sides of the objects.
         """
-        planes = fit_depth_planes(depth, intrinsics, distortion)
-        rows = (planes.depth > 0).flatten().nonzero().squeeze(1)
-        chosen = evenly_by_direction(planes.normals.reshape(-1, 3)[rows], max_samples, planes.is_flat.flatten()[rows])
-        rows = rows[chosen]
+        patches = fit_depth_patches(depth, intrinsics, distortion)
+        rows = (patches.depth > 0).flatten().nonzero().squeeze(1)
+        is_wide = patches.half.flatten()[rows] == patches.half.max() if len(rows) else rows > 0
+        rows = rows[evenly_by_direction(patches.normals.reshape(-1, 3)[rows], max_samples, is_wide)]
         samples = Samples(
-            planes.points.reshape(-1, 3)[rows],
-            planes.normals.reshape(-1, 3)[rows],
-            planes.sigma.flatten()[rows].clamp(min=_FLOOR_SIGMA),
-            planes.normal_sigma.flatten()[rows].clamp(min=_FLOOR_NORMAL_SIGMA),
+            patches.points.reshape(-1, 3)[rows],
+            patches.normals.reshape(-1, 3)[rows],
+            patches.sigma.flatten()[rows].clamp(min=_FLOOR_SIGMA),
+            patches.normal_sigma.flatten()[rows].clamp(min=_FLOOR_NORMAL_SIGMA),
         )
-        return cls(planes, intrinsics.double(), distortion, (depth.shape[0], depth.shape[1]), samples)
+        return cls(patches, intrinsics.double(), distortion, (depth.shape[0], depth.shape[1]), samples)
+
+    def with_samples(self, samples: Samples) -> DepthSurface:
+        """Return the same surface with other samples."""
+        return replace(self, samples=samples)
 
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
-        """Project samples into the image and measure them against the plane of the window they fall into."""
-        planes = self.planes
+        """Project samples into the image and measure them against the patch whose centre is nearest."""
+        patches = self.patches
         pixels, z = project_points(
             points,
             intrinsics=self.intrinsics[None],
             distortion=None if self.distortion is None else self.distortion[None],
         )
-        cell = ((pixels - planes.first) / planes.stride).round()
-        height, width = planes.depth.shape
+        cell = ((pixels - patches.first) / patches.stride).round()
+        height, width = patches.depth.shape
         inside = ((cell >= 0) & (cell < cell.new_tensor([width, height]))).all(1)
         # The far side of an object is turned away, however thin the object is.
         faces = -(points * normals).sum(1) > MIN_COSINE * points.norm(dim=1)
         rows = (inside & faces).nonzero().squeeze(1)
         column, line = cell[rows].long().unbind(1)
         index = line * width + column
-        seen = planes.depth.flatten()[index]
-        rows, index, seen = rows[seen > 0], index[seen > 0], seen[seen > 0]
+        u, v = (pixels[rows] - patches.first - patches.stride * cell[rows]).unbind(1)
+        a, b, c, d, e, f = patches.coefficients.reshape(-1, 6)[index].unbind(1)
+        inverse = torch.stack(
+            [a + u * (b + d * u + e * v) + v * (c + f * v), b + 2 * d * u + e * v, c + e * u + 2 * f * v], 1
+        )
         # Behind the surface by more than a calibration could be wrong: hidden by something nearer.
-        visible = z[rows] - seen < 2 * max_distance
-        rows, index, seen = rows[visible], index[visible], seen[visible]
-        plane = planes.coefficients.reshape(-1, 3)[index]
-        normal = planes.normals.reshape(-1, 3)[index]
-        reached = (plane * points[rows]).sum(1, keepdim=True)  # 1 on the plane, along the sample's own ray
-        residual = (1 - reached[:, 0]) / plane.norm(dim=1)
-        offset = normal * residual[:, None]
-        near = (reached[:, 0] > 0) & (residual.abs() < max_distance) & ((z[rows] - seen).abs() < 2 * max_distance)
+        seen = torch.where((patches.depth.flatten()[index] > 0) & (inverse[:, 0] > 0), 1 / inverse[:, 0], 0.0)
+        behind = z[rows] - seen
+        visible = (seen > 0) & (behind < 2 * max_distance)
+        rows, index, inverse, behind = rows[visible], index[visible], inverse[visible], behind[visible]
+        rays = points[rows] / z[rows, None]
+        normal = patch_normals(inverse, rays, patches.ray_steps.reshape(-1, 2, 2)[index])
+        # To the tangent plane where the sample's own ray meets the patch.
+        residual = (normal * rays).sum(1) * behind
+        near = (residual.abs() < max_distance) & (behind.abs() < 2 * max_distance)
         near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
         index = index[near]
         return Matches(
             rows[near],
-            offset[near],
+            (normal * residual[:, None])[near],
             normal[near],
-            planes.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA),
-            planes.normal_sigma.flatten()[index].clamp(min=_FLOOR_NORMAL_SIGMA),
+            patches.sigma.flatten()[index].clamp(min=_FLOOR_SIGMA),
+            patches.normal_sigma.flatten()[index].clamp(min=_FLOOR_NORMAL_SIGMA),
             len(rows),
         )
 
@@ -179,6 +192,10 @@ class CloudSurface:
         picked = (patches.points, patches.normals, patches.sigma, patches.normal_sigma)
         return cls(patches, Samples(*(values[kept] for values in picked)))
 
+    def with_samples(self, samples: Samples) -> CloudSurface:
+        """Return the same surface with other samples."""
+        return replace(self, samples=samples)
+
     def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
         """Measure samples against the plane of the nearest patch; the side that a normal points to is ignored."""
         index, distance = knn(self.patches.points.float(), k=1, queries=points.float())
@@ -209,7 +226,7 @@ def evenly_by_direction(
     """Choose at most ``count`` rows so that the directions share them equally, evenly spaced within each.
 
     A direction is one of 26 boxes: the signs of the components, those below 0.4 counted as 0. Where the preferred rows
-    of a direction fill its share, it takes only those.
+    of a direction fill its share, it takes only those. No direction gets more than an eighth of ``count``.
 
     Source: normal-space sampling, Rusinkiewicz & Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
     """
@@ -221,6 +238,7 @@ def evenly_by_direction(
     for size in sorted(size for size in sizes.tolist() if size):
         share = max(share, left // waiting)
         left, waiting = left - min(size, share), waiting - 1
+    share = min(share, max(1, count // _LEAST_DIRECTIONS))
     chosen = [normals.new_empty(0, dtype=torch.int64)]
     for one in sizes.nonzero().squeeze(1).tolist():
         rows = (box == one).nonzero().squeeze(1)

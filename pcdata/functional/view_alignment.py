@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional import rigid
-from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights
+from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights, unexplained_spread
 from pcdata.functional.small_motions import (
     PlaneSystem,
     TwistSolution,
@@ -22,11 +22,10 @@ from pcdata.functional.small_motions import (
 )
 from pcdata.functional.surfaces import Surface
 
-# Both directions of a pair measure the same surfaces with the same pixels, and neighbouring windows share some.
-_SHARED_DATA = 4.0
+# Both directions of a pair measure the same surfaces with the same pixels.
+_SHARED_DATA = 2.0
 _WITHIN_NOISE = 0.25  # standard deviations
 _SETTLED = 5e-5  # metres and radians: a hundredth of what fails
-_MIN_SCALE = 1.0  # of whitened residuals: two exact depth images should not make each other infinitely certain
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +34,14 @@ class PairFit:
 
     source: int
     target: int
+    row: Tensor  # (M,) int64 of the source's samples, all captures one after the other
     residual: Tensor  # (M,) float64 metres, signed: positive in front of the target's surface
     points: Tensor  # (M, 3) float64 where, in the common frame
     num_samples: int  # of the source
     num_visible: int  # of them, that the target could see
     knows_visibility: bool  # of the target; False: every sample counts as visible
     system: PlaneSystem  # 6x6, of moving the source, whitened
-    scale: float  # standard deviation of the whitened residuals: 1 where the noise model is right
+    unexplained: float  # metres, spread of the residuals beyond the sensors' noise: waves and bias in their depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def align_views(
     fixed: int = 0,
     max_distances: Sequence[float] = (0.06, 0.03, 0.015, 0.008, 0.004),
     max_angle: float = 0.6,
-    max_iterations: int = 12,
+    max_iterations: int = 20,
 ) -> ViewAlignment:
     """Move all views but one so that their surfaces meet, over all pairs and captures in one least-squares.
 
@@ -98,21 +98,27 @@ def align_views(
     pivot = scene_middle(captures, poses)
     motions = torch.eye(4, dtype=torch.float64, device=poses.device).repeat(num_views, 1, 1)
     before = measure_pairs(captures, poses, pivot, max_distances[0], max_angle)
-    fits, iterations, converged = before, 0, False
+    fits, iterations, converged, reach = before, 0, False, max_distances[0]
     for distance in max_distances:
-        converged = False
+        # A cut within the noise would keep the partners that fit by chance and throw out what could correct them.
+        if iterations and distance < TUKEY_CUT * _spread(fits):
+            break
+        reach, converged = distance, False
+        share, last = 1.0, torch.zeros(num_views, 6, dtype=torch.float64, device=poses.device)
         for _ in range(max_iterations):
             fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
             solution = _solve(fits, num_views, fixed)
             step = solution.twist.reshape(num_views, 6)
-            motions = motion_from_twist(step, pivot) @ motions
+            # Along a weak direction a step may go too far, by as much as it came; a part of it ends the swinging.
+            share, last = 0.5 * share if float((step * last).sum()) < 0 else share, step
+            motions = motion_from_twist(share * step, pivot) @ motions
             iterations += 1
             # The Newton decrement is the step in standard deviations: what is left lies within the noise.
             decrement = float(solution.decrement) / _SHARED_DATA**0.5
             if decrement < _WITHIN_NOISE or float(step.abs().max()) < _SETTLED:
                 converged = True
                 break
-    found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=max_distances[-1])
+    found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=reach)
     return replace(found, before=before, iterations=iterations, converged=converged)
 
 
@@ -141,6 +147,11 @@ def assess_motions(
         iterations=0,
         converged=True,
     )
+
+
+def _spread(fits: Sequence[PairFit]) -> float:
+    """Return the standard deviation of the residuals of all pairs, in metres."""
+    return float(robust_scale(torch.cat([fit.residual for fit in fits])))
 
 
 def measure_pairs(
@@ -182,20 +193,22 @@ def _measure(
             own[:, None] * normals[found.row] + other[:, None] * found.normals, dim=1
         )
         residual = (normal * found.offset).sum(1)
-        parts.append((residual, points[found.row], normal, sigma, (own + other).rsqrt()))
+        parts.append((found.row + num_samples, residual, points[found.row], normal, sigma, (own + other).rsqrt()))
         num_samples += len(points)
         num_visible += found.num_visible
-    residual, points, normals, sigma, tilt = (torch.cat(part) for part in zip(*parts))
+    row, residual, points, normals, sigma, tilt = (torch.cat(part) for part in zip(*parts))
     points = points @ world_from_target[:3, :3].T + world_from_target[:3, 3]
     normals = normals @ world_from_target[:3, :3].T
-    scale = robust_scale(residual / sigma).clamp(min=_MIN_SCALE)
+    unexplained = unexplained_spread(residual, sigma)
     # Tukey's cut is the distance of this scale, not the spread of the residuals: most of them lie on the table, which
     # fits however far the view slid along it, and would have the sides of the objects thrown out as outliers.
     cut = residual.new_tensor(max_distance / TUKEY_CUT)
-    weights = robust_weights(residual, cut, "tukey") / (sigma * scale).square()
+    weights = robust_weights(residual, cut, "tukey") / (sigma.square() + unexplained.square())
     system = plane_system(points, normals, residual, weights, pivot=pivot, normal_sigma=tilt)
     knows_visibility = all(capture[target].knows_visibility for capture in captures)
-    return PairFit(source, target, residual, points, num_samples, num_visible, knows_visibility, system, float(scale))
+    return PairFit(
+        source, target, row, residual, points, num_samples, num_visible, knows_visibility, system, float(unexplained)
+    )
 
 
 def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution:

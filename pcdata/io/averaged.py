@@ -10,7 +10,7 @@ import torch
 
 from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note, near_matches
 from pcdata.functional.depth_average import DepthAverage, average_depth
-from pcdata.io.source import CaptureSource
+from pcdata.io.source import CaptureSource, checked_ids
 from pcdata.io.still_camera import check_still_camera
 from pcdata.structures import Confidence, DepthFrame, confidence_of
 
@@ -42,8 +42,8 @@ class AveragedSource:
                 "AveragedSource: needs num_frames >= 2, 1 <= min_count <= num_frames and 0 <= max_moving <= 1, got "
                 f"{self.num_frames}, {self.min_count}, {self.max_moving}"
             )
-        count = len(self.source.ids)
-        if count == 0 or count % self.num_frames:
+        count = len(checked_ids("AveragedSource", self.source))
+        if count % self.num_frames:
             raise CaptureError(
                 f"AveragedSource: {count} captures are no whole number of groups of {self.num_frames}; take a subset "
                 "or another num_frames"

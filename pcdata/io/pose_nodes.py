@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -43,8 +44,9 @@ def known_entries(
 def number(document: YamlDocument, node: yaml.Node, what: str) -> float | None:
     """Read a finite number; None, with the fault noted, when it is none."""
     value = document.plain(node)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
-        document.fault(node, f"{what} must be a finite number, got {value!r}")
+    # Whole numbers may have any length in YAML: the largest float is the limit for them too.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
+        document.fault(node, f"{what} must be a finite number, got {value!r:.80}")
         return None
     return float(value)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pcdata.errors import CaptureError, ConfigError, DTypeError, near_matches
 from pcdata.functional.depth_temporal import PERSISTENCE_RULES, TemporalState, temporal_filter
 from pcdata.functional.disparity import depth_to_disparity, disparity_to_depth
-from pcdata.io.source import CaptureSource
+from pcdata.io.source import CaptureSource, checked_ids
 from pcdata.io.still_camera import check_still_camera
 from pcdata.structures import DepthFrame, with_filled_depth
 
@@ -81,6 +81,7 @@ class TemporallyFilteredSource:
     def __post_init__(self) -> None:
         if self.num_frames < 1:
             raise ConfigError(f"TemporallyFilteredSource: num_frames must be at least 1, got {self.num_frames}")
+        checked_ids("TemporallyFilteredSource", self.source)
 
     @property
     def name(self) -> str:

@@ -1,4 +1,4 @@
-"""Arrays of a zarr v2 directory, read chunk by chunk; Blosc chunks need the extra ``zarr``."""
+"""Arrays of a zarr v2 directory, read chunk by chunk; Blosc chunks and filters need the extra ``zarr``."""
 
 from __future__ import annotations
 
@@ -54,13 +54,16 @@ class ZarrArray:
             self.shape: tuple[int, ...] = tuple(header["shape"])
             self.chunks: tuple[int, ...] = tuple(header["chunks"])
             self.dtype = np.dtype(header["dtype"])
-            self._compressor, self._filters = header["compressor"], header["filters"]
+            # In the order of decoding: the compressor was the last to be applied.
+            codecs = [header["compressor"], *reversed(header["filters"] or [])]
+            self._codecs: list[dict[str, Any]] = [codec for codec in codecs if codec is not None]
             self._order, self._fill = header["order"], header["fill_value"]
             self._separator: str = header.get("dimension_separator", ".")
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CacheError(f"{folder}: its .zarray cannot be read: {error!r}") from error
-        if self.dtype.hasobject or self._filters or len(self.chunks) != len(self.shape) or 0 in self.chunks:
-            raise CacheError(f"{folder}: must hold plain numbers without filters, got {header}")
+        self._last: tuple[tuple[int, ...], np.ndarray] | None = None
+        if len(self.chunks) != len(self.shape) or 0 in self.chunks:
+            raise CacheError(f"{folder}: every axis needs chunks of at least 1, got {header}")
 
     @property
     def ndim(self) -> int:
@@ -69,15 +72,27 @@ class ZarrArray:
 
     def __getitem__(self, index: Any) -> np.ndarray:
         """Read one row of the first axis, or everything for ``...``."""
+        if not self.shape:
+            return self._scalar()
         if index is Ellipsis:
-            return self._read(0, self.shape[0] if self.shape else 1)
+            return self._read(0, self.shape[0])
         if not 0 <= index < self.shape[0]:
             raise IndexError(index)
         row: np.ndarray = self._read(index, index + 1)[0]
         return row
 
+    def _filled(self, shape: tuple[int, ...]) -> np.ndarray:
+        if self.dtype.hasobject:  # only when it is asked for: a store may hold texts beside its numbers
+            raise CacheError(f"{self.folder}: must hold numbers, got {self.dtype}")
+        return np.full(shape, 0 if self._fill is None else self._fill, self.dtype)
+
+    def _scalar(self) -> np.ndarray:
+        empty = self._filled(())
+        block = self._chunk((0,))  # an array without axes has one chunk, named 0
+        return empty if block is None else block
+
     def _read(self, start: int, stop: int) -> np.ndarray:
-        result = np.full((stop - start, *self.shape[1:]), 0 if self._fill is None else self._fill, self.dtype)
+        result = self._filled((stop - start, *self.shape[1:]))
         grids = [range(start // self.chunks[0], -(-stop // self.chunks[0]))]
         grids += [range(-(-size // chunk)) for size, chunk in zip(self.shape[1:], self.chunks[1:])]
         for position in itertools.product(*grids):
@@ -92,21 +107,23 @@ class ZarrArray:
         return result
 
     def _chunk(self, position: tuple[int, ...]) -> np.ndarray | None:
+        if self._last is not None and self._last[0] == position:  # rows are asked for one after another
+            return self._last[1]
         path = self.folder / self._separator.join(map(str, position))
         if not path.exists():
             return None
         try:
             content = self._decoded(path.read_bytes())
-            return np.frombuffer(content, self.dtype).reshape(self.chunks, order=self._order)
-        except (OSError, ValueError, EOFError, zlib.error, lzma.LZMAError) as error:
+            block = np.frombuffer(content, self.dtype).reshape(self.chunks, order=self._order)
+        except (OSError, ValueError, EOFError, RuntimeError, zlib.error, lzma.LZMAError) as error:
             raise CacheError(f"{path}: this chunk cannot be read: {error}") from error
+        self._last = (position, block)
+        return block
 
     def _decoded(self, content: bytes) -> bytes:
-        if self._compressor is None:
-            return content
-        name = self._compressor["id"]
-        if name in _DECODERS:
-            return _DECODERS[name](content)
-        numcodecs = require("numcodecs")
-        decoded: bytes = bytes(numcodecs.get_codec(self._compressor).decode(content))
-        return decoded
+        for codec in self._codecs:
+            if codec["id"] in _DECODERS:
+                content = _DECODERS[codec["id"]](content)
+            else:
+                content = bytes(require("numcodecs").get_codec(codec).decode(content))
+        return content

@@ -22,6 +22,8 @@ CHOICES = {
     "crop": "the workspace ((x, y, z), (x, y, z)), smallest and largest, metres in that frame; or None for no crop",
     "category": "the object's category as the model numbers it, 0 to 15",
     "num_points": "one of the counts that the model's code is used with",
+    "sampler": "one of the samplers that the model's code offers",
+    "window": "edge length in pixels of the square that is cut from the middle of the image",
     "voxel_size": "edge length in metres",
     "channels": "the names of the channels to feed; those that are not optional must be among them",
 }
@@ -51,6 +53,8 @@ def possible_choices(chosen: ModelContract) -> dict[str, str]:
     """Return what may be chosen for a model, required choices first, with what each wants."""
     names = list(chosen.required_choices)
     names += ["num_points"] if chosen.counts else []
+    names += ["sampler"] if chosen.samplers else []
+    names += ["window"] if chosen.window is not None else []
     names += ["voxel_size"] if chosen.voxel is not None and chosen.count_range is not None else []
     names += ["channels"] if any(channel.optional for tensor in chosen.tensors for channel in tensor.channels) else []
     names += ["crop"] if chosen.crop is not None and "crop" not in names else []
@@ -100,6 +104,25 @@ def _choose_count(chosen: ModelContract, count: Any) -> ModelContract:
     return replace(chosen, count=count)
 
 
+def _choose_sampler(chosen: ModelContract, sampler: Any) -> ModelContract:
+    original = CONTRACTS[chosen.name]
+    if not original.samplers:
+        return _unknown(chosen, "sampler")
+    if sampler not in (original.sampler, *original.samplers):
+        raise ConfigError(
+            f"{chosen.name}: sampler must be one of {[original.sampler, *original.samplers]}, got {sampler!r}"
+        )
+    return replace(chosen, sampler=sampler)
+
+
+def _choose_window(chosen: ModelContract, window: Any) -> ModelContract:
+    if CONTRACTS[chosen.name].window is None:
+        return _unknown(chosen, "window")
+    if not isinstance(window, int) or isinstance(window, bool) or window < 1:
+        raise ConfigError(f"{chosen.name}: window must be {CHOICES['window']}, got {window!r}")
+    return replace(chosen, window=(window, window))
+
+
 def _choose_voxel(chosen: ModelContract, size: Any) -> ModelContract:
     if "voxel_size" not in possible_choices(CONTRACTS[chosen.name]):
         return _unknown(chosen, "voxel_size")
@@ -135,6 +158,8 @@ _MAKERS = {
     "frame": _choose_frame,
     "crop": _choose_crop,
     "num_points": _choose_count,
+    "sampler": _choose_sampler,
+    "window": _choose_window,
     "voxel_size": _choose_voxel,
     "channels": _choose_channels,
     "category": _choose_category,

@@ -9,6 +9,7 @@ from typing import Literal
 from pcdata.structures import CAMERA_FRAME, METRE, NORMALIZED
 
 Vec3 = tuple[float, float, float]
+Sampler = Literal["none", "random", "random with replacement", "farthest point"]
 
 
 class Role(str, Enum):
@@ -85,10 +86,12 @@ class ModelContract:
     axes: str = "x right, y down, z forward"
     half_turn: bool = False  # turn half about z: x left, y up, z forward
 
+    far: float | None = None  # metres: readings beyond are dropped before anything else
     count: int | None = None  # points per cloud; None = any
     counts: tuple[int, ...] = ()  # other counts that the model's code is used with
     count_range: tuple[int, int] | None = None  # where count is None: the usual counts
-    sampler: Literal["none", "random", "random with replacement", "farthest point"] = "none"
+    sampler: Sampler = "none"
+    samplers: tuple[Sampler, ...] = ()  # others that the model's code offers
     pad: Literal["error", "repeat", "tile", "zeros", "keep"] = "keep"
     voxel: float | None = None  # edge length in metres
     voxel_rule: Literal["mean", "first", "random"] = "mean"
@@ -100,6 +103,8 @@ class ModelContract:
     crop: tuple[Vec3, Vec3] | None = None  # smallest and largest x, y, z, in the contract's frame before centring
     crop_is_open: bool = False  # the crop must be chosen: a box, or None for no crop
     column: float | None = None  # edge length of a random column of the scene, metres
+    window: tuple[int, int] | None = None  # (height, width) cut from the middle of the image, before it is resized
+    holes: Literal["nearest", "inpainted"] = "nearest"  # how an image network's code fills them
     image_size: tuple[int, int] | None = None  # (height, width)
 
     table: Literal["kept", "removed", "open"] = "kept"
@@ -107,6 +112,7 @@ class ModelContract:
     guide: str = ""  # what practitioners' guides say instead
     traps: tuple[str, ...] = ()
     wrong_frame: str = ""  # what a wrong frame would have done
+    checked: tuple[str, ...] = ()  # what was held against the model's own code: file, commit, outcome
     choices: tuple[str, ...] = field(default=())  # further choices that must be given
 
     @property

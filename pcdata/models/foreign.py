@@ -10,7 +10,7 @@ import numpy as np
 
 from pcdata.errors import CacheError, ConfigError, near_matches
 from pcdata.io.zarr_arrays import ZarrArray, zarr_arrays
-from pcdata.models.contract import ModelContract, Role
+from pcdata.models.contract import InputTensor, ModelContract, Role
 
 # What the keys of a mapping may be called besides the model's own tensor names: the roles of channels.
 ROLES = {"points": Role.POSITION, "colors": Role.COLOR, "normals": Role.DIRECTION}
@@ -48,14 +48,25 @@ def read_samples(
     for number in range(main.shape[0] if batched else 1):
         parts = {name: np.asarray(array[number] if batched else array[...]) for name, array in chosen.items()}
         if by_role:
-            yield str(number), *_joined(contract, parts)
+            whole, channels = _joined(contract, parts)
         else:
-            whole = {key: part[None] if _has_batch_axis(contract, key) else part for key, part in parts.items()}
-            yield str(number), whole, {}
+            whole = {key: part[None] if _spec(contract, key).axes[0] == "B" else part for key, part in parts.items()}
+            channels = {}
+        yield str(number), {key: _as_read(part, _spec(contract, key).dtype) for key, part in whole.items()}, channels
 
 
-def _has_batch_axis(contract: ModelContract, key: str) -> bool:
-    return next(spec.axes[0] == "B" for spec in contract.tensors if spec.key == key)
+def _spec(contract: ModelContract, key: str) -> InputTensor:
+    return next(spec for spec in contract.tensors if spec.key == key)
+
+
+def _as_read(array: np.ndarray, dtype: str) -> np.ndarray:
+    """Convert as the models' own loaders do: numbers with a fraction get the tensor's width, all this machine's order.
+
+    DP3's converter of real recordings writes float64, which every one of its data sets reads as float32.
+    """
+    fractions = array.dtype.kind == "f" and np.dtype(dtype).kind == "f"
+    with np.errstate(over="ignore"):  # what does not fit becomes infinite, which is a rule of its own
+        return array.astype(dtype if fractions else array.dtype.newbyteorder("="), copy=False)
 
 
 def _joined(

@@ -11,6 +11,14 @@ from pcdata.errors import CaptureError, DTypeError, NoReadingError, ShapeError
 from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import DepthFrame
 
+_FILLERS = {"nearest": "FillHoles(rule='nearest')", "inpainted": "InpaintDepth()"}
+
+
+def size_step(contract: ModelContract) -> str:
+    """Say which step gives an image the size that the network takes."""
+    same = contract.window == contract.image_size
+    return f"{'CropCenter' if same else 'ResizeDepth'}(size={contract.image_size})"
+
 
 def image_tensor(frames: Sequence[DepthFrame], contract: ModelContract, tensor: InputTensor) -> Tensor:
     """Stack the views of captures as (B, C, H, W) or (B, H, W, C) in the contract's channels.
@@ -31,14 +39,14 @@ def _check_frame(frame: DepthFrame, contract: ModelContract) -> None:
         raise DTypeError(f"{contract.name}: takes depth images, got a {type(frame).__name__}")
     if frame.size != contract.image_size:
         raise ShapeError(
-            f"{contract.name}: takes images of (height, width) {contract.image_size}, got {frame.size}; put "
-            f"ResizeDepth(size={contract.image_size}) last"
+            f"{contract.name}: takes images of (height, width) {contract.image_size}, got {frame.size}; end with "
+            f"{size_step(contract)}"
         )
     holes = float((frame.depth == 0).float().mean())
     if holes > 0:
         raise NoReadingError(
             f"{contract.name}: {holes:.1%} of the depth of {frame.sample_id!r} is holes, which would count as surface "
-            "at the lens; put FillHoles(rule='nearest') before ResizeDepth"
+            f"at the lens; put {_FILLERS[contract.holes]} after the crop"
         )
 
 

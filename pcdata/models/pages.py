@@ -33,6 +33,8 @@ def contract_page(contract: ModelContract) -> str:
         parts.append(f"## What guides say\n\n{contract.guide}")
     if contract.traps:
         parts.append("## Traps\n\n" + "\n".join(f"- {trap}" for trap in contract.traps))
+    if contract.checked:
+        parts.append("## Held against the model's own code\n\n" + "\n".join(f"- {line}" for line in contract.checked))
     if contract.wrong_frame:
         parts.append(f"## What a wrong frame would have done\n\n{contract.wrong_frame}")
     return "\n\n".join(parts) + "\n"
@@ -62,8 +64,9 @@ def _table(contract: ModelContract) -> str:
         "frame": contract.frame or "the model leaves it open: choose `frame`",
         "axes": contract.axes,
         "unit": "m" if contract.scaling == "none" else "normalised",
+        "depth": "all" if contract.far is None else f"up to {contract.far:g} m",
         "points per cloud": _count(contract),
-        "sampler": contract.sampler,
+        "sampler": " or ".join([contract.sampler, *contract.samplers]),
         "short clouds": _short(contract),
         "voxels": "none" if contract.voxel is None else f"{contract.voxel * 1000:g} mm, {contract.voxel_rule} point",
         "centring and scaling": _normalised(contract),
@@ -72,6 +75,8 @@ def _table(contract: ModelContract) -> str:
     }
     if contract.takes == "depth image":
         rows = {name: rows[name] for name in ("frame", "axes")}
+        rows["window"] = _window(contract)
+        rows["holes"] = {"nearest": "nearest reading", "inpainted": "inpainted (Navier-Stokes)"}[contract.holes]
     if contract.image_size is not None:
         rows["image"] = f"{contract.image_size[0]} x {contract.image_size[1]} (height x width)"
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
@@ -105,6 +110,9 @@ def _example(contract: ModelContract) -> str:
     if contract.counts:
         allowed = ", ".join(str(count) for count in sorted({contract.count or 0, *contract.counts}))
         said = [f"{line} ({allowed})" if line.startswith("- `num_points`") else line for line in said]
+    if contract.samplers:
+        offered = ", ".join(f'"{sampler}"' for sampler in (contract.sampler, *contract.samplers))
+        said = [f"{line} ({offered})" if line.startswith("- `sampler`") else line for line in said]
     return "\n".join([*code, *([] if not said else ["", "Choices:", "", *said])])
 
 
@@ -114,6 +122,12 @@ def _count(contract: ModelContract) -> str:
     if contract.count is None:
         return "any" if contract.count_range is None else "{:,} to {:,}".format(*contract.count_range)
     return f"{contract.count:,}"
+
+
+def _window(contract: ModelContract) -> str:
+    if contract.window is None:
+        return "the whole image"
+    return "{} x {} pixels in the middle (height x width)".format(*contract.window)
 
 
 def _short(contract: ModelContract) -> str:

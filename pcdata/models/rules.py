@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pcdata.models.batch import ModelBatch
 from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.models.images import size_step
 from pcdata.structures import METRE
 from pcdata.validation import Check, Verdict
 
@@ -86,8 +87,8 @@ def _frame(batch: ModelBatch, contract: ModelContract) -> Check:
     # Files that others wrote do not say whether they are centred: there the values decide, under normalisation.
     whole = batch.steps is not None
     ours, theirs = (batch.frame_id, wanted) if whole else (batch.frame_id.split("/")[0], wanted.split("/")[0])
-    fault = "" if ours == theirs else f"the data are in {batch.frame_id!r}, the model works in {wanted!r}"
-    steps = ["ToFrame(frame=...)"] if ours.split("/")[0] != theirs.split("/")[0] else []
+    fault = "" if ours == theirs else f"the data are in {ours!r}, the model works in {theirs!r}"
+    steps = [f"ToFrame(frame={contract.frame!r})"] if ours.split("/")[0] != theirs.split("/")[0] else []
     steps += ["the preset's centring"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
     return verdict(
         "frame", fault, f"add {' and '.join(steps)}, or use the preset. {contract.wrong_frame}", found=batch.frame_id
@@ -115,7 +116,7 @@ def _count(batch: ModelBatch, contract: ModelContract) -> Check:
         if tensor is not None and tensor.ndim == len(spec.axes):
             size = (tensor.shape[spec.axes.index("H")], tensor.shape[spec.axes.index("W")])
         fault = "" if size == contract.image_size else f"images of {size}, not (height, width) {contract.image_size}"
-        return verdict("count", fault, f"put ResizeDepth(size={contract.image_size}) last", found=str(size))
+        return verdict("count", fault, f"end with {size_step(contract)}", found=str(size))
     if not sizes:
         return verdict("count", "the counts are not known", "give whole clouds", found="", unknown=True)
     low, high = min(sizes), max(sizes)

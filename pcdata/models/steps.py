@@ -8,11 +8,14 @@ from pcdata.structures import CAMERA_FRAME
 from pcdata.transforms import (
     Center,
     Compose,
+    CropCenter,
     CropWorkspace,
     Deproject,
     EstimateNormals,
     FarthestPointSample,
     FillHoles,
+    InpaintDepth,
+    MaskDepth,
     MergeViews,
     NormalizeUnitSphere,
     Pipeline,
@@ -37,14 +40,22 @@ def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Pipeline | Com
     depth: list[Transform] = [Deproject()]
     if contract.image_size is not None:  # organised clouds
         depth = [ResizeDepth(size=contract.image_size), Deproject()]
+    if contract.far is not None:
+        depth = [MaskDepth(far=contract.far, use_mask=False), *depth]
     steps = _cloud_steps(contract, merge_views)
     first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
     return Pipeline(depth=depth, cloud=steps[:first], augment=steps[first:])
 
 
 def _image_steps(contract: ModelContract) -> list[Transform]:
+    """Window, holes, size, in the order of the networks' own code: what is cut away does not flow into holes."""
     assert contract.image_size is not None
-    return [FillHoles(rule="nearest"), ResizeDepth(size=contract.image_size)]
+    window = contract.window
+    steps: list[Transform] = [] if window is None else [CropCenter(size=window)]
+    steps.append(InpaintDepth() if contract.holes == "inpainted" else FillHoles(rule="nearest"))
+    if window != contract.image_size:
+        steps.append(ResizeDepth(size=contract.image_size))
+    return steps
 
 
 def _cloud_steps(contract: ModelContract, merge_views: bool) -> list[Transform]:

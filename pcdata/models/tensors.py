@@ -34,8 +34,9 @@ def contract_tensor(clouds: PointCloud, contract: ModelContract, tensor: InputTe
 
 
 def columns(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(N, C): the channels of all points in the contract's order."""
-    return torch.cat([COLUMNS[channel.name](clouds, contract) for channel in tensor.channels], dim=1)
+    """(N, C): the channels of all points in the contract's order; one channel alone is not copied."""
+    parts = [COLUMNS[channel.name](clouds, contract) for channel in tensor.channels]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
 def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
@@ -43,7 +44,10 @@ def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: Inpu
     if tensor.layout == "S C":
         return rows
     counts = clouds.counts.tolist()
-    padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
+    if min(counts) == max(counts):  # packed rows are the batch already
+        padded = rows.reshape(len(counts), counts[0], tensor.width)
+    else:
+        padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
     return padded.transpose(1, 2).contiguous() if tensor.layout == "B C N" else padded
 
 
@@ -57,8 +61,8 @@ def _category(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) 
 
 
 def _cells_of_batch(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(S, 4) int32: the cloud's number and its cell, cut towards zero as RISE's cast does."""
-    cells = (clouds.points / _CELL).to(torch.int32)
+    """(S, 4) int32: the cloud's number and its cell, cut towards zero as RISE's cast does, from float64 as there."""
+    cells = (clouds.points.double() / _CELL).to(torch.int32)
     return torch.cat([cloud_of_rows(clouds.ptr)[:, None].to(torch.int32), cells], dim=1)
 
 
@@ -75,21 +79,28 @@ def _offset(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) ->
 
 
 def _voxel_grid(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(B, C, X, Y, Z): per cell the mean of the points' channels, the cell's index / 100, and 1 where occupied."""
+    """(B, C, X, Y, Z): per cell the mean of the points' channels, the cell's index / 100, and 1 where occupied.
+
+    Points outside the box are left out; cells are counted as PerAct counts them, from a border of one cell around it.
+    """
     assert contract.crop is not None
     lower, upper = clouds.points.new_tensor(contract.crop)
-    cell = torch.floor((clouds.points - lower) / (upper - lower) * GRID_CELLS).long().clamp(0, GRID_CELLS - 1)
-    owner = cloud_of_rows(clouds.ptr)
+    edge = (upper - lower) / GRID_CELLS
+    cell = torch.floor((clouds.points - (lower - edge)) / edge).long() - 1
+    inside = ((cell >= 0) & (cell < GRID_CELLS)).all(dim=1)
+    cell, owner = cell[inside], cloud_of_rows(clouds.ptr)[inside]
     flat = ((owner * GRID_CELLS + cell[:, 0]) * GRID_CELLS + cell[:, 1]) * GRID_CELLS + cell[:, 2]
     occupied, inverse = torch.unique(flat, return_inverse=True)
-    values = torch.cat([clouds.points, COLUMNS["rgb_signed"](clouds, contract)], dim=1)
-    grid = values.new_zeros((clouds.num_clouds * GRID_CELLS**3, tensor.width))
-    grid[occupied, : values.shape[1]] = voxel_mean(values, inverse, len(occupied))
-    grid[occupied, -1] = 1.0
-    grid = grid.reshape(clouds.num_clouds, GRID_CELLS, GRID_CELLS, GRID_CELLS, tensor.width)
+    values = torch.cat([clouds.points, COLUMNS["rgb_signed"](clouds, contract)], dim=1)[inside]
+    # Filled where it stays: one grid is 40 MB, and cells are few.
+    grid = values.new_zeros((clouds.num_clouds, tensor.width, GRID_CELLS**3))
+    batch, place = occupied // GRID_CELLS**3, occupied % GRID_CELLS**3
+    grid[batch, : values.shape[1], place] = voxel_mean(values, inverse, len(occupied))
+    grid[batch, -1, place] = 1.0
+    grid = grid.reshape(clouds.num_clouds, tensor.width, GRID_CELLS, GRID_CELLS, GRID_CELLS)
     steps = torch.arange(GRID_CELLS, device=clouds.device) / GRID_CELLS
-    grid[..., 6:9] = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
-    return grid.permute(0, 4, 1, 2, 3).contiguous()
+    grid[:, 6], grid[:, 7], grid[:, 8] = steps[:, None, None], steps[:, None], steps
+    return grid
 
 
 def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:

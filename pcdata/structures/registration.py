@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors
-from pcdata.errors import ShapeError
+from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional import rigid
 from pcdata.functional.depth_registration import RegisteredDepth, register_depth
 from pcdata.structures.camera import Camera
@@ -43,6 +43,10 @@ def register_to_color(
         CaptureError, PoseError: as :func:`pcdata.functional.register_depth`.
     """
     where = "register_to_color"
+    if not isinstance(colors, Tensor):
+        raise DTypeError(f"{where}: colors must be a uint8 (V, H, W, 3) tensor, not {type(colors).__name__}")
+    if not isinstance(color_from_depth, Tensor):
+        raise DTypeError(f"{where}: color_from_depth must be a (4, 4) tensor, not {type(color_from_depth).__name__}")
     check_tensors(where, {"depth": frame.depth, "colors": colors}, {"depth": "V H W", "colors": "V Y X 3 : uint8"})
     cameras = _per_view(color_camera, frame.num_views)
     if tuple(colors.shape[1:3]) != cameras.size:

@@ -10,7 +10,8 @@ from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
 from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
-from pcdata.transforms.depth_sizes import DecimateDepth, ResizeDepth
+from pcdata.transforms.depth_inpainting import InpaintDepth
+from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
@@ -31,6 +32,7 @@ __all__ = [
     "ClusterObjects",
     "CompleteDepth",
     "Compose",
+    "CropCenter",
     "CropWorkspace",
     "DecimateDepth",
     "Deproject",
@@ -38,6 +40,7 @@ __all__ = [
     "FarthestPointSample",
     "FillHoles",
     "FuseTSDF",
+    "InpaintDepth",
     "KeepConfidence",
     "MarkUnreliableDepth",
     "MaskDepth",

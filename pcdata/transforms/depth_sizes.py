@@ -1,4 +1,4 @@
-"""Depth frames of another size: DecimateDepth, ResizeDepth. The intrinsics always follow."""
+"""Depth frames of another size: CropCenter, DecimateDepth, ResizeDepth. The intrinsics always follow."""
 
 from __future__ import annotations
 
@@ -10,10 +10,41 @@ from annotated_types import Interval
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from pcdata.errors import ShapeError
 from pcdata.functional.depth_resampling import MAX_FACTOR, decimate_depth, resize_depth
 from pcdata.structures import DepthFrame
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import Count, Positive
+
+
+class CropCenter(Transform):
+    """Keep the window in the middle of the images, pixel for pixel; an odd margin is smaller above and left.
+
+    Raises:
+        ShapeError: the window is larger than the images.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    size: tuple[Count, Count]  # (height, width) in pixels
+
+    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Cut every image and move the principal point."""
+        (height, width), (rows, columns) = self.size, data.size
+        if height > rows or width > columns:
+            raise ShapeError(
+                f"CropCenter: a window of {height} x {width} (height x width) does not fit into images of {rows} x "
+                f"{columns}; choose a smaller one, or resize first"
+            )
+        top, left = (rows - height) // 2, (columns - width) // 2
+        names = ("depth", "colors", "labels", "confidence", "mask")
+        images = {name: getattr(data, name) for name in names}
+        window: dict[str, Any] = {
+            name: None if image is None else image[:, top : top + height, left : left + width].contiguous()
+            for name, image in images.items()
+        }
+        return replace(data, camera=data.camera.cropped(top, left, self.size), **window)
 
 
 class DecimateDepth(Transform):
@@ -59,7 +90,9 @@ class ResizeDepth(Transform):
     max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
 
     def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
-        """Resize every image and rewrite the intrinsics."""
+        """Resize every image and rewrite the intrinsics; images of that size stay."""
+        if data.size == self.size:
+            return replace(data)
         depth, pixel_index = resize_depth(data.depth, size=self.size, max_jump=self.max_jump)
         colors = None
         if data.colors is not None:

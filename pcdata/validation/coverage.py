@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from pcdata.functional.missing_region import largest_missing_region
+from pcdata.functional.missing_region import largest_missing_block, largest_missing_region
 from pcdata.validation.check import Check, graded
 from pcdata.validation.limits import Limits
 
@@ -18,13 +18,16 @@ def coverage_checks(
 ) -> list[Check]:
     """Judge the share of pixels that have a reading, and the largest region that has none.
 
-    With ``may_be_cut`` a missing region only warns: someone may have taken the background away on purpose.
+    A region without straight ends only warns: someone may have taken the background away on purpose, or something stood
+    before the lens. With ``may_be_cut`` every one only warns: straight cuts may be on purpose too.
     """
     height, width = valid.shape
     count = int(valid.sum())
     fraction = count / valid.numel()
     region = largest_missing_region(valid)
     where = place_in_words(region.box, (height, width))
+    # At least half of what may not be missing lies in whole lines: less is a sensor's blind border.
+    is_block = largest_missing_block(valid) > limits.missing_region[0]
     return [
         graded(
             "valid_fraction",
@@ -41,12 +44,14 @@ def coverage_checks(
             "missing_region",
             region.fraction,
             threshold=limits.missing_region[0],
-            fails_at=None if may_be_cut else limits.missing_region[1],
+            fails_at=limits.missing_region[1] if is_block and not may_be_cut else None,
             found=f"{100 * region.fraction:.0f} % of the image in one piece have no reading, {where}"
             if region.fraction
             else "no region without readings",
-            advice=f"look at what the camera sees {where}: something before the lens, out of range, black, shiny or "
-            "transparent; or the image was stored in part only",
+            advice=f"whole lines have no reading {where}: the image was stored or decoded in part only"
+            if is_block
+            else f"look at what the camera sees {where}: something before the lens, out of range, black, shiny or "
+            "transparent; right if the background was cut away on purpose",
             view=view,
         ),
     ]

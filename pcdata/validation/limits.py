@@ -27,8 +27,9 @@ class Limits:
     workspace_fraction: tuple[float, float] = (0.5, 100_000 / 307_200)
     # A single depth holds less than 1 in 500 readings of any real scene's end; 1 in 100 makes a false wall.
     saturation: tuple[float, float] = (0.002, 0.01)
-    # Of the image's width or height. Lenses are mounted within 5 %; K of an image resized by 1.25 is off by 10 %.
-    principal_point: tuple[float, float] = (0.05, 0.10)
+    # Of the image's width or height. Lenses are mounted within 5 %; K of an image resized by 0.8, the smallest usual
+    # change of size, is off by 10 %: halfway.
+    principal_point: tuple[float, float] = (0.05, 0.075)
     # Degrees across the image: depth cameras lie between 40 (long-range stereo) and 110 (wide time of flight).
     field_of_view: tuple[float, float] = (30.0, 120.0)
     # Pixels are square to 1 % in every depth camera; an image resized unevenly differs on purpose, so this warns only.

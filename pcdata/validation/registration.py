@@ -20,8 +20,8 @@ def frame_votes(frame: DepthFrame) -> list[EdgeVotes]:
 def registration_check(votes: EdgeVotes, limits: Limits, view: int) -> Check:
     """Judge the shift between colour and depth at the rims of near surfaces.
 
-    It fails when even the shortest shift within the measurement's uncertainty is beyond the limit, passes when the
-    shift is within it and one of 3 pixels can be ruled out, and says "not measurable" otherwise.
+    It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it and one of 3
+    pixels can be ruled out, and says "not measurable" otherwise.
     """
     offset = offset_from_votes(votes)
     if offset.problem is None and offset.least_length > limits.color_shift:

@@ -81,11 +81,33 @@ def test_a_camera_knocked_over_is_refused():
         refine_extrinsics([rig(0)], names=NAMES, max_shift=0.005)
 
 
+def test_poses_that_bring_no_surface_nearer_are_refused():
+    # One camera's image twice: where both agree exactly, nothing can be made better.
+    one = scene(0).frame.view(0)
+    pose = scene(0).truth.world_from_camera[:1].repeat(2, 1, 1)
+    camera = replace(one.camera, intrinsics=one.camera.intrinsics.repeat(2, 1, 1))
+    twice = replace(
+        one, depth=one.depth.repeat(2, 1, 1), colors=None, labels=None, camera=camera, world_from_camera=pose
+    )
+    with pytest.raises(CalibrationError, match="as well as these captures can tell"):
+        refine_extrinsics([twice], names=["a", "b"], fixed="a")
+
+
+def test_gaps_are_those_of_samples_left_out_and_fall():
+    found = refine_extrinsics([rig(0)], names=NAMES)
+    assert found.rmse_gap[1] < found.rmse_gap[0] / 2
+    assert found.median_gap[1] < found.median_gap[0]
+    assert "left out of the fit" in found.text()
+    assert found.to_json()["rmse_gap"] == list(found.rmse_gap)
+
+
 def test_a_bare_table_is_refused_as_undetermined():
     bare = tabletop(0, 0, 3, noise="stereo", floor=False, size=(360, 480)).frame
     depth = torch.zeros_like(bare.depth)
     depth[:, 120:240, 150:330] = bare.depth[:, 120:240, 150:330]
-    with pytest.raises(CalibrationError, match=r"does not determine its pose: shift along .*upright sides"):
+    with pytest.raises(
+        CalibrationError, match=r"does not determine its pose: shift along .*at most 1 mm.*upright sides"
+    ):
         refine_extrinsics([replace(bare, depth=depth)], names=NAMES, fixed="left")
 
 

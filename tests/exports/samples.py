@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from pcdata.functional import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, PointCloud
+from pcdata.transforms import NormalizeUnitSphere
 
 
 class Samples:
@@ -43,6 +45,12 @@ def cloud(count: int = 40, seed: int = 0, **changes: object) -> PointCloud:
         "labels": torch.arange(count) % 4,
     }
     return PointCloud(**(fields | changes))
+
+
+def shape(count: int = 2048, seed: int = 0, **changes: object) -> PointCloud:
+    """A cloud whose mean is the origin and whose farthest point is at 1."""
+    made = NormalizeUnitSphere()(cloud(count, seed))
+    return replace(made, **changes)
 
 
 def frame(size: tuple[int, int] = (12, 16), seed: int = 0, **changes: object) -> DepthFrame:

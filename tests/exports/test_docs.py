@@ -24,3 +24,13 @@ def test_every_target_and_option_is_explained(name):
         row += re.findall(rf"^\| `{INHERITED[name]}` \|(.*?)\|", OPTIONS, re.MULTILINE)[0]
     named = set(re.findall(r"`(\w+)`", row)) - set(TARGETS)
     assert named == {field.name for field in fields(TARGETS[name])}
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_the_page_says_whose_rules_hold_and_which_are_left_to_the_loader(name):
+    target = TARGETS[name]
+    rules = TEXT.split("## Whose rules, and what ran")[1].split("## Options and traps")[0]
+    (contract, left) = re.findall(rf"^\| `{name}` \|([^|]*)\|([^|]*)\|", rules, re.MULTILINE)[0]
+    assert f"[{target.model}](models/{target.model}.md)" in contract
+    said = set() if left.strip().startswith("nothing") else {word.strip() for word in left.split(",")}
+    assert said == target.left_to_loader

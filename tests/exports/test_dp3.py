@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata.errors import CaptureError, ConfigError, FrameError, ShapeError, TooFewPointsError, UnitError
+from pcdata.errors import CaptureError, ConfigError, ContractError, ShapeError, TooFewPointsError
 from pcdata.exports import export_dataset
 from pcdata.exports.dp3 import DP3
 from tests.exports.samples import Samples, cloud, frame
@@ -41,7 +41,7 @@ def episodes(lengths=(3, 2)) -> dict:
     return result
 
 
-def clouds(number=5, count=8, **changes) -> Samples:
+def clouds(number=5, count=512, **changes) -> Samples:
     return Samples({f"t{step}": cloud(count, seed=step, **changes) for step in range(number)})
 
 
@@ -50,10 +50,10 @@ def test_the_replay_buffer_holds_the_clouds_states_and_actions(tmp_path):
     report = export_dataset(source, "dp3", tmp_path / "out.zarr", episodes=robot)
     buffer = replay_buffer(tmp_path / "out.zarr")
     assert report.written == 5
-    assert report.notes == []
+    assert ["fewer than 8 steps" in note for note in report.notes] == [True]
     assert buffer["episode_ends"].dtype == np.int64
     assert buffer["episode_ends"].tolist() == [3, 5]
-    assert buffer["point_cloud"].shape == (5, 8, 6)
+    assert buffer["point_cloud"].shape == (5, 512, 6)
     assert {key: buffer[key].dtype for key in KEYS} == dict.fromkeys(KEYS, np.float32) | {"img": np.uint8}
     for step, name in enumerate(source.ids):
         stored = source.samples[name]
@@ -76,7 +76,7 @@ def test_the_zarr_package_opens_it_as_the_loader_does(tmp_path):
         assert np.array_equal(value, wanted[key])
         assert value.min() <= value.max()  # the loader prints the range of every array
     assert root["meta"]["episode_ends"][:].tolist() == [3, 5]
-    assert root["data"]["point_cloud"].chunks == (100, 8, 6)
+    assert root["data"]["point_cloud"].chunks == (100, 512, 6)
 
 
 def test_episodes_come_from_npz_files_in_the_order_of_their_names(tmp_path):
@@ -91,40 +91,44 @@ def test_episodes_come_from_npz_files_in_the_order_of_their_names(tmp_path):
 
 
 def test_more_timesteps_than_a_chunk(tmp_path):
-    export_dataset(clouds(230, 4), "dp3", tmp_path / "out", episodes=episodes((230,)), compression="none", colors=False)
+    report = export_dataset(
+        clouds(230), "dp3", tmp_path / "out", episodes=episodes((230,)), compression="none", colors=False
+    )
+    assert report.notes == []
     assert sorted(path.name for path in (tmp_path / "out/data/point_cloud").iterdir()) == [
         ".zarray", "0.0.0", "1.0.0", "2.0.0",
     ]  # fmt: skip
     buffer = replay_buffer(tmp_path / "out")
-    assert np.array_equal(buffer["point_cloud"][229], cloud(4, seed=229).points.numpy())
+    assert np.array_equal(buffer["point_cloud"][229], cloud(512, seed=229).points.numpy())
 
 
 def test_padding_by_zeros_is_noted_with_what_it_does_to_the_statistics(tmp_path):
     source = clouds()
     points = source.samples["t3"].points + 2.0
-    source = Samples({name: cloud(8, points=points) for name in source.ids})
+    source = Samples({name: cloud(512, points=points) for name in source.ids})
     padded = points.clone()
-    padded[6:] = 0
-    source.samples["t3"] = cloud(8, points=padded)
+    padded[500:] = 0
+    source.samples["t3"] = cloud(512, points=padded)
     report = export_dataset(source, "dp3", tmp_path / "out", episodes=episodes())
-    assert len(report.notes) == 1
-    assert "1 clouds have points at exactly 0 0 0" in report.notes[0]
-    assert "'t3'" in report.notes[0]
+    assert len(report.notes) == 2
+    assert "1 clouds have points at exactly 0 0 0" in report.notes[1]
+    assert "'t3'" in report.notes[1]
     low = min(points.min(dim=0).values.tolist())
-    assert f"{low:.3g}" in report.notes[0]  # the range without the zeros
+    assert f"{low:.3g}" in report.notes[1]  # the range without the zeros
 
 
 @pytest.mark.parametrize(
     ("sample", "error", "fix"),
     [
-        (cloud(9), ShapeError, "needs 8 points in every cloud, this one has 9"),
-        (cloud(7), TooFewPointsError, r"FarthestPointSample\(num_points=8"),
-        (cloud(8, unit="normalized"), UnitError, "without NormalizeUnitSphere"),
-        (cloud(8, frame_id="camera"), FrameError, r"ToFrame\(frame='base'\)"),
-        (cloud(8, colors=None), CaptureError, "colors=false"),
-        (cloud(8, points=torch.full((8, 3), torch.nan)), CaptureError, "not finite"),
+        (cloud(1024), ShapeError, "the samples before have 512 points, this one has 1024"),
+        (cloud(511), ContractError, r"count: 511 points .*FarthestPointSample\(num_points=512"),
+        (cloud(512, unit="normalized"), ContractError, "unit: .*remove the normalisation"),
+        (cloud(512, frame_id="camera"), ContractError, r"frame: .*'camera'.*'base'; add ToFrame"),
+        (cloud(512, points=1000 * cloud(512).points), ContractError, "scale: .*millimetres"),
+        (cloud(512, colors=None), CaptureError, "colors=false"),
+        (cloud(512, points=torch.full((512, 3), torch.nan)), ContractError, "finite: "),
         (cloud(0), TooFewPointsError, "empty"),
-        (cloud(8, ptr=torch.tensor([0, 4, 8])), ShapeError, "MergeViews"),
+        (cloud(512, ptr=torch.tensor([0, 4, 512])), ShapeError, "MergeViews"),
         (frame(), TypeError, "pcdata build"),
     ],
 )
@@ -137,8 +141,19 @@ def test_what_the_loader_cannot_take_is_refused_with_the_fix(tmp_path, sample, e
     assert list(tmp_path.iterdir()) == []
 
 
+def test_episodes_too_short_for_a_sequence_are_noted(tmp_path):
+    """common/sampler.py: a sequence of 16 starts at most 1 step before an episode and ends at most 7 beyond it."""
+    for length, sequences in ((7, 0), (8, 1)):
+        starts = range(-1, length - 16 + 7 + 1)  # create_indices: min_start .. max_start
+        assert len(starts) == sequences
+        report = export_dataset(clouds(length), "dp3", tmp_path / str(length), episodes=episodes((length,)))
+        assert [("1 episodes have fewer than 8 steps (first: 'episode0')" in note) for note in report.notes] == [
+            True
+        ] * (not sequences)
+
+
 def test_a_frame_can_be_asked_for(tmp_path):
-    with pytest.raises(FrameError, match="frame asks for 'world'"):
+    with pytest.raises(ContractError, match="the data are in 'base', the model works in 'world'"):
         export_dataset(clouds(), "dp3", tmp_path / "out", episodes=episodes(), frame="world")
 
 

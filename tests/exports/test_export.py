@@ -180,9 +180,9 @@ def test_only_the_same_export_is_continued(tmp_path):
 def test_an_array_of_all_samples_is_continued_as_a_whole(tmp_path):
     robot = {"e": {"samples": np.array(["a", "b"]), "state": np.zeros((2, 1)), "action": np.zeros((2, 1))}}
     with pytest.raises(KeyboardInterrupt):
-        export_dataset(Samples({"a": cloud(), "b": stop}), "dp3", tmp_path / "out", resume=True, episodes=robot)
+        export_dataset(Samples({"a": cloud(512), "b": stop}), "dp3", tmp_path / "out", resume=True, episodes=robot)
     assert [path.name for path in (tmp_path / "out").iterdir()] == [FILE_NAME]
-    source = Samples({"a": cloud(), "b": cloud()})
+    source = Samples({"a": cloud(512), "b": cloud(512)})
     export_dataset(source, "dp3", tmp_path / "out", resume=True, episodes=robot)
     export_dataset(source, "dp3", tmp_path / "one go", episodes=robot)
     assert tree(tmp_path / "out") == tree(tmp_path / "one go")

@@ -224,6 +224,18 @@ def test_the_scene_tree_is_what_the_dataset_class_walks_through(tmp_path):
             assert np.array_equal(np.load(folder / "camK.npy"), sample.camera.intrinsics[0].numpy())
 
 
+def test_a_scene_in_finer_units_than_graspnetapi_takes_is_noted(tmp_path):
+    fine = ((frame().depth.double() * 1000).round() * 0.0002).float()
+    source = Samples({"a": frame(depth=fine, provenance={"metres_per_unit": 0.0002})})
+    options = {"any_size": True, "frames_per_scene": 1}
+    notes = export_dataset(source, "graspnet_scene", tmp_path / "own", **options).notes
+    assert any("units of 1/5000 m" in note and "factor_depth=1000" in note for note in notes)
+    notes = export_dataset(
+        source, "graspnet_scene", tmp_path / "api", factor_depth=1000, round_depth=True, **options
+    ).notes
+    assert not any("graspnetAPI" in note for note in notes)
+
+
 def test_the_scene_tree_refuses_half_scenes_and_frames_without_pose_or_labels(tmp_path):
     def refused(error, message, samples, **options):
         with pytest.raises(error, match=message):
@@ -267,7 +279,7 @@ def test_ggcnn_finds_depth_colour_and_grasps_under_cornells_names(tmp_path):
         assert corners.tolist() == [[[6, 5], [6, 9], [10, 9], [10, 5]]]  # rows y, x; halves to even
 
 
-@pytest.mark.parametrize("holes", ["smooth", "nearest"])
+@pytest.mark.parametrize("holes", ["inpainted", "smooth", "nearest"])
 def test_ggcnn_holes_are_filled_and_readings_stay(tmp_path, holes):
     source = captures(1)
     export_dataset(source, "ggcnn", tmp_path / "out", grasps={"view 0": GRASP}, any_size=True, holes=holes)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata.errors import CaptureError, ConfigError, ShapeError, TooFewPointsError, UnitError
+from pcdata.errors import CaptureError, ConfigError, ContractError, TooFewPointsError
 from pcdata.exports import export_dataset, pointnet
-from tests.exports.samples import Samples, cloud
+from tests.exports.samples import Samples, cloud, shape
 
 TABLE = {
     "a": {"class": "mug", "split": "test"},
@@ -24,6 +24,10 @@ TABLE = {
 
 def clouds(count: int = 2048, **changes) -> Samples:
     return Samples({name: cloud(count, seed=number, **changes) for number, name in enumerate(TABLE)})
+
+
+def shapes(**changes) -> Samples:
+    return Samples({name: shape(seed=number, **changes) for number, name in enumerate(TABLE)})
 
 
 def write_csv(path: Path) -> Path:
@@ -42,7 +46,7 @@ def get_data_files(path: Path) -> list[str]:
 
 def test_pointnet_opens_the_files_that_its_lists_name(tmp_path, monkeypatch):
     root = tmp_path / "data" / "modelnet40_ply_hdf5_2048"
-    source = clouds(unit="normalized")
+    source = shapes()
     export_dataset(source, "pointnet", root, table=write_csv(tmp_path / "table.csv"))
     monkeypatch.chdir(tmp_path)  # train.py runs in the repository, where data/ is
     names = get_data_files(root / "shape_names.txt")
@@ -61,30 +65,31 @@ def test_pointnet_opens_the_files_that_its_lists_name(tmp_path, monkeypatch):
 
 def test_pointnet_files_hold_so_many_shapes_and_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(pointnet, "_FILE_ROWS", 2)
-    report = export_dataset(clouds(unit="normalized"), "pointnet", tmp_path / "out", table=TABLE, prefix="")
+    report = export_dataset(shapes(), "pointnet", tmp_path / "out", table=TABLE, prefix="")
     assert get_data_files(tmp_path / "out" / "train_files.txt") == ["ply_data_train0.h5", "ply_data_train1.h5"]
     with h5py.File(tmp_path / "out" / "ply_data_train1.h5") as file:
-        assert np.array_equal(file["data"][0], cloud(2048, seed=3).points.numpy())
+        assert np.array_equal(file["data"][0], shape(seed=3).points.numpy())
     assert report.written == 4
 
 
 @pytest.mark.parametrize(
-    ("sample", "error", "fix"),
+    ("sample", "fix"),
     [
-        (cloud(2048), UnitError, r"NormalizeUnitSphere\(\) as the last step"),
-        (cloud(2048, unit="normalized", points=2 * cloud(2048).points), UnitError, "unit sphere"),
-        (cloud(1024, unit="normalized"), TooFewPointsError, "num_points=2048"),
-        (cloud(4096, unit="normalized"), ShapeError, "num_points=2048"),
+        (cloud(2048), r"unit: .*add NormalizeUnitSphere"),
+        (shape(points=2 * shape().points), "normalisation: .*farthest point at 2"),
+        (shape(1024), r"count: .*num_points=2048"),
+        (shape(4096), r"count: .*num_points=2048"),
+        (shape(points=shape().points.index_fill(0, torch.tensor([5]), torch.nan)), "finite: "),
     ],
 )
-def test_pointnet_refuses_what_its_loader_does_not_repair(tmp_path, sample, error, fix):
-    with pytest.raises(error, match=fix):
+def test_pointnet_refuses_what_its_loader_does_not_repair(tmp_path, sample, fix):
+    with pytest.raises(ContractError, match=fix):
         export_dataset(Samples({"a": sample}), "pointnet", tmp_path / "out", table=TABLE)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_pointnet_part_has_a_part_for_every_point_and_the_files_on_categories(tmp_path):
-    source = clouds(unit="normalized")
+    source = shapes()
     for name, sample in source.samples.items():
         shift = 4 if TABLE[name]["class"] == "mug" else 0
         source.samples[name] = sample.with_fields(labels=sample.labels + shift)
@@ -116,7 +121,7 @@ def test_pointnet_part_has_a_part_for_every_point_and_the_files_on_categories(tm
     ],
 )
 def test_pointnet_part_refuses_labels_that_are_no_parts(tmp_path, labels, message):
-    source = Samples({"a": cloud(2048, unit="normalized", labels=labels)})
+    source = Samples({"a": shape(labels=labels)})
     with pytest.raises(CaptureError, match=message):
         export_dataset(source, "pointnet_part", tmp_path / "out", table={"a": {"class": "mug"}})
 
@@ -124,7 +129,7 @@ def test_pointnet_part_refuses_labels_that_are_no_parts(tmp_path, labels, messag
 def test_a_part_of_two_classes_is_refused(tmp_path):
     table = {name: {"class": row["class"]} for name, row in TABLE.items()}
     with pytest.raises(CaptureError, match="number parts through all classes"):
-        export_dataset(clouds(unit="normalized"), "pointnet_part", tmp_path / "out", table=table)
+        export_dataset(shapes(), "pointnet_part", tmp_path / "out", table=table)
 
 
 # -- ModelNet texts ------------------------------------------------------------------------------------------------
@@ -133,9 +138,9 @@ def test_a_part_of_two_classes_is_refused(tmp_path):
 def modelnet(root: Path, split: str, catfile: str):
     """pointnet2 modelnet_dataset.py (catfile shape_names.txt), ModelNetDataLoader.py (modelnet40_shape_names.txt)."""
     classes = {name: n for n, name in enumerate(get_data_files(root / catfile))}
-    for shape in get_data_files(root / f"modelnet40_{split}.txt"):
-        name = "_".join(shape.split("_")[0:-1])
-        points = np.loadtxt(root / name / f"{shape}.txt", delimiter=",").astype(np.float32)
+    for shape_id in get_data_files(root / f"modelnet40_{split}.txt"):
+        name = "_".join(shape_id.split("_")[0:-1])
+        points = np.loadtxt(root / name / f"{shape_id}.txt", delimiter=",").astype(np.float32)
         yield points[0:1024, :], classes[name]
 
 
@@ -202,7 +207,7 @@ def test_pointcept_without_a_table_is_all_train_and_says_what_is_missing(tmp_pat
 
 
 def test_pointcept_refusals(tmp_path):
-    with pytest.raises(UnitError, match="metres"):
+    with pytest.raises(ContractError, match="unit: the data are in 'normalized', the model takes 'm'"):
         export_dataset(clouds(50, unit="normalized"), "pointcept", tmp_path / "out")
     with pytest.raises(CaptureError, match="needs weight"):
         export_dataset(clouds(50), "pointcept", tmp_path / "out", segment="weight")
@@ -210,7 +215,7 @@ def test_pointcept_refusals(tmp_path):
         export_dataset(clouds(50), "pointcept", tmp_path / "out", segment="points")
     with pytest.raises(CaptureError, match="int32"):
         export_dataset(clouds(50, labels=torch.full((50,), 2**40)), "pointcept", tmp_path / "out", segment="labels")
-    with pytest.raises(ValueError, match=r"ToFrame\(frame='world'\)"):
+    with pytest.raises(ContractError, match="the data are in 'base', the model works in 'world'; add ToFrame"):
         export_dataset(clouds(50), "pointcept", tmp_path / "out", frame="world")
 
 

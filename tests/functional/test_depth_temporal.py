@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from pcdata.errors import ConfigError, ShapeError
+from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional import TemporalState, temporal_filter
 from pcdata.rng import seeded
 
@@ -103,3 +103,5 @@ def test_bad_parameters_and_foreign_states_are_refused():
         temporal_filter(torch.ones(1, 5, 4), state)
     with pytest.raises(ShapeError, match="TemporalState: history"):
         TemporalState(last=state.last, history=state.history[:, 1:])
+    with pytest.raises(DTypeError, match="state must be what the call before returned"):
+        temporal_filter(values, values)

@@ -68,13 +68,49 @@ def test_on_a_noisy_table_a_good_frame_and_one_that_is_off_by_3_pixels_differ(se
     assert offset.shift == pytest.approx((x, y), abs=1.25)
 
 
-def test_a_side_that_no_rim_shows_makes_the_answer_less_sure_by_the_bias() -> None:
-    """Of the plates only the upper half is near: fat rims look like a shift downwards, and nothing says otherwise."""
-    upper = torch.where(inside(3.0) & (V % 240 < 115), 0.6, 0.9)
-    table = torch.where(V % 240 < 115, 0.0, (V % 240 - 115) / 125.0)  # below, the table rises to meet the plates
-    depth = torch.where(inside(3.0) & (V % 240 >= 115), 0.6, upper - 0.3 * table)
-    one_sided, all_around = measured(depth, plates_color()), measured(plates_depth(3.0), plates_color())
-    assert one_sided.spread[1] > all_around.spread[1] + 0.5
+def shelves_depth(grow: int, *, posts: bool) -> Tensor:
+    """Boards that show their upper rim alone, since below they run back to the wall; posts show both."""
+    board = V % 120
+    depth = torch.where(board < 50 - grow, 0.9, 0.6 + 0.3 * (board - 50.0).clamp_min(0) / 70.0)
+    post = ((U % 160 - 80).abs() <= 25 + grow) & (V > 20) & (V < 460)
+    return torch.where(post, 0.45, depth) if posts else depth
+
+
+def shelves_color(down: int, *, posts: bool) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    light = torch.where(V % 120 < 50, 80.0, 150.0)
+    light = torch.where(((U % 160 - 80).abs() <= 25) & (V > 20) & (V < 460), 220.0, light) if posts else light
+    noise = 5.0 * torch.randn(HEIGHT, WIDTH, 3, generator=generator)
+    return (light[..., None] + noise).clamp(1, 255).byte().roll(down, 0)
+
+
+def test_rims_of_one_side_alone_leave_open_whether_they_are_shifted_or_fat() -> None:
+    """Seen from their upper rims, boards that depth makes 3 pixels fatter are boards whose colour lies lower."""
+    for grow, down in ((3, 0), (0, 3)):
+        offset = measured(shelves_depth(grow, posts=False), shelves_color(down, posts=False))
+        assert offset.problem is not None or offset.least_length < 0.5
+
+
+def test_a_bias_that_other_rims_refute_excuses_no_shift() -> None:
+    """The posts' sides tell how fat objects are, so that the boards' upper rims tell the shift along the other axis."""
+    shifted = measured(shelves_depth(0, posts=True), shelves_color(4, posts=True))
+    assert shifted.problem is None
+    assert shifted.least_length > 3.0
+    assert shifted.shift == pytest.approx((0.0, 4.0), abs=0.5)
+    fat = measured(shelves_depth(2, posts=True), shelves_color(0, posts=True))
+    assert fat.problem is None
+    assert fat.least_length < 1.0
+    assert fat.bias == pytest.approx(-2.0, abs=0.75)
+
+
+def test_a_single_part_of_the_image_is_never_sure_evidence() -> None:
+    """However sharp the rim of one small object, nothing confirms that it tells of the whole image."""
+    near = (U - 360) ** 2 + (V - 280) ** 2 <= 35**2
+    depth = torch.where(near, 0.6, 0.9)
+    colors = torch.where(near.roll(4, 1)[..., None], 190, 90).repeat(1, 1, 3).byte()
+    offset = measured(depth, colors)
+    assert offset.num_edges > 150
+    assert offset.problem is not None
 
 
 def test_too_few_rims_and_colours_that_share_no_edge_give_a_reason_instead_of_a_number() -> None:

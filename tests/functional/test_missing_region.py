@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from pcdata.errors import DTypeError
-from pcdata.functional import largest_missing_region
+from pcdata.functional import largest_missing_block, largest_missing_region
 
 
 @pytest.mark.parametrize("size", [(480, 640), (720, 1280), (100, 90), (7, 5)])
@@ -52,3 +52,32 @@ def test_it_is_the_region_that_scipy_finds(seed: int, share: float) -> None:
 def test_a_depth_image_in_place_of_the_mask_is_refused() -> None:
     with pytest.raises(DTypeError, match="largest_missing_region: valid"):
         largest_missing_region(torch.zeros(4, 4))
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "share"),
+    [
+        (slice(0, 24), slice(None), 0.5),
+        (slice(36, 48), slice(None), 0.25),
+        (slice(None), slice(16, 48), 0.5),
+        (slice(0, 0), slice(None), 0.0),
+        (slice(None), slice(None), 1.0),
+    ],
+)
+def test_whole_lines_without_readings_are_a_block(rows: slice, columns: slice, share: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    valid = torch.rand(48, 64, generator=generator) < 0.9
+    valid[rows, columns] = False
+    assert largest_missing_block(valid) == pytest.approx(share)
+
+
+def test_what_is_left_of_a_cut_background_ends_in_a_tip_and_is_no_block() -> None:
+    v, u = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
+    assert largest_missing_block((u - 32) ** 2 + (v - 30) ** 2 < 15**2) == 0.0
+    assert largest_missing_block(v > 20 + u // 2) == 0.0, "the far edge of a table, seen at an angle"
+
+
+def test_a_block_is_found_beside_what_else_is_missing() -> None:
+    v, u = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
+    disc = (u - 32) ** 2 + (v - 24) ** 2 < 20**2
+    assert largest_missing_block(disc & (u >= 32)) == pytest.approx(0.5)

@@ -88,6 +88,13 @@ def test_inverse_undoes_a_pose():
     torch.testing.assert_close(rigid.invert_rigid(pose) @ pose, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
 
 
+def test_a_pose_that_is_a_rotation_to_four_digits_only_is_inverted_all_the_same():
+    almost = torch.eye(3, dtype=torch.float64) * (1 - 4e-4)
+    pose = rigid.from_rotation_translation(almost, torch.tensor([0.3, 2.0, 1.0]))
+    rigid.check_rigid("a pose that readers accept", pose)
+    torch.testing.assert_close(rigid.invert_rigid(pose) @ pose, torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -108,6 +108,7 @@ def test_a_quaternion_and_a_rotation_vector_say_the_same_rotation(tmp_path: Path
         ("fx: 600.5", "fx: -600.5", r"5:3: camera 'wrist': .*focal lengths must be positive"),
         ("fx: 600.5", "fx: .nan", r"5:55: camera 'wrist': fx must be a finite number, got nan"),
         ("fx: 600.5", "Fx: 600.5", r"no such key 'Fx'; did you mean 'fx'"),
+        ("fx: 600.5", "fx: 1" + "0" * 400, r"fx must be a finite number, got 10000"),
         ("width: 640", "width: 640.5", r"width must be a whole number from 1 to 65536, got 640.5"),
         ("cx: 320", "cx: 900", r"principal point .* outside the 640x480 image"),
         ("[0.1, 0, 0, 0]", "[0.1, 0, 0]", r"distortion must be a list of 4 or 5 or 8 or 12 numbers, got 3"),

@@ -27,10 +27,15 @@ def answers(name: str) -> dict[str, Any]:
 
 
 @cache
-def capture() -> DepthFrame:
+def capture(size: tuple[int, int] = (240, 320)) -> DepthFrame:
     """One view of a table with objects, with colour."""
-    frame = tabletop(3, num_objects=4, num_views=1, size=(240, 320), sample_id="scene").frame
+    frame = tabletop(3, num_objects=4, num_views=1, size=size, sample_id="scene").frame
     return frame
+
+
+def capture_for(name: str) -> DepthFrame:
+    """A capture that the model's preset can work on: windows are cut from whole images."""
+    return capture((480, 640)) if CONTRACTS[name].takes == "depth image" else capture()
 
 
 def made_preset(name: str) -> Preset:
@@ -41,7 +46,7 @@ def made_preset(name: str) -> Preset:
 def sample_of(name: str, seed: int = 0) -> Any:
     """The capture through the preset's pipeline."""
     pipeline = made_preset(name).pipeline
-    return pipeline(capture(), generator=seeded(seed) if pipeline.is_random else None)
+    return pipeline(capture_for(name), generator=seeded(seed) if pipeline.is_random else None)
 
 
 @cache

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from pcdata.models import CONTRACTS, Preset, contract, preset
 from pcdata.models.steps import pipeline_of
 from pcdata.rng import seeded
 from pcdata.structures import NORMALIZED, PointCloud
-from pcdata.synthetic import SyntheticSource
+from pcdata.synthetic import SyntheticSource, tabletop
 from pcdata.transforms import Pipeline, RandomSample
 from tests.models.captures import answers, capture, correct_batch, made_preset, sample_of
 
@@ -92,9 +94,16 @@ def test_the_counts_that_the_code_is_used_with_can_be_chosen():
     assert made.collate([made.pipeline(capture())])["point_cloud"].shape == (1, 1024, 6)
 
 
+def test_a_view_of_nothing_inside_the_box_does_not_stop_a_preset():
+    frame = tabletop(3, num_objects=4, num_views=3, size=(120, 160), sample_id="scene").frame
+    blind = replace(frame, depth=frame.depth * torch.tensor([1.0, 1.0, 4.0])[:, None, None])
+    made = preset("dp3_guide", frame="base", crop=answers("dp3_guide")["crop"])
+    assert made.pipeline(blind).fields()["view"].unique().tolist() == [0, 1]
+
+
 def test_optional_channels_can_be_left_out_but_others_cannot():
     made = preset("pointnet2_cls", frame="base", channels=["xyz"])
-    assert made.collate([made.pipeline(capture())])["points"].shape == (1, 3, 1024)
+    assert made.collate([made.pipeline(capture(), generator=seeded(0))])["points"].shape == (1, 3, 1024)
     assert preset("dp3_sim", frame="base", crop=None, channels=["rgb_255"]).contract.main.width == 6
     with pytest.raises(ConfigError, match="channels are"):
         preset("dp3_sim", frame="base", crop=None, channels=["xyz", "heat"])
@@ -133,7 +142,8 @@ def test_m2t2_centres_by_the_full_cloud_and_keeps_points_where_they_are():
 def test_rise_cuts_cells_towards_zero():
     batch = correct_batch("rise")
     xyz = batch["input_feats_list"][:, :3].numpy()
-    assert np.array_equal(batch["input_coords_list"][:, 1:].numpy(), np.trunc(xyz / np.float32(0.005)).astype(np.int32))
+    # realworld.py joins float32 points and float64 colours, so it divides in float64.
+    assert np.array_equal(batch["input_coords_list"][:, 1:].numpy(), (xyz.astype(np.float64) / 0.005).astype(np.int32))
     assert batch["input_coords_list"][:, 0].tolist() == [b for b, n in enumerate(batch.counts) for _ in range(n)]
 
 
@@ -181,10 +191,80 @@ def test_unit_sphere_before_and_after_sampling_are_different_orders():
 
 def test_depth_images_with_holes_are_refused():
     made = preset("ggcnn")
-    frame = made.pipeline(capture())
+    frame = sample_of("ggcnn")
     frame.depth[0, :5] = 0
     with pytest.raises(NoReadingError, match="holes"):
         made.collate([frame])
+
+
+def test_ggcnn_gets_a_window_pixel_for_pixel_filled_before_the_mean():
+    """ggcnn_torch.py: process_depth_image and predict, with the pixels' own size."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+    frame = tabletop(3, num_objects=4, size=(480, 640), noise="stereo").frame
+    window = frame.depth[0, 90:390, 170:470].numpy()
+    assert (window == 0).any()
+    padded = cv2.copyMakeBorder(window, 1, 1, 1, 1, cv2.BORDER_DEFAULT)
+    scale = padded.max()
+    filled = cv2.inpaint(padded / scale, (padded == 0).astype(np.uint8), 1, cv2.INPAINT_NS)[1:-1, 1:-1] * scale
+    wanted = np.clip(filled - filled.mean(), -1, 1)
+    made = preset("ggcnn")
+    assert np.allclose(made.collate([made.pipeline(frame)])["x"][0, 0].numpy(), wanted, atol=1e-6)
+
+
+def test_a_larger_window_is_resized_and_a_smaller_camera_may_choose_one():
+    steps = [type(step).__name__ for step in preset("ggcnn").pipeline.steps]
+    assert steps == ["CropCenter", "InpaintDepth"]
+    made = preset("ggcnn", window=200)
+    assert made.collate([made.pipeline(capture())])["x"].shape == (1, 1, 300, 300)
+    assert Preset.from_yaml(made.to_yaml()).contract == made.contract
+    for window in (0, 2.5, True, (3, 3)):
+        with pytest.raises(ConfigError, match="window must be edge length in pixels"):
+            preset("ggcnn", window=window)
+    with pytest.raises(ConfigError, match="no choice 'window'"):
+        preset("fcgqcnn", window=300)
+
+
+def test_classifiers_draw_at_random_as_the_first_rows_of_stored_samples_and_offer_farthest_points():
+    random = preset("pointnet2_cls", frame="base", channels=["xyz"])
+    assert random.pipeline.is_random
+    spread = preset("pointnet2_cls", frame="base", channels=["xyz"], sampler="farthest point")
+    assert not spread.pipeline.is_random
+
+    def gap(made: Preset) -> float:
+        points = made.pipeline(capture(), generator=seeded(0) if made.pipeline.is_random else None).points
+        return float(torch.cdist(points, points).fill_diagonal_(9).amin(dim=1).median())
+
+    assert gap(spread) > 1.5 * gap(random)
+    with pytest.raises(ConfigError, match="sampler must be one of"):
+        preset("pointnet2_cls", frame="base", sampler="voxels")
+    with pytest.raises(ConfigError, match="no choice 'sampler'"):
+        preset("gsnet", sampler="farthest point")
+
+
+def test_rise_does_not_see_beyond_three_metres():
+    """Open3D's create_from_color_and_depth drops them, and its voxels are counted from what is left."""
+    frame = capture()
+    wall = frame.depth.clone()
+    wall[0, :40] = 3.5
+    gone = torch.where(wall > 3.0, 0.0, wall)
+    made = preset("rise")
+    near, far = (made.collate([made.pipeline(replace(frame, depth=depth))]) for depth in (gone, wall))
+    assert all(torch.equal(near[key], far[key]) for key in near)
+
+
+def test_peract_leaves_points_outside_its_box_out():
+    made = made_preset("peract")
+    cloud = sample_of("peract")
+    outside = replace(cloud, points=cloud.points + torch.tensor([0.3, 0.0, 0.0]))
+    grid = made.collate([outside])["voxel_grid"][0]
+    lower, upper = torch.tensor(answers("peract")["crop"])
+    edge = (upper - lower) / 100
+    cell = ((outside.points - (lower - edge)) / edge).floor().long() - 1  # VoxelGrid: a border of one cell, cut off
+    inside = ((cell >= 0) & (cell < 100)).all(dim=1)
+    assert 0 < int(inside.sum()) < cloud.num_points
+    x, y, z = torch.unique(cell[inside], dim=0).unbind(dim=1)
+    assert bool((grid[9, x, y, z] == 1).all())
+    assert int(grid[9].sum()) == len(x)
 
 
 def test_collate_refuses_clouds_of_another_frame_or_count():
@@ -200,7 +280,7 @@ def test_collate_refuses_clouds_of_another_frame_or_count():
 
 @pytest.mark.parametrize("name", ["graspnet_baseline", "ggcnn"])
 def test_presets_feed_a_data_loader(name):
-    source = SyntheticSource(num_scenes=2, size=(240, 320), num_objects=2)
+    source = SyntheticSource(num_scenes=2, size=(480, 640), num_objects=2)
     made = preset(name)
     (batch,) = DataLoader(made.dataset(source), batch_size=2, collate_fn=made.collate)
     assert len(batch[made.contract.main.key]) == 2

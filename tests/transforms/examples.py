@@ -57,6 +57,7 @@ EXAMPLES: dict[str, list[Example]] = {
             displacement=0.004 * math.sqrt(3),
         ),
     ],
+    "CropCenter": _of(T.CropCenter(size=(5, 7)), make=frame_with_counts),
     "CropWorkspace": _of(
         T.CropWorkspace(frame="base", **BOX),
         T.CropWorkspace(frame="base", frame_from_box=QUARTER_TURN, lower=(0.1, 0.0, -0.5), upper=(0.5, 0.3, 0.5)),
@@ -85,6 +86,7 @@ EXAMPLES: dict[str, list[Example]] = {
         ),
         make=tabletop_with_counts,
     ),
+    "InpaintDepth": _of(T.InpaintDepth(), T.InpaintDepth(max_distance=1), make=frame_with_counts),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "MarkUnreliableDepth": _of(
         T.MarkUnreliableDepth(sensor="realsense_d435"),

@@ -1,4 +1,4 @@
-"""DecimateDepth and ResizeDepth: geometry stays, every image follows."""
+"""CropCenter, DecimateDepth and ResizeDepth: geometry stays, every image follows."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional import rigid
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
-from pcdata.transforms import DecimateDepth, Deproject, ResizeDepth
+from pcdata.transforms import CropCenter, DecimateDepth, Deproject, ResizeDepth
 from tests.factories import frame_with_counts
 
 STEPS = [
@@ -21,6 +21,7 @@ STEPS = [
     DecimateDepth(factor=7),
     ResizeDepth(size=(45, 67), max_jump=None),
     ResizeDepth(size=(200, 180)),
+    CropCenter(size=(101, 120)),
 ]
 each_step = pytest.mark.parametrize("step", STEPS, ids=str)
 
@@ -118,3 +119,26 @@ def test_sizes_are_checked_when_the_step_is_made():
             DecimateDepth(factor=wrong)
     with pytest.raises(ConfigError, match=r"ResizeDepth\.size"):
         ResizeDepth(size=(0, 5))
+
+
+def test_the_window_in_the_middle_keeps_every_pixel_and_its_ray(scene):
+    frame = CropCenter(size=(101, 120))(scene.frame)
+    top, left = 9, 20  # of the 19 rows and 40 columns to spare the smaller half
+    for name in ("depth", "colors", "labels"):
+        assert torch.equal(getattr(frame, name), getattr(scene.frame, name)[:, top : top + 101, left : left + 120])
+    whole = Deproject()(scene.frame)
+    row, column = whole.source_index % (120 * 160) // 160, whole.source_index % 160
+    inside = (row >= top) & (row < top + 101) & (column >= left) & (column < left + 120)
+    assert torch.allclose(Deproject()(frame).points, whole.points[inside], atol=1e-6)
+
+
+def test_a_window_larger_than_the_image_is_refused(scene):
+    with pytest.raises(ShapeError, match=r"300 x 300 .* does not fit into images of 120 x 160"):
+        CropCenter(size=(300, 300))(scene.frame)
+
+
+def test_images_of_the_wanted_size_are_not_copied(scene):
+    frame = ResizeDepth(size=scene.frame.size)(scene.frame)
+    for name in ("depth", "colors", "labels"):
+        assert getattr(frame, name).data_ptr() == getattr(scene.frame, name).data_ptr()
+    assert torch.equal(frame.camera.intrinsics, scene.frame.camera.intrinsics)

@@ -88,6 +88,17 @@ def test_a_missing_half_fails_and_is_located(rows: slice, columns: slice, place:
     assert any(place in check.found for check in validate_frame(half) if check.name == "missing_region")
 
 
+def test_a_background_that_was_cut_away_warns_and_says_that_this_may_be_right() -> None:
+    frame = scene(num_views=1).frame
+    v, u = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    cut = replace(frame, depth=frame.depth * ((u - WIDTH / 2).abs() + (v - HEIGHT / 2).abs() < 0.35 * WIDTH))
+    check = next(one for one in validate_frame(cut) if one.name == "missing_region")
+    assert check.value is not None
+    assert check.value > Limits().missing_region[1]
+    assert check.verdict is Verdict.WARN
+    assert "cut away on purpose" in check.advice
+
+
 @pytest.mark.parametrize("size", [(120, 160), (480, 640)])
 def test_coverage_scales_with_resolution(size: tuple[int, int]) -> None:
     """100,000 of 307,200 readings, scattered, are the least that does not fail, at any resolution."""
@@ -122,7 +133,7 @@ def test_without_colour_or_poses_their_checks_are_left_out() -> None:
     assert not {"color_registration", "pose", "pose_direction"} & {check.name for check in validate_frame(bare)}
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.75, 1.25, 1.5])
+@pytest.mark.parametrize("scale", [0.5, 0.75, 0.8, 1.25, 1.5])
 def test_intrinsics_of_another_resolution_fail_and_its_size_is_told(scale: float) -> None:
     frame = scene(num_views=1).frame
     other = frame.camera.resized((round(HEIGHT * scale), round(WIDTH * scale)))

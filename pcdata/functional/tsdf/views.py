@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pcdata.functional import rigid
 from pcdata.functional.lens import fold_radius
 
 Weighting = Literal["constant", "inverse_square", "angle"]
@@ -32,11 +33,7 @@ class FusionView:
     @property
     def camera_from_world(self) -> Tensor:
         """The pose the other way, (4, 4) float64."""
-        rotation = self.world_from_camera[:3, :3]
-        inverse = self.world_from_camera.clone()
-        inverse[:3, :3] = rotation.T
-        inverse[:3, 3] = -(rotation.T @ self.world_from_camera[:3, 3])
-        return inverse
+        return rigid.invert_rigid(self.world_from_camera)
 
     @property
     def fold(self) -> float:

@@ -34,6 +34,13 @@ GRASPNET_BASELINE = ModelContract(
         "The rotation augmentation is about x, whatever its comment says, and x is mirrored with probability 0.5.",
     ),
     wrong_frame=_UPSIDE_DOWN,
+    checked=(
+        "graspnet/graspnet-baseline 086033d dataset/graspnet_dataset.py, f4c705e demo.py, 95b3ae2 utils/data_utils.py: "
+        "metres in the camera frame, without replacement, short clouds filled up with duplicates, no centring. The "
+        "exported frame folders and scene trees ran through both; of a real frame the cloud is equal point for point "
+        "to "
+        "that of the original folder. The network needs CUDA extensions: not run.",
+    ),
 )
 
 GSNET = ModelContract(
@@ -52,11 +59,16 @@ GSNET = ModelContract(
     traps=(
         _TABLE,
         _METRIC,
-        "coors are xyz / 0.005 as floats: MinkowskiEngine's collate quantises them, per batch.",
+        "coors are xyz / 0.005 as floats. The network takes them after its minkowski_collate_fn, which floors them, "
+        "joins the clouds and drops doubled cells (quantize2original leads back): pass it coors[b] and feats[b].",
         "Colour is never used: the features are ones.",
     ),
     guide='The "15,000 points of AnyGrasp" in guides are GSNet\'s.',
     wrong_frame=_UPSIDE_DOWN,
+    checked=(
+        "rhett-chen/graspness_implementation 0be0ac7 dataset/graspnet_dataset.py: keys, order, sampling and padding; "
+        "coors = float32 xyz / 0.005, feats = ones. The network needs MinkowskiEngine: not run.",
+    ),
 )
 
 ANYGRASP = ModelContract(
@@ -75,6 +87,11 @@ ANYGRASP = ModelContract(
         "get_grasp takes one cloud: use batches of one. Newer versions take no colours.",
     ),
     wrong_frame=_UPSIDE_DOWN,
+    checked=(
+        "graspnet/anygrasp_sdk 00dfc57 grasp_detection/demo.py: 0 < z < 1 m, float32 points in metres and colours in "
+        "[0, 1] "
+        "of all of them. The library is closed: not run.",
+    ),
 )
 
 CONTACT_GRASPNET = ModelContract(
@@ -100,6 +117,11 @@ CONTACT_GRASPNET = ModelContract(
         "z is cropped to 0.2-1.8 m only on the depth path; a cloud given as such is not cropped.",
     ),
     wrong_frame=_UPSIDE_DOWN,
+    checked=(
+        "NVlabs/contact_graspnet f28013a contact_graspnet/data.py: 20,000 drawn, x and y negated, then the mean of "
+        "what was "
+        "drawn; the same order and signs. The network is TensorFlow's: not run.",
+    ),
 )
 
 CONTACT_GRASPNET_API = ModelContract(
@@ -114,6 +136,12 @@ CONTACT_GRASPNET_API = ModelContract(
         "The stock command line needs depth and K in its npz; with xyz alone it stops with an UnboundLocalError.",
     ),
     wrong_frame=_UPSIDE_DOWN,
+    checked=(
+        "NVlabs/contact_graspnet f28013a contact_graspnet/data.py, a2d898b contact_grasp_estimator.py: the exported "
+        "npz ran "
+        "through load_available_input_data, extract_point_clouds and extract_3d_cam_boxes; the cloud is equal to the "
+        "preset's to within 1e-5 m.",
+    ),
 )
 
 M2T2 = ModelContract(
@@ -135,9 +163,16 @@ M2T2 = ModelContract(
         "The mean is that of the full cloud, before sampling; points stays uncentred.",
         "The sampler repeats whole permutations of a short cloud.",
         "The colours are part of inputs but unused: use_rgb is off.",
-        "A held object is 1024 more points in the end effector's frame; this preset makes the scene.",
+        "A held object is 1024 more points in the end effector's frame; this preset makes the scene. Without one the "
+        "loader feeds random object_inputs, an identity ee_pose and zeros.",
+        "Where scene_bounds are given, its demo sets the height of points within 2 cm of z = 0 to 0.",
     ),
     wrong_frame="Placements are searched for on horizontal surfaces: in the camera frame the table is a ramp.",
+    checked=(
+        "NVlabs/M2T2 734a525 m2t2/dataset.py, dataset_utils.py, config.yaml: xyz minus the mean of the full cloud, "
+        "ImageNet "
+        "colours, 16,384 rows by whole permutations. The network needs CUDA extensions: not run.",
+    ),
 )
 
 GRASPGEN = ModelContract(
@@ -153,15 +188,24 @@ GRASPGEN = ModelContract(
     sampler="random with replacement",
     pad="repeat",
     centring="mean",
+    normalise="before sampling",
     table="removed",
     max_duplicates=0.7,
     traps=(
         "One segmented object, not a scene: cut the object out first.",
         "The mean is subtracted in metres; the network scales by its own factor: do not normalise to the unit sphere.",
         "Its depth helper rounds fx, fy, cx, cy to whole pixels: deproject elsewhere.",
+        "At inference nothing is sampled: points whose mean L1 distance to 20 neighbours is 14 mm or more are dropped, "
+        "and the rest is fed whole.",
     ),
     wrong_frame="The object's pose is free, so the grasps are as good; but they come back in the frame that went in, "
     "and a robot that takes them for base coordinates reaches beside the object.",
+    checked=(
+        "NVlabs/GraspGen 14d42f2 grasp_gen/dataset/dataset.py: the mean of the whole object is subtracted, then rows "
+        "are "
+        "drawn by torch.randint, with replacement; 62b9010 grasp_gen/utils/point_cloud_utils.py. The network was not "
+        "run.",
+    ),
 )
 
 TABLE = (GRASPNET_BASELINE, GSNET, ANYGRASP, CONTACT_GRASPNET, CONTACT_GRASPNET_API, M2T2, GRASPGEN)

@@ -19,16 +19,30 @@ GGCNN = ModelContract(
     "dougsm/mvp_grasp c301ba2: ggcnn/src/ggcnn/ggcnn_torch.py:20-69",
     takes="depth image",
     tensors=(InputTensor("x", "B C H W", (_RELATIVE,), content="depth_image"),),
+    window=(300, 300),
+    holes="inpainted",
     image_size=(300, 300),
     traps=(
         _NO_CLOUD,
-        "Holes are filled before anything else, here with the nearest reading, by the authors with OpenCV's "
-        "Navier-Stokes inpainting: a 0 left in would drag the mean and be clipped to the closest surface.",
+        "The window is cut from the image pixel for pixel, never squeezed: a pixel's angle is part of what the network "
+        "has learnt. window=N takes another square and resizes it; its code blends depth across edges then, this does "
+        "not.",
+        "Holes are inpainted before the mean is taken: a 0 left in would drag it and be clipped to the closest "
+        "surface. The training loader fills nothing in: its files must be whole.",
         "In millimetres the clip to [-1, 1] turns the image into two values.",
         'Cornell\'s "depth" is the distance along the ray, not z.',
         "The predicted width is in pixels, divided by 150.",
     ),
     wrong_frame=_FRAME,
+    checked=(
+        "dougsm/mvp_grasp 75b1562 ggcnn/src/ggcnn/ggcnn_torch.py: window, inpainting (border of one reflected pixel, "
+        "scaled by the largest depth, radius 1, Navier-Stokes), mean, clip: the preset's tensor is equal to within "
+        "1e-6 m on a noisy synthetic capture.",
+        "dougsm/ggcnn f10fc95 utils/data/cornell_data.py, grasp_data.py, utils/dataset_processing/image.py, a748338 "
+        "grasp.py: the exported images and rectangles ran through the Cornell loader, rotated and zoomed, with and "
+        "without colour.",
+        "dougsm/ggcnn e0b21ab models/ggcnn.py: the forward pass takes the preset's batch as it is.",
+    ),
 )
 
 GRCONVNET = ModelContract(
@@ -38,31 +52,52 @@ GRCONVNET = ModelContract(
     "utils/dataset_processing/image.py:53-56,205-209",
     takes="depth image",
     tensors=(InputTensor("x", "B C H W", (_RELATIVE, _RGB), content="depth_image"),),
+    window=(224, 224),
+    holes="inpainted",
     image_size=(224, 224),
     traps=(
         _NO_CLOUD,
+        "The window is cut from the image pixel for pixel: around the grasps in training, from the middle live.",
         "Depth comes first, then red, green, blue, each divided by 255 and less the image's mean.",
         "Its live camera code normalises depth by the colours' rule (/ 255 - mean), unlike its training code; the "
         "preset follows the training code.",
     ),
     wrong_frame=_FRAME,
+    checked=(
+        "skumra/robotic-grasping ba13afd utils/data/camera_data.py, 84db2fe utils/data/cornell_data.py, "
+        "utils/dataset_processing/image.py: a window of 224 without resizing; depth minus its mean, clipped; colours "
+        "/ 255 minus one mean; depth first.",
+        "skumra/robotic-grasping 050af02 inference/models/grconvnet3.py: the forward pass takes the preset's batch as "
+        "it is.",
+    ),
 )
 
 FCGQCNN = ModelContract(
     name="fcgqcnn",
     title="FC-GQ-CNN",
-    source="BerkeleyAutomation/gqcnn 499a609: cfg/*.yaml (sizes and bins; the tensor's layout was not verified in "
-    "code)",
+    source="BerkeleyAutomation/gqcnn 499a609: cfg/*.yaml; dd6f949: examples/policy.py; 04678ed: "
+    "gqcnn/grasping/policy/fc_policy.py",
     takes="depth image",
     tensors=(InputTensor("im", "B H W C", (_METRES,), content="depth_image"),),
     image_size=(480, 640),
     guide='Guides name an "FC-GraspNet"; no such repository was found. FC-GQ-CNN is the nearest real network.',
     traps=(
         _NO_CLOUD,
-        "The network subtracts each of 16 depth bins by itself (im_depth_sub): give metres.",
+        "The policy makes 16 copies of the image, one per depth bin, and the network subtracts each bin's depth and "
+        "normalises by its training set's mean and deviation: give one image in metres.",
+        "Any size runs: examples/policy.py sets the network's size to the image's. 480 x 640 is what the "
+        "configurations and the weights' pixel angles are made for.",
+        "It fills holes by averaging their neighbours again and again at half the size (DepthImage.inpaint of the "
+        "perception package); the preset copies the nearest reading.",
+        "The policy wants a mask of the objects too, which is not part of this tensor.",
         "The camera looks straight down in its training data.",
     ),
     wrong_frame=_FRAME,
+    checked=(
+        "BerkeleyAutomation/gqcnn 04678ed gqcnn/grasping/policy/fc_policy.py: depth (H, W, 1) in metres, tiled to "
+        "(16, H, W, 1); 499a609 gqcnn/model/tf/network_tf.py: no normalisation outside the network in the mode that "
+        "subtracts depth. The network is TensorFlow's: not run.",
+    ),
 )
 
 TABLE = (GGCNN, GRCONVNET, FCGQCNN)

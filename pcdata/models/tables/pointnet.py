@@ -17,10 +17,11 @@ _TURNED = (
     "A cloud in the camera frame lies tilted and off to one side: the yaw augmentation then turns it about an axis "
     "that is not its own, and weights trained on upright objects see objects lying down."
 )
-_UNIT_SPHERE_TRAP = (
-    "The stored clouds are uniform samples of a surface, so their first N rows are a fair sample; the first N rows of "
-    "a depth image are its top edge. The preset takes farthest points instead."
+_FIRST_ROWS_TRAP = (
+    "The loaders take the first N rows of stored clouds, which are random samples of a surface: a random draw. The "
+    "first N rows of a depth image would be its top edge, so the preset draws them at random."
 )
+_UNIFORM = 'Farthest points (sampler="farthest point") are its option --use_uniform_sample, off by default.'
 
 POINTNET_CLS = ModelContract(
     name="pointnet_cls",
@@ -31,7 +32,8 @@ POINTNET_CLS = ModelContract(
     axes="the object's own; y up for weights trained on ModelNet",
     count=1024,
     counts=(256, 512, 2048),
-    sampler="farthest point",
+    sampler="random",
+    samplers=("farthest point",),
     pad="error",
     centring="mean",
     scaling="unit sphere",
@@ -40,10 +42,18 @@ POINTNET_CLS = ModelContract(
     guide=_GUIDE,
     traps=(
         "The HDF5 loader does not normalise: the file must be.",
-        _UNIT_SPHERE_TRAP,
+        _FIRST_ROWS_TRAP,
+        'Farthest points (sampler="farthest point") are an option of the PyTorch port, off by default.',
         "Yaw is drawn about y: turn z-up clouds, or change the axis.",
     ),
     wrong_frame=_TURNED,
+    checked=(
+        "charlesq34/pointnet 0237262 train.py, 5819bbe provider.py: current_data[:, 0:NUM_POINT] of the file's rows, "
+        "no normalisation, (B, N, 3). The exported HDF5 files ran through this code (slice, shuffle, rotation, "
+        "jitter, batches).",
+        "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 models/pointnet_cls.py, d65f07f pointnet_utils.py: the forward pass "
+        "takes the preset's batch, transposed to (B, 3, N) as its script does.",
+    ),
 )
 
 POINTNET2_CLS = replace(
@@ -57,8 +67,17 @@ POINTNET2_CLS = replace(
     traps=(
         "The port's networks take (B, C, N); the loader gives (B, N, C) and the training script transposes.",
         "Ball radii 0.2 and 0.4 assume the unit sphere.",
-        _UNIT_SPHERE_TRAP,
+        _FIRST_ROWS_TRAP,
+        _UNIFORM,
         "Random dropout overwrites dropped points with the first one: duplicates are part of its augmentation.",
+    ),
+    checked=(
+        "yanx27/Pointnet_Pointnet2_pytorch 8e26b85 data_utils/ModelNetDataLoader.py: point_set[0:npoints], then mean "
+        "and largest norm; farthest points only with use_uniform_sample. The exported texts ran through this loader, "
+        "with and without normals, cached and not.",
+        "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 models/pointnet2_cls_ssg.py, a9ef8ae pointnet2_utils.py: the "
+        "forward "
+        "pass takes the preset's batch as it is, with normals and without.",
     ),
 )
 
@@ -68,7 +87,12 @@ POINTNET2_CLS_TF = replace(
     title="PointNet++, classification (TensorFlow)",
     source="charlesq34/pointnet2 4292663: modelnet_dataset.py:15-21,84-86,120-124; models/*.py:12-16",
     tensors=(InputTensor("pointclouds_pl", "B N C", (XYZ, replace(NORMALS, optional=True))),),
-    traps=("A short cloud crashes in the copy into the fixed batch buffer.", _UNIT_SPHERE_TRAP),
+    samplers=(),
+    traps=("A short cloud crashes in the copy into the fixed batch buffer.", _FIRST_ROWS_TRAP),
+    checked=(
+        "charlesq34/pointnet2 8b1046c modelnet_dataset.py: the first npoints rows, then mean and largest norm, "
+        "(B, N, 3) or (B, N, 6). The exported texts ran through this loader. The network is TensorFlow's: not run.",
+    ),
 )
 
 POINTNET_PART = replace(
@@ -81,11 +105,23 @@ POINTNET_PART = replace(
         InputTensor("input_label_ph", "B C", (_CATEGORY,), content="category"),
     ),
     count=2048,
-    counts=(1024,),
-    sampler="random with replacement",
-    pad="repeat",
+    counts=(256, 512, 1024),
+    sampler="random",
+    samplers=(),
+    pad="tile",
     normalise="before sampling",
     choices=("category",),
+    traps=(
+        "The training script feeds the 2048 stored points of a shape as they are; its test script normalises the whole "
+        "shape, then repeats it in order up to 3000 points.",
+        "The category is an input: it must be known before the parts.",
+        "The HDF5 loader does not normalise: the file must be.",
+    ),
+    checked=(
+        "charlesq34/pointnet 0237262 part_seg/train.py, part_seg/test.py: (B, 2048, 3) and a (B, 16) one-hot; "
+        "normalised, then filled up. The exported HDF5 files, lists and names ran through this code. The network is "
+        "TensorFlow's: not run.",
+    ),
 )
 
 POINTNET2_PART = replace(
@@ -98,10 +134,19 @@ POINTNET2_PART = replace(
         InputTensor("cls_label", "B 1 C", (_CATEGORY,), content="category"),
     ),
     counts=(2500,),
+    sampler="random with replacement",
+    pad="repeat",
     traps=(
         "Normalised on the full cloud first, then drawn with replacement even where there are enough points: about a "
         "third of the rows come twice.",
         "The category is an input: it must be known before the parts.",
+    ),
+    checked=(
+        "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 data_utils/ShapeNetDataLoader.py: mean and largest norm of the "
+        "whole "
+        "shape, then a draw with replacement.",
+        "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 models/pointnet2_part_seg_ssg.py: the forward pass takes points and "
+        "cls_label as they are, with normals and without.",
     ),
 )
 
@@ -113,18 +158,24 @@ POINTNET_SEMSEG = ModelContract(
     frame="",
     axes="z up; the scene's lowest corner is the origin",
     count=4096,
-    sampler="random",
+    sampler="random with replacement",
     pad="repeat",
     centring="corner",
     normalise="before sampling",
     column=1.0,
-    max_duplicates=0.75,  # 1,025 points in a column are enough for its code
+    max_duplicates=0.8,  # a hundred points in a column are enough for its code
     guide=_GUIDE,
     traps=(
         "z is not centred: it says how high above the floor a point is.",
-        "The original sampler draws until a column of 1 m has more than 1024 points, and so hangs for ever on a small "
-        "or thin scene; the preset gives up after 100 draws and says so.",
+        "Its columns of 1 m stand on a fixed grid, 0.5 m apart, and those with fewer than 100 points are left out; the "
+        "preset draws columns around random points, as the PyTorch port does.",
+        "Of a column with more than 4096 points it draws with replacement; of a smaller one it "
+        "keeps all and adds duplicates, where the preset draws anew.",
         "Colours are stored 0-255 and divided by 255 in the loader.",
+    ),
+    checked=(
+        "charlesq34/pointnet 149ff90 sem_seg/indoor3d_util.py: nine channels in this order, x and y from the column's "
+        "middle, z as it is, rgb / 255, xyz over the room's largest. The network is TensorFlow's: not run.",
     ),
     wrong_frame="With z along the camera's view a column of 1 m x 1 m becomes a tunnel away from the camera, and the "
     "height above the floor, the strongest cue for floor and table, becomes a distance.",
@@ -137,6 +188,22 @@ POINTNET2_SEMSEG = replace(
     source="yanx27/Pointnet_Pointnet2_pytorch eb64fe0: data_utils/S3DISDataLoader.py:54-76, indoor3d_util.py:59-60; "
     "models/pointnet2_sem_seg.py:9-12; train_semseg.py:184",
     tensors=(InputTensor("points", "B C N", (_BLOCK, _UNIT_RGB, _ROOM)),),
+    sampler="random",
+    max_duplicates=0.75,  # 1,025 points in a column are enough for its code
+    traps=(
+        "z is not centred: it says how high above the floor a point is.",
+        "Its sampler draws until a column of 1 m has more than 1024 points, and so hangs for ever on a small or thin "
+        "scene; the preset gives up after 100 draws and says so.",
+        "A column with fewer than 4096 points is drawn with replacement as a whole; the preset keeps every point and "
+        "adds duplicates.",
+        "Colours are stored 0-255 and divided by 255 in the loader.",
+    ),
+    checked=(
+        "yanx27/Pointnet_Pointnet2_pytorch 88790dd data_utils/S3DISDataLoader.py: columns around a random point, the "
+        "nine channels in this order.",
+        "yanx27/Pointnet_Pointnet2_pytorch a71e7d9 models/pointnet2_sem_seg.py: the forward pass takes the preset's "
+        "batch as it is.",
+    ),
 )
 
 POINTNET2_POLICY_GUIDE = ModelContract(

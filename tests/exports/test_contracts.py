@@ -1,0 +1,123 @@
+"""An export refuses what ``check`` refuses for its model, rule by rule, but for what the loader itself makes true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pcdata.errors import ContractError, TooFewPointsError
+from pcdata.exports import TARGETS, export_dataset
+from pcdata.models import CONTRACTS, check
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.synthetic import tabletop
+from pcdata.transforms import Deproject
+from pcdata.validation import Verdict
+from tests.exports.samples import Samples, cloud, shape
+
+CLOUDS: dict[str, PointCloud] = {
+    "dp3": cloud(512),
+    "pointnet": shape(),
+    "pointnet_part": shape(),
+    "modelnet": shape(1024),
+    "pointcept": cloud(500),
+}
+CHOICES: dict[str, dict[str, Any]] = {
+    "dp3": {"frame": "base", "crop": None, "channels": ["xyz", "rgb_255"]},
+    "pointnet": {"num_points": 2048},
+    "pointnet_part": {"num_points": 2048, "category": 0},
+    "modelnet": {},
+    "pointcept": {"channels": ["xyz", "cells", "rgb", "normals"]},
+}
+BROKEN = {
+    "nothing": lambda one: one,
+    "unit": lambda one: replace(one, unit="m" if one.unit == "normalized" else "normalized"),
+    "millimetres": lambda one: replace(one, points=1000 * one.points),
+    "centred elsewhere": lambda one: replace(one, points=one.points + torch.tensor([0.4, 0.8, -0.3])),
+    "centred": lambda one: replace(one, points=one.points - one.points.double().mean(dim=0).float()),
+    "one point fewer": lambda one: one.select(torch.arange(one.num_points - 1), torch.tensor([0, one.num_points - 1])),
+    "NaN": lambda one: replace(one, points=one.points.index_fill(0, torch.tensor([7]), torch.nan)),
+    "repeated": lambda one: replace(one, points=one.points[torch.arange(one.num_points) % 40]),
+    "normals of length 2": lambda one: replace(one, normals=2 * one.normals),
+}
+
+
+def export(target: str, sample: Any, folder: Any) -> None:
+    """Export one sample with the least of options."""
+    options: dict[str, Any] = {}
+    if target == "dp3":
+        robot = {"samples": np.array(["a"]), "state": np.zeros((1, 2)), "action": np.zeros((1, 2))}
+        options = {"episodes": {"e": robot}}
+    if target in ("pointnet", "pointnet_part", "modelnet"):
+        options = {"table": {"a": {"class": "mug", "split": "train"}}}
+    if target == "modelnet":
+        options |= {"num_points": min(sample.num_points, 1024)}
+    if target in ("graspnet", "graspnet_scene", "ggcnn"):
+        options = {"any_size": True}
+    if target == "graspnet_scene":
+        options |= {"frames_per_scene": 1, "label_offset": 1, "round_depth": True}
+    if target == "graspnet":
+        options |= {"label_offset": 1, "round_depth": True}
+    if target == "contact_graspnet":
+        options = {"label_offset": 1}
+    export_dataset(Samples({"a": sample}), target, folder, **options)
+
+
+def failed(sample: Any, model: str, **choices: Any) -> set[str]:
+    """The rules of the model that the sample fails."""
+    summary = check(sample, model, **choices)
+    return {rule for (rule, _), entry in summary.checks.items() if entry.counts[Verdict.FAIL]}
+
+
+def test_every_target_names_a_contract():
+    assert all(target.model in CONTRACTS for target in TARGETS.values())
+    assert set(CLOUDS) == {name for name, target in TARGETS.items() if target.takes == "clouds"}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+@pytest.mark.parametrize("target", CLOUDS)
+def test_a_cloud_is_refused_for_the_rules_that_check_fails_and_for_no_other(tmp_path, target, broken):
+    sample = BROKEN[broken](CLOUDS[target])
+    rules = failed(sample, TARGETS[target].model, **CHOICES[target]) - TARGETS[target].left_to_loader
+    if not rules:
+        export(target, sample, tmp_path / "out")
+        return
+    with pytest.raises(ContractError) as caught:
+        export(target, sample, tmp_path / "out")
+    lines = str(caught.value).splitlines()[1:]
+    assert {line.split(":")[0] for line in lines} == rules
+    assert f"{target}: sample 'a'" in str(caught.value)
+
+
+def test_every_violation_is_refused_by_some_target():
+    for broken, change in BROKEN.items():
+        rules = [
+            failed(change(CLOUDS[name]), TARGETS[name].model, **CHOICES[name]) - TARGETS[name].left_to_loader
+            for name in CLOUDS
+        ]
+        assert any(rules) == (broken != "nothing")
+
+
+def capture(**changes: Any) -> DepthFrame:
+    return replace(tabletop(1, num_objects=2, size=(120, 160)).frame, **changes)
+
+
+@pytest.mark.parametrize("target", ["graspnet", "graspnet_scene", "contact_graspnet"])
+def test_depth_is_refused_for_the_rules_that_its_cloud_fails(tmp_path, target):
+    export(target, capture(), tmp_path / "good")
+    sample = capture(depth=40 * capture().depth)
+    rules = failed(Deproject()(sample), TARGETS[target].model) - TARGETS[target].left_to_loader
+    assert rules == {"scale"}
+    with pytest.raises(ContractError, match="scale: "):
+        export(target, sample, tmp_path / "bad")
+    with pytest.raises(TooFewPointsError, match="no points"):
+        export(target, capture(depth=torch.zeros_like(sample.depth)), tmp_path / "empty")
+
+
+def test_an_image_in_millimetres_is_refused_for_ggcnn(tmp_path):
+    export("ggcnn", capture(), tmp_path / "good")
+    with pytest.raises(ContractError, match=r"scale: .*clipped"):
+        export("ggcnn", capture(depth=1000 * capture().depth), tmp_path / "bad")
