@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,31 +18,41 @@ from pcdata.functional.tsdf.views import FusionView
 from pcdata.kernels.native import call
 
 _MARK_BYTES = 192  # per block: a bit per edge
+_FEWEST_SLOTS = 1 << 12  # of a table of rows
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
 def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     """Collect keys in one hash table per thread; sorted, they do not depend on the threads."""
     height, width = view.depth.shape
-    offsets = torch.tensor(grid.band, dtype=torch.float64)
+    offsets = integrate.band(grid)
     found = torch.empty(height * width * len(offsets), dtype=torch.int64)  # what is not written never becomes memory
     count = torch.empty(1, dtype=torch.int64)
-    call(
-        "pc_tsdf_touched",
-        view.depth.contiguous(),
-        view.rays.contiguous(),
-        height,
-        width,
-        view.world_from_camera[:3].contiguous(),
-        offsets,
-        len(offsets),
-        1.0 / grid.block_size,
-        found,
-        count,
-    )
+    turn, fraction, camera = integrate.camera_in_blocks(view, grid)
+    images = (view.depth.contiguous(), view.rays.contiguous(), height, width)
+    call("pc_tsdf_touched", *images, turn, fraction, camera, offsets, len(offsets), found, count)
     if count < 0:
         return integrate.touched_blocks(view, grid)  # knows what to say
     return torch.from_numpy(found[: int(count)].numpy().copy())
+
+
+def pack_colors(colors: Tensor) -> Tensor:
+    """Pack pixels on this thread: torch's threads would spin where the next steps want to work."""
+    packed = torch.empty(colors.shape[:-1], dtype=torch.int32)
+    call("pc_tsdf_pack_colors", colors.contiguous(), packed.numel(), packed)
+    return packed
+
+
+def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Ask a hash table of the rows, which learns here of the blocks added since the last time."""
+    if blocks.table is None or 2 * len(blocks) > len(blocks.table):
+        slots = max(_FEWEST_SLOTS, 1 << (4 * len(blocks) - 1).bit_length())
+        blocks.table, blocks.in_table = torch.from_numpy(np.full(slots, -1, np.int32)), 0
+    rows, missing, count = torch.empty_like(keys), torch.empty_like(keys), torch.empty(1, dtype=torch.int64)
+    table = (blocks.keys, len(blocks), blocks.table, len(blocks.table), blocks.in_table)
+    call("pc_tsdf_find", *table, keys.contiguous(), len(keys), rows, missing, count)
+    blocks.in_table = len(blocks)
+    return rows, missing[: int(count)]
 
 
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
@@ -58,7 +69,7 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
         *images,
         height,
         width,
-        view.camera_from_world[:3].contiguous(),
+        integrate.image_from_world(view).contiguous(),
         grid.block_size,
         integrate.voxel_steps(view, grid).contiguous(),
         torch.tensor(view.pinhole, dtype=torch.float32),
@@ -108,6 +119,8 @@ def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
     return table, kept
 
 
+BODIES["pack_colors", "cpu"] = pack_colors
+BODIES["find_blocks", "cpu"] = find_blocks
 BODIES["touched_blocks", "cpu"] = touched_blocks
 BODIES["integrate_view", "cpu"] = integrate_view
 BODIES["find_crossings", "cpu"] = find_crossings

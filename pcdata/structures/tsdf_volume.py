@@ -20,7 +20,7 @@ from pcdata.structures.fields import Kind
 from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
-_CAMERAS_KEPT = 8  # 5 MB each at 640x480
+_CAMERAS_KEPT = 8  # 7 MB each at 640x480
 _WEIGHTINGS = ("constant", "inverse_square", "angle")
 
 
@@ -43,7 +43,7 @@ class TSDFVolume:
     frame_id: str | None = None  # the frame of the surface; None = that of the first frame
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
-    _kept_rays: dict[tuple[float, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+    _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.weighting not in _WEIGHTINGS:
@@ -84,15 +84,17 @@ class TSDFVolume:
             UnitError: a reading lies 2^20 blocks or more from the origin.
         """
         views, touched = self._prepared(frame)
-        new = self._missing(touched)
+        found, new = self._found(touched)
         self._check_room(frame, len(new))
         if self.blocks is None:
             self.frame_id = frame.frame_id
             self.blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device)
         self.blocks.add(new)
-        for view, keys in zip(views, touched, strict=True):
-            rows = torch.arange(len(self.blocks), device=frame.device) if self.carve else self.blocks.find(keys)
-            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve, backend=self.backend)
+        if len(new) or not found:
+            found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
+        for view, rows in zip(views, found, strict=True):
+            every = torch.arange(len(self.blocks), device=frame.device) if self.carve else rows
+            tsdf.integrate_view(self.blocks, every, view, self.grid, carve=self.carve, backend=self.backend)
         self.num_views += len(views)
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
@@ -102,16 +104,21 @@ class TSDFVolume:
             FrameError, CaptureError, DeviceError, UnitError: as :meth:`integrate`.
         """
         _, touched = self._prepared(frame)
-        return (self.num_blocks + len(self._missing(touched))) * self._planes_of(frame).bytes_per_block
+        return (self.num_blocks + len(self._found(touched)[1])) * self._planes_of(frame).bytes_per_block
 
     def _prepared(self, frame: DepthFrame) -> tuple[list[tsdf.FusionView], list[Tensor]]:
         self._check_frame(frame)
         views = [self._view(frame, index) for index in range(frame.num_views)]
         return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
 
-    def _missing(self, touched: list[Tensor]) -> Tensor:
-        keys = touched[0] if len(touched) == 1 else torch.cat(touched).unique()
-        return keys if self.blocks is None else self.blocks.missing(keys)
+    def _found(self, touched: list[Tensor]) -> tuple[list[Tensor], Tensor]:
+        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of those."""
+        if self.blocks is None:
+            found, missing = [], touched
+        else:
+            both = [tsdf.find_blocks(self.blocks, keys, backend=self.backend) for keys in touched]
+            found, missing = [rows for rows, _ in both], [keys for _, keys in both]
+        return found, missing[0] if len(missing) == 1 else torch.cat(missing).unique()
 
     def _check_room(self, frame: DepthFrame, new: int) -> None:
         per_block = self._planes_of(frame).bytes_per_block
@@ -149,14 +156,14 @@ class TSDFVolume:
                 f"TSDFVolume: every frame needs the images of the first, which had colours: {had.colors}, labels: "
                 f"{had.labels}; {frame!r} has colours: {has.colors}, labels: {has.labels}"
             )
-        if frame.labels is not None and int(frame.labels.abs().max()) >= 2**31:
+        if frame.labels is not None and not tsdf.fit_labels(frame.labels):
             raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
 
     def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
         camera = frame.camera
         k = camera.intrinsics[index]
         lens = None if camera.distortion is None else camera.distortion[index]
-        rays = self._rays(k, lens, frame)
+        rays, directions = self._rays(k, lens, frame)
         depth = frame.depth[index]
         if self.min_confidence is not None and frame.confidence is not None:
             depth = torch.where(frame.confidence[index] >= self.min_confidence, depth, 0.0)
@@ -165,24 +172,24 @@ class TSDFVolume:
         assert frame.world_from_camera is not None
         return tsdf.FusionView(
             depth=depth,
-            rays=rays,
+            rays=directions,
             pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
             distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
             world_from_camera=frame.world_from_camera[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
-            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index]),
-            label=None if frame.labels is None else frame.labels[index].int(),
+            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
+            label=None if frame.labels is None else tsdf.pack_labels(frame.labels[index]),
         )
 
-    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
-        """Return the rays (H, W, 2) of a camera; those of a few cameras are kept: frames repeat them."""
+    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> tuple[Tensor, Tensor]:
+        """Return the rays of a camera, (H, W, 2) float64 and (2, H, W) float32; kept, because frames repeat cameras."""
         coefficients = () if lens is None else tuple(lens.tolist())
         known = (*k.flatten().tolist(), *coefficients, *frame.size)
         if known not in self._kept_rays:
             if len(self._kept_rays) >= _CAMERAS_KEPT:
                 self._kept_rays.pop(next(iter(self._kept_rays)))
-            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0]
-            self._kept_rays[known] = rays.to(frame.device)
+            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0].to(frame.device)
+            self._kept_rays[known] = rays, rays.permute(2, 0, 1).float().contiguous()
         return self._kept_rays[known]
 
     # -- out -------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.dispatch import AUTO_ORDER, BACKEND_MODULES, REFERENCE, backends, why_unavailable
 from pcdata.errors import BackendError, near_matches
-from pcdata.functional.tsdf import integrate, surface
+from pcdata.functional.tsdf import integrate, surface, views
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
@@ -21,16 +21,30 @@ from pcdata.functional.tsdf.views import FusionView
 
 # (step, backend) -> body; the core's join when it is loaded.
 BODIES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("pack_colors", REFERENCE): views.pack_colors,
     ("touched_blocks", REFERENCE): integrate.touched_blocks,
+    ("find_blocks", REFERENCE): integrate.find_blocks,
     ("integrate_view", REFERENCE): integrate.integrate_view,
     ("find_crossings", REFERENCE): surface.find_crossings,
 }
+
+
+def pack_colors(colors: Tensor, *, backend: str = "auto") -> Tensor:
+    """See :func:`pcdata.functional.tsdf.views.pack_colors`."""
+    packed: Tensor = _body("pack_colors", backend, colors.device)(colors)
+    return packed
 
 
 def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") -> Tensor:
     """See :func:`pcdata.functional.tsdf.integrate.touched_blocks`."""
     keys: Tensor = _body("touched_blocks", backend, view.depth.device)(view, grid)
     return keys
+
+
+def find_blocks(blocks: VoxelBlocks, keys: Tensor, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """See :func:`pcdata.functional.tsdf.integrate.find_blocks`."""
+    found: tuple[Tensor, Tensor] = _body("find_blocks", backend, blocks.device)(blocks, keys)
+    return found
 
 
 def integrate_view(
