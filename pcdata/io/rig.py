@@ -111,7 +111,7 @@ class RigSource(Source):
         return cast(DepthFrame, super().load(sample_id))
 
     def _load(self, sample_id: str) -> DepthFrame:
-        provenance = {**self.provenance(sample_id), "cameras": self.names}
+        provenance = {**self.provenance(sample_id), "cameras": list(self.names)}
         units = {camera.metres_per_unit for camera in self.cameras.values()}
         if len(units) == 1:
             provenance["metres_per_unit"] = units.pop()
