@@ -15,7 +15,7 @@ from pcdata.cli.progress import Progress
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
-    validate = commands.add_parser("validate", help="check raw captures, each camera alone and against the others, before any fusion")
+    validate = commands.add_parser("validate", help="check raw captures, each camera alone and against others")
     validate.add_argument(
         "path", metavar="PATH", help="folder of captures, or of several cameras' folders, or one cloud file"
     )
