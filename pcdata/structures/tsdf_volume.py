@@ -208,7 +208,7 @@ class TSDFVolume:
         Raises:
             ConfigError: nothing was integrated yet.
         """
-        return self._cloud(*self._surface(min_weight), min_weight)
+        return self._cloud(self._surface(min_weight, edges=False), min_weight)
 
     def extract_mesh(self, *, min_weight: float = 0.0) -> SurfaceMesh:
         """Return the surface as triangles between the points of :meth:`extract_points`.
@@ -216,12 +216,11 @@ class TSDFVolume:
         Only cubes with eight seen corners hold triangles, so single views give a surface with gaps at its rim.
         Points that are in no triangle are left out.
         """
-        found, dropped = self._surface(min_weight)
+        found = self._surface(min_weight, edges=True)
         assert self.blocks is not None
-        triangles = tsdf.find_triangles(self.blocks, found, self._least_weight(min_weight))
-        used, renumbered = triangles.unique(return_inverse=True)
-        vertices = self._cloud(found.select(used), dropped, min_weight)
-        return SurfaceMesh(vertices=vertices, triangles=renumbered.reshape(-1, 3))
+        least = self._least_weight(min_weight)
+        used, triangles = tsdf.find_triangles(self.blocks, found.edge, min_weight=least, backend=self.backend)
+        return SurfaceMesh(vertices=self._cloud(found.select(used), min_weight), triangles=triangles)
 
     def _least_weight(self, min_weight: float) -> int:
         if not (math.isfinite(min_weight) and min_weight >= 0):
@@ -232,17 +231,13 @@ class TSDFVolume:
     def _unit(self) -> int:
         return 1 if self.weighting == "constant" else UNIT_WEIGHT
 
-    def _surface(self, min_weight: float) -> tuple[tsdf.Crossings, int]:
+    def _surface(self, min_weight: float, *, edges: bool) -> tsdf.Crossings:
         if self.blocks is None:
             raise ConfigError("TSDFVolume: nothing was integrated yet")
         least = self._least_weight(min_weight)
-        found = tsdf.find_crossings(self.blocks, self.grid, backend=self.backend)
-        if least == 1:
-            return found, 0
-        kept = found.select(found.weight >= least)
-        return kept, len(found.edge) - len(kept.edge)
+        return tsdf.find_crossings(self.blocks, self.grid, min_weight=least, edges=edges, backend=self.backend)
 
-    def _cloud(self, found: tsdf.Crossings, dropped: int, min_weight: float) -> PointCloud:
+    def _cloud(self, found: tsdf.Crossings, min_weight: float) -> PointCloud:
         assert self.frame_id is not None
         step: dict[str, Any] = {
             "step": "TSDFVolume",
@@ -252,8 +247,8 @@ class TSDFVolume:
             "carve": self.carve,
             "views": self.num_views,
             "min_weight": min_weight,
-            "dropped": dropped,
-            "points": len(found.edge),
+            "dropped": found.dropped,
+            "points": len(found.points),
         }
         return PointCloud(
             points=found.points,
@@ -261,7 +256,7 @@ class TSDFVolume:
             normals=found.normals,
             colors=found.colors,
             labels=found.labels,
-            extra={"num_views": found.views.long(), "weight": found.weight.float() / self._unit},
+            extra={"num_views": found.views, "weight": found.weight if self._unit == 1 else found.weight / self._unit},
             kinds={"num_views": Kind.INVARIANT, "weight": Kind.INVARIANT},
             frames={self.frame_id: torch.eye(4, dtype=torch.float64, device=found.points.device)[None]},
             history=[[step]],

@@ -17,7 +17,6 @@ from pcdata.functional import tsdf
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.tsdf.blocks import COLOR_SCALE, MAX_WEIGHT, TSDF_SCALE
 from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, pack_keys, unpack_keys
-from pcdata.functional.tsdf.marching import triangle_table
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, TSDFVolume
 from pcdata.synthetic import tabletop
@@ -163,8 +162,9 @@ def test_a_wall_is_found_wherever_it_stands(offset, turns):
     assert float((local[:, 2] - 0.5).abs().max()) < 1e-5 + 1e-6 * max(map(abs, offset))
     corners = local[mesh.triangles]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).sum() / 2
-    seen = (0.5 * 32 / 40) * (0.5 * 24 / 41)
-    assert 0.75 * seen < float(area) < 1.02 * seen, "all but a rim of a voxel"
+    # At the border of the view a voxel is lost that no pixel's cone takes in whole, and one whose block no ray meets.
+    width, height, rim = 0.5 * 32 / 40, 0.5 * 24 / 41, 2 * 2 * 0.02
+    assert (width - rim) * (height - rim) < float(area) < 1.02 * width * height
 
 
 def test_a_capture_without_readings_gives_an_empty_cloud():
@@ -319,45 +319,6 @@ def test_cuda_agrees_with_the_cpu():
     assert torch.equal(on_cpu.blocks.keys, on_gpu.blocks.keys.cpu())
     apart = on_gpu.extract_points().points.cpu() - on_cpu.extract_points().points
     assert float(apart.abs().max()) < 1e-5
-
-
-def test_every_case_of_the_cube_gives_a_closed_surface():
-    """Within a cube, a cut edge lies on two faces; a line along a face is drawn once, in one direction."""
-    for inside, triangles in enumerate(triangle_table()):
-        used = {edge for triangle in triangles for edge in triangle}
-        cut = {(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1}
-        assert used == {(a, b) for a, b in cut if (inside >> a & 1) != (inside >> b & 1)}
-        sides = [(t[i], t[(i + 1) % 3]) for t in triangles for i in range(3)]
-        assert len(set(sides)) == len(sides)
-        outline = {side for side in sides if (side[1], side[0]) not in sides}
-        assert all(_common_faces(*side) for side in outline), "what is not shared by two triangles lies on a face"
-
-
-def _common_faces(one: tuple[int, int], other: tuple[int, int]) -> list[tuple[int, int]]:
-    corners = (*one, *other)
-    return [(axis, side) for axis in range(3) for side in (0, 1) if all(c >> axis & 1 == side for c in corners)]
-
-
-def test_a_mesh_between_seen_voxels_is_closed_and_faces_outwards():
-    """A ball written into the field by hand: every edge has two triangles, and the volume is the ball's."""
-    volume = volume_of(frame_of(wall(0.5)), voxel_size=0.05, truncation=0.25)
-    places = torch.cartesian_prod(*[torch.arange(-2, 2)] * 3)
-    volume.blocks = tsdf.VoxelBlocks(tsdf.Planes(), torch.device("cpu"))
-    volume.blocks.add(pack_keys(places).sort().values)
-    corner = unpack_keys(volume.blocks.keys) * 8
-    inner = torch.stack([torch.arange(512) % 8, torch.arange(512) // 8 % 8, torch.arange(512) // 64], dim=-1)
-    distance = ((corner[:, None] + inner) * 0.05).double().norm(dim=-1) - 0.41
-    chunk = volume.blocks.chunks[0]
-    chunk.tsdf[:64] = (distance / 0.25 * TSDF_SCALE).clamp(-TSDF_SCALE, TSDF_SCALE).round().short()
-    chunk.weight[:64] = 1
-    mesh = volume.extract_mesh()
-    a, b, c = mesh.vertices.points.double()[mesh.triangles].unbind(1)
-    assert float((a * torch.linalg.cross(b, c)).sum() / 6) == pytest.approx(4 / 3 * math.pi * 0.41**3, rel=0.03)
-    sides = torch.cat([mesh.triangles[:, [i, (i + 1) % 3]] for i in range(3)]).tolist()
-    assert sorted(map(tuple, sides)) == sorted((b, a) for a, b in sides)
-    assert float((mesh.vertices.points.norm(dim=1) - 0.41).abs().max()) < 2e-3
-    outwards = torch.nn.functional.normalize(mesh.vertices.points, dim=1)
-    assert float((outwards * mesh.vertices.normals).sum(1).min()) > 0.98
 
 
 @pytest.mark.parametrize("planes", [tsdf.Planes(), tsdf.Planes(colors=True), tsdf.Planes(True, True, True)])
