@@ -214,7 +214,7 @@ def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size
 
 
 def timed(body: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds of the processor, all threads together, and of the clock, once the threads of others have come to rest."""
+    """Seconds of the processor, all threads together, and of the clock, once others' threads have come to rest."""
     until = time.perf_counter() + _WAIT
     while time.perf_counter() < until:
         pass  # busy: an idle processor would clock down
