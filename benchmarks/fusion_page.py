@@ -90,6 +90,17 @@ def _speed(runs: list[dict[str, Any]]) -> str:
     return _markdown(header, rows)
 
 
+def _again(runs: list[dict[str, Any]]) -> str:
+    header = [*LENGTHS, "library", "a frame", "on two threads"]
+    rows = []
+    for run in runs:
+        one, two = run["again"]["1"], run["again"]["2"]
+        for name in one:
+            cells = [_against(one, name, "cpu ms", "{:.0f} ms"), _against(two, name, "wall ms", "{:.0f} ms")]
+            rows.append([*_lengths(run)[:2], "10", name, *cells])
+    return _markdown(header, rows)
+
+
 def _memory(runs: list[dict[str, Any]]) -> str:
     header = [*LENGTHS, "library", "stored voxels", "the process grows by", "and extracting"]
     rows = []
@@ -153,6 +164,7 @@ _TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "truth": _truth,
     "workspace": _workspace,
     "speed": lambda result: _speed(result["recording"]),
+    "again": lambda result: _again(result["recording"]),
     "memory": lambda result: _memory(result["recording"]),
     "legacy speed": lambda result: _speed(result["legacy"]),
     "legacy memory": lambda result: _memory(result["legacy"]),
