@@ -166,8 +166,10 @@ def _camera(
         shift=float(shift.norm()),
         shift_vector=tuple(shift.tolist()),
         shift_sigma=shift_sigma,
+        measured_shift_sigma=_sigma_of(shift, covariance[3:, 3:]),
         rotation_degrees=degrees,
         rotation_sigma_degrees=math.degrees(turn_sigma),
+        measured_rotation_sigma_degrees=math.degrees(_sigma_of(turn, covariance[:3, :3])),
         center=tuple(center.tolist()),
         correction=motion.tolist(),
         unmeasurable=unknown,
@@ -201,6 +203,12 @@ def _spread(covariance: Tensor, limit: float) -> tuple[float, list[Tensor]]:
     beyond = [vectors[:, k] for k in range(3) if float(sigma[k]) > limit]
     largest = float(sigma[-1])
     return (largest if largest < 0.1 else math.inf), beyond
+
+
+def _sigma_of(vector: Tensor, covariance: Tensor) -> float:
+    """Return the standard deviation of a vector's length; of a vector of length 0, that of no direction."""
+    along = torch.nn.functional.normalize(vector, dim=0)
+    return float((along @ covariance @ along).clamp(min=0).sqrt())
 
 
 def _words(direction: Tensor) -> str:

@@ -71,8 +71,10 @@ class CameraOverlap:
     shift: float  # metres, at ``center``
     shift_vector: tuple[float, ...]  # metres, in the common frame: what would bring it back
     shift_sigma: float  # metres, standard deviation along the worst direction; inf = not determined
+    measured_shift_sigma: float  # metres, standard deviation of ``shift`` itself, whatever is not determined
     rotation_degrees: float
     rotation_sigma_degrees: float  # about the worst axis; inf = not determined
+    measured_rotation_sigma_degrees: float  # of ``rotation_degrees`` itself
     center: tuple[float, ...]  # the middle of what it shares with others, in the common frame
     correction: list[list[float]]  # 4x4 in the common frame: better_pose = correction @ world_from_camera
     unmeasurable: tuple[str, ...]  # directions about which the scene says too little

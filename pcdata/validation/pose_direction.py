@@ -1,4 +1,4 @@
-"""Do the poses of several views lead where they say? Views of one still scene agree under the right convention alone."""
+"""Do the poses of several views lead where they say? Under the right convention alone do they see one surface."""
 
 from __future__ import annotations
 

@@ -54,6 +54,12 @@ class PoseDirectionOverTime:
         name = max(better, key=lambda one: shares[one], default="")
         if name and self._is_established(name, _PAIRS):
             return [_fails(given, f"{found}; {100 * shares[name]:.0f} % would if the poses were {name}", name)]
+        if name:
+            found += "; they fit another convention better, but the other captures do not say so"
+            advice = (
+                "see pose_direction (all captures); in one capture alone: was its depth, or its pose, of another time?"
+            )
+            return [direction_check(Verdict.WARN, given, found, advice)]
         return [judged_as_given(given, found, who)]
 
     def whole(self) -> list[Check]:

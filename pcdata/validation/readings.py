@@ -10,6 +10,7 @@ from pcdata.validation.limits import Limits
 
 _SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
 _UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)  # how far units are mistaken: mm, cm, the 0.1 mm of some sensors
+_EXPLAINS = 0.5  # of the readings must then lie in the workspace, and half of those outside now
 _CODES = {65535: "the highest 16-bit number", 4095: "the highest 12-bit number", 32767: "the highest 15-bit number"}
 
 
@@ -34,31 +35,57 @@ def reading_checks(
 
 
 def _unit(readings: Tensor, limits: Limits, metres_per_unit: float | None, view: int | None) -> Check:
-    """A median twice beyond the workspace that a usual mistake of the unit explains fails; just outside it warns."""
+    """A median twice beyond the workspace that a usual mistake of the unit explains fails; just outside it warns.
+
+    Just outside without such an explanation it passes: how much lies within the workspace is judged on its own.
+    """
     near, far = limits.workspace
     median = float(readings.median())
-    factor = next((f for f in _UNITS if near <= median * f <= far), None)
-    inside = near <= median <= far
     beyond = max(near / median, median / far)
-    verdict = Verdict.PASS if inside else Verdict.FAIL if factor is not None and beyond > 2 else Verdict.WARN
+    factor = None if beyond <= 1 else _explaining_factor(readings, limits)
     advice = ""
-    if factor is not None and not inside:
+    if beyond <= 1 or (factor is None and beyond <= 2):
+        verdict = Verdict.PASS
+    elif factor is None:
+        verdict = Verdict.WARN
+        advice = "if the scene is that far away, say so with workspace; else check the unit of depth"
+    else:
+        verdict = Verdict.FAIL if beyond > 2 else Verdict.WARN
         unit = "" if metres_per_unit is None else f", metres_per_unit={metres_per_unit * factor:g}"
         mistake = f"{1 / factor:g} times too long" if factor < 1 else f"{factor:g} times too short"
         advice = f"the unit looks {mistake}: multiply depth by {factor:g}{unit}; if the scene is so far, say workspace"
-    elif not inside:
-        advice = "if the scene is that far away, say so with workspace; else check the unit of depth"
+    fails_at = 2 * far if median > near else near / 2
+    passes = (far if median > near else near) if factor is not None else fails_at
     return Check(
         name="depth_unit",
         verdict=verdict,
         found=f"half of the readings lie within {median:.3g} m; the workspace is {near:g} to {far:g} m",
         value=median,
-        threshold=far if median > near else near,
-        fails_at=2 * far if median > near else near / 2,
+        threshold=passes,
+        fails_at=fails_at,
         unit="m",
         advice=advice,
         view=view,
     )
+
+
+def _explaining_factor(readings: Tensor, limits: Limits) -> float | None:
+    """Return the mistake of the unit that brings most readings into the workspace, if that is clearly more than now.
+
+    A scene at the end of the workspace is half inside, and half inside again at its other end once a factor is applied.
+    """
+
+    def inside(factor: float) -> float:
+        return _share_inside(factor * readings, limits)
+
+    best = max(_UNITS, key=inside)
+    explains = inside(best) >= max(_EXPLAINS, 1 - (1 - inside(1.0)) / 2)
+    return best if explains else None
+
+
+def _share_inside(readings: Tensor, limits: Limits) -> float:
+    near, far = limits.workspace
+    return float(((readings >= near) & (readings <= far)).float().mean())
 
 
 def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
@@ -66,7 +93,7 @@ def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
     one_percent = len(readings) // 100
     low = float(readings.kthvalue(1 + one_percent).values)
     high = float(readings.kthvalue(len(readings) - one_percent).values)
-    fraction = float(((readings >= near) & (readings <= far)).float().mean())
+    fraction = _share_inside(readings, limits)
     return graded(
         "workspace_fraction",
         fraction,

@@ -64,9 +64,9 @@ def validate_source(source: Captures, *, limits: Limits | None = None) -> Iterat
     """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
-    report with a failed check, and the others follow. After a recording a last report, with the sample id :data:`WHOLE`,
-    judges over all captures together what single ones tell less surely: the registration of colour and depth, and the
-    direction of the poses.
+    report with a failed check, and the others follow. After a recording a last report, with the sample id
+    :data:`WHOLE`, judges over all captures together what single ones tell less surely: the registration of colour and
+    depth, and the direction of the poses.
 
     Args:
         source: anything with ``ids`` and ``load``; a :class:`Source` also has its files looked at.

@@ -85,9 +85,12 @@ def _pose(result: OverlapResult, view: int) -> Check:
 
 
 def _is_certain(camera: CameraOverlap, limits: OverlapLimits) -> bool:
-    """Whether the camera is out of place by more than may pass, even when it is off by two standard deviations."""
-    shift = camera.shift - 2 * camera.shift_sigma
-    turn = camera.rotation_degrees - 2 * camera.rotation_sigma_degrees
+    """Whether what is measured is more than may pass, even when it is off by two of its standard deviations.
+
+    What the surfaces do not determine is left out of it: a camera that is off one way is off, whatever the other ways.
+    """
+    shift = camera.shift - 2 * camera.measured_shift_sigma
+    turn = camera.rotation_degrees - 2 * camera.measured_rotation_sigma_degrees
     return shift > limits.shift[0] or turn > limits.rotation_degrees[0]
 
 

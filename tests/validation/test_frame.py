@@ -71,6 +71,25 @@ def test_a_far_scene_is_no_wrong_unit_once_the_workspace_is_given() -> None:
     assert not {"depth_unit", "workspace_fraction"} & failed(far, Limits(workspace=(1.0, 30.0)))
 
 
+@pytest.mark.parametrize("distance", [2.01, 2.5, 3.5])
+def test_a_scene_at_the_end_of_the_workspace_is_no_wrong_unit(distance: float) -> None:
+    """Half of it lies within 2 m; ten times nearer, half of it would lie beyond 0.2 m: no more than now."""
+    frame = scene(num_views=1).frame
+    depth = distance * torch.linspace(0.3, 1.7, frame.depth.numel()).reshape(frame.depth.shape)
+    spread = replace(frame, depth=depth, provenance={"metres_per_unit": 0.001})
+    check = next(one for one in validate_frame(spread) if one.name == "depth_unit")
+    assert check.verdict is Verdict.PASS
+    assert check.value == pytest.approx(distance, abs=0.01)
+    assert check.threshold == 2 * Limits().workspace[1]
+
+
+def test_a_narrow_scene_just_beyond_the_workspace_warns_since_a_unit_explains_it() -> None:
+    frame = scene(num_views=1).frame
+    narrow = replace(frame, depth=2.5 + 0.1 * frame.depth)
+    assert verdicts(validate_frame(narrow), "depth_unit") == [Verdict.WARN]
+    assert "multiply depth by 0.1" in advice(narrow, "depth_unit")
+
+
 @pytest.mark.parametrize(
     ("rows", "columns", "place"),
     [
