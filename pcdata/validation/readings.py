@@ -10,7 +10,9 @@ from pcdata.validation.limits import Limits
 
 _SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
 _UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)  # how far units are mistaken: mm, cm, the 0.1 mm of some sensors
-_EXPLAINS = 0.5  # of the readings must then lie in the workspace, and half of those outside now
+_MOST = 0.5  # of all readings must lie in the workspace once the unit is set right
+# And by so many more than before: where the median is far outside, and where a deep scene may reach beyond the end.
+_GAIN = (0.1, 0.5)
 _CODES = {65535: "the highest 16-bit number", 4095: "the highest 12-bit number", 32767: "the highest 15-bit number"}
 
 
@@ -42,7 +44,7 @@ def _unit(readings: Tensor, limits: Limits, metres_per_unit: float | None, view:
     near, far = limits.workspace
     median = float(readings.median())
     beyond = max(near / median, median / far)
-    factor = None if beyond <= 1 else _explaining_factor(readings, limits)
+    factor = None if beyond <= 1 else _explaining_factor(readings, limits, _GAIN[beyond <= 2])
     advice = ""
     if beyond <= 1 or (factor is None and beyond <= 2):
         verdict = Verdict.PASS
@@ -69,18 +71,16 @@ def _unit(readings: Tensor, limits: Limits, metres_per_unit: float | None, view:
     )
 
 
-def _explaining_factor(readings: Tensor, limits: Limits) -> float | None:
+def _explaining_factor(readings: Tensor, limits: Limits, gain: float) -> float | None:
     """Return the mistake of the unit that brings most readings into the workspace, if that is clearly more than now.
 
-    A scene at the end of the workspace is half inside, and half inside again at its other end once a factor is applied.
+    A deep scene at the end of the workspace is partly inside, and partly inside again once a factor moves it to the
+    other end: that is no evidence.
     """
-
-    def inside(factor: float) -> float:
-        return _share_inside(factor * readings, limits)
-
-    best = max(_UNITS, key=inside)
-    explains = inside(best) >= max(_EXPLAINS, 1 - (1 - inside(1.0)) / 2)
-    return best if explains else None
+    shares = {factor: _share_inside(factor * readings, limits) for factor in _UNITS}
+    best = max(shares, key=lambda factor: shares[factor])
+    needed = max(_MOST, _share_inside(readings, limits) + gain)
+    return best if shares[best] >= needed else None
 
 
 def _share_inside(readings: Tensor, limits: Limits) -> float:
