@@ -69,13 +69,15 @@ def _pose(result: OverlapResult, view: int) -> Check:
     verdict = _VERDICTS[camera.verdict]
     passes, fails = result.limits.shift
     found = f"out of place by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees"
-    if verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
+    if math.isinf(camera.shift):
+        found = "too far out of place to be measured; the others agree without it"
+    elif verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
         verdict, found = Verdict.WARN, f"not measurable: {'; '.join(camera.unmeasurable) or found}"
     return Check(
         name="view_pose",
         verdict=verdict,
         found=found,
-        value=None if found.startswith("not measurable") else camera.shift,
+        value=None if found.startswith("not measurable") or math.isinf(camera.shift) else camera.shift,
         threshold=passes,
         fails_at=fails,
         unit="m",
