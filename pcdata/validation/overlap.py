@@ -13,7 +13,7 @@ from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.small_motions import motion_from_twist
 from pcdata.functional.surfaces import Surface
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
-from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part
+from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part, sigma_along
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.surfaces import surfaces_of
@@ -202,10 +202,10 @@ def _camera(
         shift=float(shift.norm()),
         shift_vector=tuple(shift.tolist()),
         shift_sigma=shift_sigma,
-        measured_shift_sigma=_sigma_of(shift, covariance[3:, 3:]),
+        measured_shift_sigma=sigma_along(shift, covariance[3:, 3:]),
         rotation_degrees=degrees,
         rotation_sigma_degrees=math.degrees(turn_sigma),
-        measured_rotation_sigma_degrees=math.degrees(_sigma_of(turn, covariance[:3, :3])),
+        measured_rotation_sigma_degrees=math.degrees(sigma_along(turn, covariance[:3, :3])),
         center=tuple(center.tolist()),
         correction=motion.tolist(),
         unmeasurable=unknown,
@@ -239,12 +239,6 @@ def _spread(covariance: Tensor, limit: float) -> tuple[float, list[Tensor]]:
     beyond = [vectors[:, k] for k in range(3) if float(sigma[k]) > limit]
     largest = float(sigma[-1])
     return (largest if largest < 0.1 else math.inf), beyond
-
-
-def _sigma_of(vector: Tensor, covariance: Tensor) -> float:
-    """Return the standard deviation of a vector's length; of a vector of length 0, that of no direction."""
-    along = torch.nn.functional.normalize(vector, dim=0)
-    return float((along @ covariance @ along).clamp(min=0).sqrt())
 
 
 def _words(direction: Tensor) -> str:
