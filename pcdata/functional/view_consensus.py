@@ -31,7 +31,7 @@ class Consensus:
 def find_consensus(
     alignment: ViewAlignment, *, max_shift: float, max_angle: float, reference: int | None = None
 ) -> Consensus:
-    """Find the fewest views whose removal leaves a majority in which no two are apart beyond the limits and beyond doubt.
+    """Find the fewest views whose removal leaves a majority of which no two are apart beyond the limits and doubt.
 
     Of equally few, those that leave the closest agreement are named, if they do so at least twice as well as any
     other choice; otherwise all that would do are candidates. Two views can never be told apart.
