@@ -20,13 +20,13 @@ def at_most(name: str, value: float, limit: float, unit: str, *, factor: float =
     """Judge a number that must not exceed a limit; both are shown multiplied by ``factor``."""
     shown = f"{value * factor:.{digits}g} {unit}".strip()
     # A NaN fails: written so that it is not "not greater".
-    return Finding(name, shown, f"<= {limit * factor:g} {unit}".strip(), value <= limit)
+    return Finding(name, shown, f"<= {limit * factor:.4g} {unit}".strip(), value <= limit)
 
 
 def at_least(name: str, value: float, limit: float, unit: str, *, factor: float = 1.0, digits: int = 3) -> Finding:
     """Judge a number that must reach a limit; both are shown multiplied by ``factor``."""
     shown = f"{value * factor:.{digits}g} {unit}".strip()
-    return Finding(name, shown, f">= {limit * factor:g} {unit}".strip(), value >= limit)
+    return Finding(name, shown, f">= {limit * factor:.4g} {unit}".strip(), value >= limit)
 
 
 def all_passed(findings: Iterable[Finding]) -> bool:

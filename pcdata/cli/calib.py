@@ -150,6 +150,7 @@ def _check_table(checks: dict[str, PlaneCheck]) -> str:
     any_check = next(iter(checks.values()))
     header += ["expected mm"] if any_check.expected_noise is not None else []
     header += ["bias mm"] if any_check.bias is not None else []
+    header += ["warp mm"]
     rows = []
     for name, check in checks.items():
         row = [name, f"{check.axis_distance:.4f}", f"{check.normal_distance:.4f}", f"{math.degrees(check.tilt):.1f}"]
@@ -157,6 +158,7 @@ def _check_table(checks: dict[str, PlaneCheck]) -> str:
         row += [f"{1000 * check.plane_rms:.2f}", f"{1000 * check.depth_rms:.2f}"]
         row += [f"{1000 * check.expected_noise:.2f}"] if check.expected_noise is not None else []
         row += [f"{1000 * check.bias:+.2f}"] if check.bias is not None else []
+        row += [f"{1000 * check.warp:.2f}"]
         rows.append([*row, "pass" if check.passed else "FAIL"])
     return text_table([*header, "verdict"], rows)
 

@@ -14,6 +14,7 @@ from pcdata.functional.view_alignment import ViewAlignment
 
 # What is unknown about a direction that the surfaces do not determine, in metres and radians: far beyond any limit.
 _UNKNOWN = 1.0
+_DOUBT = 2.0  # standard deviations that views may be nearer to each other than measured: 95 % of a normal error
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class Consensus:
 def find_consensus(
     alignment: ViewAlignment, *, max_shift: float, max_angle: float, reference: int | None = None
 ) -> Consensus:
-    """Find the fewest views whose removal leaves a majority in which every two agree within the limits.
+    """Find the fewest views whose removal leaves a majority of which no two are apart beyond the limits and doubt.
 
     Of equally few, those that leave the closest agreement are named, if they do so at least twice as well as any
     other choice; otherwise all that would do are candidates. Two views can never be told apart.
@@ -55,7 +56,11 @@ def find_consensus(
             twist = alignment.twists[view] - alignment.twists[other]
             shift = measured_part(twist[3:], uncertain[3:, 3:], max_shift / 2)
             turn = measured_part(twist[:3], uncertain[:3, :3], max_angle / 2)
-            apart[view, other] = max(float(shift.norm()) / max_shift, float(turn.norm()) / max_angle)
+            shift_doubt, turn_doubt = sigma_along(shift, uncertain[3:, 3:]), sigma_along(turn, uncertain[:3, :3])
+            apart[view, other] = max(
+                (float(shift.norm()) - _DOUBT * shift_doubt) / max_shift,
+                (float(turn.norm()) - _DOUBT * turn_doubt) / max_angle,
+            )
     wrong, candidates = _named(apart)
     agreeing = [view for view in range(num_views) if view not in wrong]
     if reference is None:
@@ -74,6 +79,12 @@ def measured_part(vector: Tensor, covariance: Tensor, max_sigma: float) -> Tenso
     variances, directions = torch.linalg.eigh((covariance + covariance.T) / 2)
     known = directions[:, variances <= max_sigma**2]
     return known @ (known.T @ vector)
+
+
+def sigma_along(vector: Tensor, covariance: Tensor) -> float:
+    """Return the standard deviation along a (3,) vector: of its length; of a vector of length 0 it is 0."""
+    along = torch.nn.functional.normalize(vector, dim=0)
+    return float((along @ covariance @ along).clamp(min=0).sqrt())
 
 
 def _named(apart: Tensor) -> tuple[tuple[int, ...], tuple[int, ...]]:

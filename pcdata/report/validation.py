@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pcdata.report.table import text_table
 from pcdata.validation import Check, Summary, Verdict
+from pcdata.validation.report import Message
 
 
 def validation_text(summary: Summary) -> str:
-    """Return a table of all checks, then what was found and what to do for each that did not always pass."""
+    """Return a table of all checks, then what was found and what to do for each that did not always pass.
+
+    One line for every distinct message of the worst verdict, with the captures it is about; numbers are of the first.
+    """
     rows: list[list[object]] = []
     notes = []
     for (name, view), entry in summary.checks.items():
@@ -16,15 +20,21 @@ def validation_text(summary: Summary) -> str:
         counts = [entry.counts[verdict] for verdict in Verdict]
         rows.append([name, "" if view is None else view, *counts, _value(entry.worst), _limit(entry.worst)])
         if entry.worst.verdict is not Verdict.PASS:
-            where = ", ".join(entry.examples) + (", ..." if counts[entry.worst.verdict.severity] > 5 else "")
             of_view = "" if view is None else f", view {view}"
-            notes.append(f"{entry.worst.verdict.value.upper()} {name}{of_view} ({where}): {entry.worst.found}")
-            if entry.worst.advice:
-                notes[-1] += f"\n     -> {entry.worst.advice}"
+            notes += [_note(f"{name}{of_view}", message) for message in entry.messages.values()]
+            if entry.untold:
+                notes.append(f"     {name}{of_view}: other words in {entry.untold} captures more")
     table = text_table(["check", "view", "pass", "warn", "fail", "worst", "passes"], rows)
     shares = ", ".join(f"{summary.samples[verdict]} {verdict.value}" for verdict in Verdict)
     end = f"{summary.verdict.value.upper()}: of {sum(summary.samples.values())} captures {shares}"
     return "\n\n".join(part for part in (table, "\n".join(notes), end) if part)
+
+
+def _note(name: str, message: Message) -> str:
+    check = message.check
+    where = ", ".join(message.examples) + (", ..." if message.count > len(message.examples) else "")
+    advice = f"\n     -> {check.advice}" if check.advice else ""
+    return f"{check.verdict.value.upper()} {name} ({where}): {check.found}{advice}"
 
 
 def _value(check: Check) -> str:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.small_motions import motion_from_twist
+from pcdata.functional.surfaces import Surface
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
-from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part
+from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part, sigma_along
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.surfaces import surfaces_of
@@ -59,8 +61,42 @@ def verify_overlap(
     names = tuple(f"camera {view}" for view in range(num_views)) if names is None else tuple(names)
     if len(names) != num_views or len(set(names)) != num_views:
         raise ConfigError(f"{where}: give one name per camera, all different: {num_views} cameras, got {names}")
-    alignment = align_views(surfaces, poses[0])
-    return judge_alignment(alignment, names, limits)
+    found = judge_alignment(align_views(surfaces, poses[0]), names, limits)
+    if num_views < 3 or not found.candidates:
+        return found
+    # A view that is far off spoils the fit of all by partners found by chance: look whether the rest agree without it.
+    rests = {view: _without(view, surfaces, poses[0], names, limits) for view in range(num_views)}
+    agreeing = [view for view, rest in rests.items() if rest.verdict in ("pass", "not measurable")]
+    confirmed = {view: sum(pair.verdict == "pass" for pair in rests[view].pairs) for view in agreeing}
+    best = [view for view in agreeing if confirmed[view] == max(confirmed.values())]
+    return _far_off(best[0], found, rests[best[0]]) if len(best) == 1 and confirmed[best[0]] else found
+
+
+def _without(
+    view: int,
+    captures: Sequence[Sequence[Surface]],
+    poses: Tensor,
+    names: Sequence[str],
+    limits: OverlapLimits,
+) -> OverlapResult:
+    rest = [other for other in range(len(poses)) if other != view]
+    alignment = align_views([[capture[other] for other in rest] for capture in captures], poses[rest])
+    return judge_alignment(alignment, [names[other] for other in rest], limits)
+
+
+def _far_off(view: int, joint: OverlapResult, rest: OverlapResult) -> OverlapResult:
+    """Judge the others by the fit without this view; how far it is off cannot be told."""
+    lost = replace(
+        joint.cameras[view],
+        shift=math.inf,
+        shift_vector=(math.inf,) * 3,
+        rotation_degrees=math.inf,
+        correction=torch.eye(4).tolist(),
+        unmeasurable=(),
+        verdict="fail",
+    )
+    cameras = [*rest.cameras[:view], lost, *rest.cameras[view:]]
+    return replace(joint, cameras=tuple(cameras), wrong=(lost.name,), candidates=(), reference=rest.reference)
 
 
 def judge_alignment(
@@ -166,8 +202,10 @@ def _camera(
         shift=float(shift.norm()),
         shift_vector=tuple(shift.tolist()),
         shift_sigma=shift_sigma,
+        measured_shift_sigma=sigma_along(shift, covariance[3:, 3:]),
         rotation_degrees=degrees,
         rotation_sigma_degrees=math.degrees(turn_sigma),
+        measured_rotation_sigma_degrees=math.degrees(sigma_along(turn, covariance[:3, :3])),
         center=tuple(center.tolist()),
         correction=motion.tolist(),
         unmeasurable=unknown,

@@ -68,11 +68,13 @@ class CameraOverlap:
     """How far one camera is out of place, against the reference camera, along the directions that are measurable."""
 
     name: str
-    shift: float  # metres, at ``center``
+    shift: float  # metres, at ``center``; inf = too far off to be measured, and so are its vector and rotation_degrees
     shift_vector: tuple[float, ...]  # metres, in the common frame: what would bring it back
     shift_sigma: float  # metres, standard deviation along the worst direction; inf = not determined
+    measured_shift_sigma: float  # metres, standard deviation of ``shift`` itself, whatever is not determined
     rotation_degrees: float
     rotation_sigma_degrees: float  # about the worst axis; inf = not determined
+    measured_rotation_sigma_degrees: float  # of ``rotation_degrees`` itself
     center: tuple[float, ...]  # the middle of what it shares with others, in the common frame
     correction: list[list[float]]  # 4x4 in the common frame: better_pose = correction @ world_from_camera
     unmeasurable: tuple[str, ...]  # directions about which the scene says too little
@@ -106,6 +108,9 @@ class OverlapResult:
         by_name = {camera.name: camera for camera in self.cameras}
         for name in self.wrong:
             found = by_name[name]
+            if math.isinf(found.shift):
+                yield f"recalibrate {name}: the others agree without it, and it is too far off to be measured"
+                continue
             yield (
                 f"recalibrate {name}: the others agree without it, and it is off by {1e3 * found.shift:.1f} mm and "
                 f"{found.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose"

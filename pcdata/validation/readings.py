@@ -10,6 +10,9 @@ from pcdata.validation.limits import Limits
 
 _SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
 _UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)  # how far units are mistaken: mm, cm, the 0.1 mm of some sensors
+_MOST = 0.5  # of all readings must lie in the workspace once the unit is set right
+# And by so many more than before: where the median is far outside, and where a deep scene may reach beyond the end.
+_GAIN = (0.1, 0.5)
 _CODES = {65535: "the highest 16-bit number", 4095: "the highest 12-bit number", 32767: "the highest 15-bit number"}
 
 
@@ -34,31 +37,55 @@ def reading_checks(
 
 
 def _unit(readings: Tensor, limits: Limits, metres_per_unit: float | None, view: int | None) -> Check:
-    """A median twice beyond the workspace that a usual mistake of the unit explains fails; just outside it warns."""
+    """A median twice beyond the workspace that a usual mistake of the unit explains fails; just outside it warns.
+
+    Just outside without such an explanation it passes: how much lies within the workspace is judged on its own.
+    """
     near, far = limits.workspace
     median = float(readings.median())
-    factor = next((f for f in _UNITS if near <= median * f <= far), None)
-    inside = near <= median <= far
     beyond = max(near / median, median / far)
-    verdict = Verdict.PASS if inside else Verdict.FAIL if factor is not None and beyond > 2 else Verdict.WARN
+    factor = None if beyond <= 1 else _explaining_factor(readings, limits, _GAIN[beyond <= 2])
     advice = ""
-    if factor is not None and not inside:
+    if beyond <= 1 or (factor is None and beyond <= 2):
+        verdict = Verdict.PASS
+    elif factor is None:
+        verdict = Verdict.WARN
+        advice = "if the scene is that far away, say so with workspace; else check the unit of depth"
+    else:
+        verdict = Verdict.FAIL if beyond > 2 else Verdict.WARN
         unit = "" if metres_per_unit is None else f", metres_per_unit={metres_per_unit * factor:g}"
         mistake = f"{1 / factor:g} times too long" if factor < 1 else f"{factor:g} times too short"
         advice = f"the unit looks {mistake}: multiply depth by {factor:g}{unit}; if the scene is so far, say workspace"
-    elif not inside:
-        advice = "if the scene is that far away, say so with workspace; else check the unit of depth"
+    fails_at = 2 * far if median > near else near / 2
+    passes = (far if median > near else near) if factor is not None else fails_at
     return Check(
         name="depth_unit",
         verdict=verdict,
         found=f"half of the readings lie within {median:.3g} m; the workspace is {near:g} to {far:g} m",
         value=median,
-        threshold=far if median > near else near,
-        fails_at=2 * far if median > near else near / 2,
+        threshold=passes,
+        fails_at=fails_at,
         unit="m",
         advice=advice,
         view=view,
     )
+
+
+def _explaining_factor(readings: Tensor, limits: Limits, gain: float) -> float | None:
+    """Return the mistake of the unit that brings most readings into the workspace, if that is clearly more than now.
+
+    A deep scene at the end of the workspace is partly inside, and partly inside again once a factor moves it to the
+    other end: that is no evidence.
+    """
+    shares = {factor: _share_inside(factor * readings, limits) for factor in _UNITS}
+    best = max(shares, key=lambda factor: shares[factor])
+    needed = max(_MOST, _share_inside(readings, limits) + gain)
+    return best if shares[best] >= needed else None
+
+
+def _share_inside(readings: Tensor, limits: Limits) -> float:
+    near, far = limits.workspace
+    return float(((readings >= near) & (readings <= far)).float().mean())
 
 
 def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
@@ -66,7 +93,7 @@ def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
     one_percent = len(readings) // 100
     low = float(readings.kthvalue(1 + one_percent).values)
     high = float(readings.kthvalue(len(readings) - one_percent).values)
-    fraction = float(((readings >= near) & (readings <= far)).float().mean())
+    fraction = _share_inside(readings, limits)
     return graded(
         "workspace_fraction",
         fraction,

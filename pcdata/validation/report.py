@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,7 +11,9 @@ from typing import Any
 from pcdata.validation.check import Check, Verdict, worst
 
 WHOLE = "*"  # the sample id of checks on the capture as a whole
-_EXAMPLES = 5  # samples named for every check that did not pass
+_EXAMPLES = 5  # samples named for every message
+_MESSAGES = 10  # kept for every check, so that memory stays constant
+_NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -32,20 +35,44 @@ class SampleReport:
 
 
 @dataclass
+class Message:
+    """What one check said of some samples, in the same words but for numbers."""
+
+    check: Check  # the first that said so
+    count: int = 0
+    examples: list[str] = field(default_factory=list)  # the first samples
+
+    def add(self, sample_id: str) -> None:
+        """Count one more sample."""
+        self.count += 1
+        if len(self.examples) < _EXAMPLES:
+            self.examples.append(sample_id)
+
+
+@dataclass
 class CheckSummary:
     """One check on one view, over all samples."""
 
     counts: Counter[Verdict] = field(default_factory=Counter)
     worst: Check | None = None  # the first one of the worst verdict
     examples: list[str] = field(default_factory=list)  # the first samples of the worst verdict
+    messages: dict[str, Message] = field(default_factory=dict)  # of the worst verdict, by their words
+    untold: int = 0  # samples of the worst verdict whose message is one too many to keep
 
     def add(self, sample_id: str, check: Check) -> None:
         """Count one more check."""
         self.counts[check.verdict] += 1
         if self.worst is None or check.verdict.severity > self.worst.verdict.severity:
-            self.worst, self.examples = check, []
-        if check.verdict is self.worst.verdict and len(self.examples) < _EXAMPLES:
+            self.worst, self.examples, self.messages, self.untold = check, [], {}, 0
+        if check.verdict is not self.worst.verdict:
+            return
+        if len(self.examples) < _EXAMPLES:
             self.examples.append(sample_id)
+        words = _NUMBER.sub("#", f"{check.found}\n{check.advice}".replace(sample_id, "#"))
+        if words in self.messages or len(self.messages) < _MESSAGES:
+            self.messages.setdefault(words, Message(check)).add(sample_id)
+        else:
+            self.untold += 1
 
 
 class Summary:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Protocol
 
-from pcdata.errors import IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
+from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
 from pcdata.functional.edge_offset import EdgeVotes
-from pcdata.io.source import Source
+from pcdata.io.source import Source, checked_ids
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.cameras import intrinsics_checks, pose_checks
 from pcdata.validation.check import Check, Verdict, worst
 from pcdata.validation.clouds import cloud_checks
 from pcdata.validation.coverage import coverage_checks
 from pcdata.validation.limits import Limits
-from pcdata.validation.pose_direction import PoseDirectionOverTime, direction_checks
+from pcdata.validation.pose_direction import direction_checks
+from pcdata.validation.pose_direction_over_time import PoseDirectionOverTime
 from pcdata.validation.raw_files import raw_value_checks
 from pcdata.validation.readings import reading_checks
 from pcdata.validation.registration import frame_votes, registration_check
@@ -47,7 +48,15 @@ def validate_frame(frame: DepthFrame, *, limits: Limits | None = None) -> list[C
     Args:
         frame: the capture as it was read, before any filter.
         limits: thresholds; None = the defaults, for a camera above a table.
+
+    Raises:
+        DTypeError: it is no frame.
     """
+    if not isinstance(frame, DepthFrame):
+        raise DTypeError(
+            f"validate_frame: frame must be a DepthFrame, got {type(frame).__name__}; source.load(id) makes one, and "
+            "validate_source judges a source with all its captures"
+        )
     return _frame_checks(frame, frame_votes(frame), limits or Limits())
 
 
@@ -55,15 +64,24 @@ def validate_source(source: Captures, *, limits: Limits | None = None) -> Iterat
     """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
-    report with a failed check, and the others follow. After a recording with colour a last report, with the sample id
-    :data:`WHOLE`, judges the registration over all captures together, which sees more rims than any single one.
+    report with a failed check, and the others follow. After a recording a last report, with the sample id
+    :data:`WHOLE`, judges over all captures together what single ones tell less surely: the registration of colour and
+    depth, and the direction of the poses.
 
     Args:
         source: anything with ``ids`` and ``load``; a :class:`Source` also has its files looked at.
         limits: thresholds; None = the defaults, for a camera above a table.
+
+    Raises:
+        DTypeError: it is no source.
+        CaptureError: it has no captures, or two with one id.
     """
-    series = _Series(limits or Limits())
-    for sample_id in source.ids:
+    return _reports(source, checked_ids("validate_source", source), limits or Limits())
+
+
+def _reports(source: Captures, ids: list[str], limits: Limits) -> Iterator[SampleReport]:
+    series = _Series(limits)
+    for sample_id in ids:
         yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
     if whole := series.whole():
         yield SampleReport(WHOLE, tuple(whole))
@@ -85,7 +103,9 @@ class _Series:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._over_time = (RepeatChecks(), ClockChecks(limits), PoseDirectionOverTime())
+        self._repeats = RepeatChecks()
+        self._clock = ClockChecks(limits)
+        self._poses = PoseDirectionOverTime()
         self._votes: list[EdgeVotes] = []  # by view, summed over the captures
         self._voted = 0
 
@@ -100,17 +120,21 @@ class _Series:
         if isinstance(capture, PointCloud):
             return [*checks, *cloud_checks(capture, self._limits)]
         votes = frame_votes(capture)
-        checks += _frame_checks(capture, votes, self._limits)
+        repeats = self._repeats.check(capture)
+        found = _frame_checks(capture, votes, self._limits, _views_failing(repeats, "repeated_depth"))
         self._add(votes)
-        for over_time in self._over_time:
-            checks += over_time.check(capture)
+        checks += [*found, *repeats, *self._clock.check(capture)]
+        # Depth of another moment or another unit contradicts right poses: it neither accuses them nor is kept.
+        if not _views_failing(checks, "repeated_depth", "depth_unit"):
+            checks += self._poses.check(capture)
         return checks
 
     def whole(self) -> list[Check]:
         """Judge what all captures tell together."""
-        if self._voted < 2:
-            return []
-        return [registration_check(votes, self._limits, view) for view, votes in enumerate(self._votes)]
+        checks = self._poses.whole()
+        if self._voted >= 2:
+            checks += [registration_check(votes, self._limits, view) for view, votes in enumerate(self._votes)]
+        return checks
 
     def _add(self, votes: list[EdgeVotes]) -> None:
         """Add up the votes, of captures with equal numbers of views and resolution."""
@@ -125,7 +149,9 @@ class _Series:
         self._voted += 1
 
 
-def _frame_checks(frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits) -> list[Check]:
+def _frame_checks(
+    frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits, repeated: Collection[int] = ()
+) -> list[Check]:
     unit = frame.provenance.get("metres_per_unit")
     checks = []
     for view, depth in enumerate(frame.depth):
@@ -133,9 +159,14 @@ def _frame_checks(frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits)
         checks += reading_checks(depth, limits, metres_per_unit=unit, view=view)
     checks += intrinsics_checks(frame.camera, limits)
     checks += pose_checks(frame)
-    direction = direction_checks(frame)
+    direction = direction_checks(frame, {*repeated, *_views_failing(checks, "depth_unit")})
     checks += direction
     if worst(direction) is not Verdict.FAIL:  # views carried the wrong way have no gap worth a number
         checks += overlap_checks(frame)
     checks += [registration_check(one, limits, view) for view, one in enumerate(votes)]
     return checks
+
+
+def _views_failing(checks: Iterable[Check], *names: str) -> set[int]:
+    failed = (check for check in checks if check.name in names and check.verdict is Verdict.FAIL)
+    return {check.view for check in failed if check.view is not None}

@@ -70,13 +70,15 @@ def _pose(result: OverlapResult, view: int) -> Check:
     verdict = _VERDICTS[camera.verdict]
     passes, fails = result.limits.shift
     found = f"out of place by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees"
-    if verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
+    if math.isinf(camera.shift):
+        found = "too far out of place to be measured; the others agree without it"
+    elif verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
         verdict, found = Verdict.WARN, f"not measurable: {'; '.join(camera.unmeasurable) or found}"
     return Check(
         name="view_pose",
         verdict=verdict,
         found=found,
-        value=None if found.startswith("not measurable") else camera.shift,
+        value=None if found.startswith("not measurable") or math.isinf(camera.shift) else camera.shift,
         threshold=passes,
         fails_at=fails,
         unit="m",
@@ -86,9 +88,12 @@ def _pose(result: OverlapResult, view: int) -> Check:
 
 
 def _is_certain(camera: CameraOverlap, limits: OverlapLimits) -> bool:
-    """Whether the camera is out of place by more than may pass, even when it is off by two standard deviations."""
-    shift = camera.shift - 2 * camera.shift_sigma
-    turn = camera.rotation_degrees - 2 * camera.rotation_sigma_degrees
+    """Whether what is measured is more than may pass, even when it is off by two of its standard deviations.
+
+    What the surfaces do not determine is left out of it: a camera that is off one way is off, whatever the other ways.
+    """
+    shift = camera.shift - 2 * camera.measured_shift_sigma
+    turn = camera.rotation_degrees - 2 * camera.measured_rotation_sigma_degrees
     return shift > limits.shift[0] or turn > limits.rotation_degrees[0]
 
 

@@ -38,7 +38,7 @@ def walls(tmp_path: Path) -> Path:
     root = tmp_path / "walls"
     (root / "depth").mkdir(parents=True)
     for name, distance in (("near", 0.6), ("far", 1.2)):
-        frame = wall(normal_distance=distance, noise=0.004 * distance**2, scale=1.005)
+        frame = wall(normal_distance=distance, noise=0.004 * distance**2, scale=1.003)
         write_depth(root / "depth" / f"{name}.png", frame.depth[0], metres_per_unit=0.0001, round_to_unit=True)
     k = frame.camera.to_dict()
     (fx, _, cx), (_, fy, cy), _ = k["intrinsics"][0]
@@ -52,7 +52,7 @@ def test_check_tells_one_line_per_capture(capsys, walls: Path):
     assert (code, err) == (0, "")
     far, near = out.splitlines()[2:4]
     assert far.split()[0] == "far"
-    assert float(far.split()[1]) == pytest.approx(1.206, abs=2e-3)
+    assert float(far.split()[1]) == pytest.approx(1.2036, abs=2e-3)
     assert float(near.split()[7]) == pytest.approx(1.44, rel=0.03)
     assert "verdict  pass: 2 of 2 captures in order" in out
 
@@ -61,14 +61,14 @@ def test_check_fails_on_bias_and_names_the_limit(capsys, walls: Path):
     code, out, _ = run(capsys, "calib", "check", walls, "--distance", "1.2", "--along", "normal")
     assert code == 1
     assert "near: bias, part of the distance is" in out
-    assert "must be <= 2 %" in out
+    assert "must be <= 0.5 %" in out
     assert "verdict  FAIL: 1 of 2 captures in order" in out
 
 
 def test_check_holds_noise_to_a_sensor(capsys, walls: Path):
     profile = sensor_profile("realsense_d435")
     code, out, _ = run(capsys, "calib", "check", walls, "--sensor", profile.name, "--limit", "1")
-    expected = math.hypot(profile.noise_at(1.206, focal=300.0), profile.depth_step / 12**0.5)
+    expected = math.hypot(profile.noise_at(1.2036, focal=300.0), profile.depth_step / 12**0.5)
     assert float(out.splitlines()[2].split()[8]) == pytest.approx(1000 * expected, rel=0.01)
     assert code == (0 if 1.5 * expected >= 0.004 * 1.2**2 * 1.0 else 1)
     code, out, _ = run(capsys, "calib", "check", walls, "--sensor", "photoneo_phoxi_m")  # a scanner is finer by far
@@ -77,6 +77,19 @@ def test_check_holds_noise_to_a_sensor(capsys, walls: Path):
     code, _, err = run(capsys, "calib", "check", walls, "--sensor", "realsense_d436")
     assert code == 2
     assert "realsense_d435" in err
+
+
+def test_check_names_a_bowl_and_tells_its_height(capsys, tmp_path: Path, walls: Path):
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "intrinsics.json").write_text((walls / "intrinsics.json").read_text())
+    bowl = wall(noise=0.001, bowl=0.012)
+    write_depth(tmp_path / "depth" / "bowl.png", bowl.depth[0], metres_per_unit=0.0001, round_to_unit=True)
+    for sensor in ((), ("--sensor", "realsense_d435")):
+        code, out, _ = run(capsys, "calib", "check", tmp_path, *sensor)
+        assert code == 1
+        assert out.splitlines()[0].split("  ")[-2].strip() == "warp mm"
+        assert float(out.splitlines()[2].split()[-2]) == pytest.approx(12.0, rel=0.05)
+        assert "bowl: warp is 1" in out
 
 
 # -- intrinsics ----------------------------------------------------------------------------------------------------

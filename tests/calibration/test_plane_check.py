@@ -25,13 +25,19 @@ def wall(
     noise: float = 0.0,  # metres, along z
     scale: float = 1.0,  # of a depth unit that is wrong
     fill: float = 1.0,
+    bowl: float = 0.0,  # metres, how much deeper the corners of the central half are than its centre
     camera: Camera = CAMERA,
 ) -> DepthFrame:
     generator = torch.Generator().manual_seed(0)
     normal = torch.tensor([0.0, math.sin(math.radians(tilt)), math.cos(math.radians(tilt))], dtype=torch.float64)
     rays = pixel_rays(camera.intrinsics, camera.size, camera.distortion)
     depth = normal_distance / (rays @ normal[:2] + normal[2])
-    depth = scale * depth + noise * torch.randn(depth.shape, generator=generator, dtype=torch.float64)
+    v, u = torch.meshgrid(*(torch.linspace(-2, 2, side, dtype=torch.float64) for side in camera.size), indexing="ij")
+    depth = (
+        scale * depth
+        + bowl * (u**2 + v**2) / 2
+        + noise * torch.randn(depth.shape, generator=generator, dtype=torch.float64)
+    )
     keep = torch.rand(depth.shape, generator=generator) < fill
     return DepthFrame(depth=torch.where(keep, depth, 0.0).float(), camera=camera)
 
@@ -100,14 +106,44 @@ def test_noise_is_judged_by_the_sensor_s_own_model_where_there_is_one() -> None:
 
 
 def test_each_limit_can_fail_alone() -> None:
-    frame = wall(noise=0.003, scale=1.01)
+    frame = wall(noise=0.003, scale=1.004)
     assert check_plane(frame, distance=1.0).passed
     for limits, name in [
         (PlaneLimits(max_rms=0.002), "depth RMS, part of the distance"),
-        (PlaneLimits(max_bias=0.005), "bias, part of the distance"),
+        (PlaneLimits(max_bias=0.003), "bias, part of the distance"),
+        (PlaneLimits(max_warp=0.00001), "warp"),
     ]:
         check = check_plane(frame, distance=1.0, limits=limits)
         assert [finding.name for finding in check.findings if not finding.passed] == [name]
+
+
+@pytest.mark.parametrize("bowl", [0.008, -0.008])
+@pytest.mark.parametrize("tilt", [0.0, 15.0])
+def test_a_bowl_is_measured_by_its_height_and_fails_though_its_rms_is_small(bowl: float, tilt: float) -> None:
+    """8 mm at 1 m: a quarter of that is its RMS, which noise may be and a shape may not."""
+    check = check_plane(wall(bowl=bowl, tilt=tilt, noise=0.001))
+    assert check.warp == pytest.approx(0.008, rel=0.05)
+    assert check.depth_rms < 0.003
+    assert [finding.name for finding in check.findings if not finding.passed] == ["warp"]
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.005])
+def test_noise_and_tilt_are_no_warp(noise: float) -> None:
+    assert check_plane(wall(noise=noise, tilt=30.0)).warp < 0.2 * noise  # 0.1 is expected of six terms at the corners
+
+
+def test_a_bias_of_8_mm_at_1_m_fails_with_and_without_a_sensor_s_model() -> None:
+    frame = wall(normal_distance=1.0, scale=0.992, noise=0.001)
+    plain = check_plane(frame, distance=1.0)
+    modelled = check_plane(frame, distance=1.0, noise=lambda z: 0.0037 * z**2)
+    assert [finding.name for finding in plain.findings if not finding.passed] == ["bias, part of the distance"]
+    assert [finding.name for finding in modelled.findings if not finding.passed] == ["size of the bias"]
+    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0055 * z**2).passed, "1.5 times 5.5 mm is more than 8"
+
+
+def test_no_model_asks_for_more_than_a_wall_and_a_tape_measure_can_show() -> None:
+    frame = wall(scale=1.0005, noise=0.0001, bowl=0.0008)
+    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0003 * z**2).passed
 
 
 def test_quantised_depth_without_noise_is_no_clutter() -> None:

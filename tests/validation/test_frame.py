@@ -71,6 +71,25 @@ def test_a_far_scene_is_no_wrong_unit_once_the_workspace_is_given() -> None:
     assert not {"depth_unit", "workspace_fraction"} & failed(far, Limits(workspace=(1.0, 30.0)))
 
 
+@pytest.mark.parametrize("distance", [2.01, 2.5, 3.0])
+def test_a_scene_at_the_end_of_the_workspace_is_no_wrong_unit(distance: float) -> None:
+    """A deep one: part of it lies within 2 m, and ten times nearer not much more would lie beyond 0.2 m."""
+    frame = scene(num_views=1).frame
+    depth = distance * torch.linspace(0.3, 1.7, frame.depth.numel()).reshape(frame.depth.shape)
+    spread = replace(frame, depth=depth, provenance={"metres_per_unit": 0.001})
+    check = next(one for one in validate_frame(spread) if one.name == "depth_unit")
+    assert check.verdict is Verdict.PASS
+    assert check.value == pytest.approx(distance, abs=0.01)
+    assert check.threshold == 2 * Limits().workspace[1]
+
+
+def test_a_narrow_scene_just_beyond_the_workspace_warns_since_a_unit_explains_it() -> None:
+    frame = scene(num_views=1).frame
+    narrow = replace(frame, depth=2.5 + 0.1 * frame.depth)
+    assert verdicts(validate_frame(narrow), "depth_unit") == [Verdict.WARN]
+    assert "multiply depth by 0.1" in advice(narrow, "depth_unit")
+
+
 @pytest.mark.parametrize(
     ("rows", "columns", "place"),
     [
@@ -170,6 +189,22 @@ def test_a_camera_that_was_moved_by_10_mm_fails_and_is_named() -> None:
     checks = validate_frame(frame)
     assert verdicts(checks, "view_gap") == [Verdict.FAIL]
     assert [check.view for check in checks if check.name == "view_pose" and check.verdict is Verdict.FAIL] == [1]
+
+
+def test_a_camera_off_along_what_is_determined_fails_though_sliding_is_not_determined() -> None:
+    """A bare table fixes height and tilt alone; a camera that is 10 mm too high is wrong wherever it may have slid."""
+    bare = tabletop(0, 0, 3, noise="stereo", floor=False, size=(360, 480)).frame
+    depth = torch.zeros_like(bare.depth)
+    depth[:, 120:240, 150:330] = bare.depth[:, 120:240, 150:330]  # without the table's edges, which show sides
+    assert bare.world_from_camera is not None
+    poses = bare.world_from_camera.clone()
+    poses[1, 2, 3] += 0.010
+    checks = validate_frame(replace(bare, depth=depth, colors=None, world_from_camera=poses))
+    pose = next(one for one in checks if one.name == "view_pose" and one.view == 1)
+    assert pose.verdict is Verdict.FAIL
+    assert pose.value == pytest.approx(0.010, abs=0.001)
+    level = [one for one in validate_frame(replace(bare, depth=depth, colors=None)) if one.name == "view_pose"]
+    assert all(one.verdict is not Verdict.FAIL for one in level)
 
 
 def test_of_views_that_fail_in_direction_no_gap_is_told() -> None:

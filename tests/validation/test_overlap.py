@@ -137,6 +137,22 @@ def test_bare_clouds_are_compared_by_nearest_neighbours():
     assert found.pairs[0].meeting is None
 
 
+@pytest.mark.parametrize(("seed", "num_views"), [(0, 3), (2, 4)])
+def test_a_camera_that_is_far_off_is_named_and_the_others_are_not_blamed(seed, num_views):
+    """Turned by 40 degrees about the table's normal it finds partners on the table by chance."""
+    frame = rig(seed, num_views)
+    cosine, sine = math.cos(math.radians(40)), math.sin(math.radians(40))
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[cosine, -sine], [sine, cosine]])
+    poses = frame.world_from_camera.clone()
+    poses[1] = turn @ poses[1]
+    found = verify_overlap(replace(frame, world_from_camera=poses))
+    assert found.wrong == ("camera 1",)
+    assert [camera.name for camera in found.cameras if camera.verdict == "fail"] == ["camera 1"]
+    assert "recalibrate camera 1" in found.advice[0]
+    json.dumps(found.to_json(), allow_nan=False)
+
+
 def test_numbers_are_plain_json_and_have_names():
     found = verify_overlap(rig(0, 3), names=["left", "right", "top"])
     plain = json.loads(json.dumps(found.to_json(), allow_nan=False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import tracemalloc
@@ -14,13 +15,14 @@ import pytest
 import torch
 from PIL import Image
 
-from pcdata import open_source, validate_source
-from pcdata.errors import CaptureError
+from pcdata import open_source, validate_frame, validate_source
+from pcdata.errors import CaptureError, DTypeError
 from pcdata.functional import rigid
 from pcdata.io import read_depth, write_pcd
+from pcdata.report.validation import validation_text
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import SyntheticSource, look_at, tabletop
-from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict
+from pcdata.validation import WHOLE, Check, Limits, SampleReport, Summary, Verdict
 from tests.validation.captures import SIZE, Frames, scene, store, verdicts
 
 
@@ -95,10 +97,11 @@ def moving_camera(count: int = 4) -> list[DepthFrame]:
 def test_the_poses_of_a_moving_camera_are_judged_by_what_it_saw_before() -> None:
     frames = moving_camera()
     good = checked(frames)
-    assert [verdicts(report.checks, "pose_direction") for report in good[1:4]] == [[Verdict.PASS]] * 3
+    assert [verdicts(report.checks, "pose_direction") for report in good[1:]] == [[Verdict.PASS]] * 4
     inverted = [replace(f, world_from_camera=rigid.invert_rigid(f.world_from_camera)) for f in frames]  # type: ignore[arg-type]
     bad = checked(inverted)
-    assert all("pose_direction" in failed(report) for report in bad[1:4])
+    assert verdicts(bad[1].checks, "pose_direction") == [Verdict.WARN], "one pair may be an accident"
+    assert all("pose_direction" in failed(report) for report in bad[2:])
     assert "pose_direction" not in {check.name for check in bad[0].checks}, "one view alone tells nothing"
 
 
@@ -124,6 +127,16 @@ def test_memory_does_not_grow_with_the_number_of_captures() -> None:
 
     peak(2)  # imports and caches
     assert peak(24) < 1.2 * peak(6) + 50_000
+
+
+@pytest.mark.parametrize("given", [None, "captures", torch.zeros(2)])
+def test_what_is_no_source_and_no_frame_is_refused_with_what_to_do(given: object) -> None:
+    with pytest.raises(DTypeError, match=r"validate_source: source must have ids and load\(id\), got .*open_source"):
+        validate_source(given)  # type: ignore[arg-type]
+    with pytest.raises(DTypeError, match=r"validate_frame: frame must be a DepthFrame, got .*source.load\(id\)"):
+        validate_frame(given)  # type: ignore[arg-type]
+    with pytest.raises(CaptureError, match=r"validate_source: .* has no samples"):
+        validate_source(Frames([]))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -277,7 +290,8 @@ def test_on_a_real_recording_inverted_poses_are_named(test_data: Path, tmp_path:
         np.savetxt(pose, np.linalg.inv(np.loadtxt(pose)), fmt="%.17g")
     shutil.copy(source.path / "camera-intrinsics.txt", tmp_path)
     reports = list(validate_source(open_source(tmp_path), limits=Limits(workspace=(0.3, 5.0))))
-    for report in reports[1:3]:
+    assert verdicts(reports[1].checks, "pose_direction") == [Verdict.WARN]
+    for report in reports[2:]:
         check = next(one for one in report.checks if one.name == "pose_direction")
         assert check.verdict is Verdict.FAIL
         assert "camera_from_world" in check.advice
@@ -300,6 +314,27 @@ def test_a_summary_counts_verdicts_and_names_the_first_of_the_worst() -> None:
     assert plain["verdict"] == "fail"
     assert plain["samples"] == {"pass": 3, "warn": 0, "fail": 1}
     assert json.loads(json.dumps(reports[3].to_json(), allow_nan=False))["verdict"] == "fail"
+
+
+def test_the_text_has_one_line_for_each_distinct_message_with_its_captures() -> None:
+    def refused(sample_id: str, found: str) -> SampleReport:
+        return SampleReport(sample_id, (Check(name="readable", verdict=Verdict.FAIL, found=found),))
+
+    cut = [refused(f"{n:04d}", f"read_depth: depth/{n:04d}.png: image file is truncated") for n in range(7)]
+    empty = refused("0008", "read_depth: depth/0008.png: not an image")
+    lines = [line for line in validation_text(Summary([*cut, empty])).splitlines() if line.startswith("FAIL readable")]
+    assert lines == [
+        "FAIL readable (0000, 0001, 0002, 0003, 0004, ...): read_depth: depth/0000.png: image file is truncated",
+        "FAIL readable (0008): read_depth: depth/0008.png: not an image",
+    ]
+
+
+def test_messages_kept_are_bounded_and_the_rest_is_counted() -> None:
+    words = ["".join(letters) for letters in itertools.product("abcd", repeat=2)]
+    checks = [Check(name="readable", verdict=Verdict.FAIL, found=found) for found in words]
+    text = validation_text(Summary(SampleReport("one", (check,)) for check in checks))
+    assert text.count("FAIL readable") == 10
+    assert "readable: other words in 6 captures more" in text
 
 
 def test_nothing_to_judge_passes() -> None:
