@@ -94,7 +94,9 @@ def check_files(
     """
     contract = contract_named(model, **choices)
     summary = Summary()
-    for name, arrays, channels in itertools.islice(read_samples(path, contract, keys), limit):
+    made = _category_tensors(contract, choices)
+    for name, stored, channels in itertools.islice(read_samples(path, contract, keys), limit):
+        arrays = {**made, **stored}
         declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
         summary.add(SampleReport(name, tuple(_checks(arrays, model, choices, declared, False))))
     _require_samples(summary, str(path))
@@ -133,6 +135,17 @@ def _checks(
         return [Check(name="channels", verdict=Verdict.FAIL, found=str(error), advice="use the preset's pipeline")]
     checks = list(cheap_checks(batch, contract))
     return checks if cheap else [*checks, *value_checks(batch, contract)]
+
+
+def _category_tensors(contract: ModelContract, choices: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the one-hot tensors that a chosen category makes: files hold its number, or nothing."""
+    if "category" not in choices:
+        return {}
+    return {
+        spec.key: np.eye(spec.width, dtype=spec.dtype)[choices["category"]].reshape([1] * (len(spec.axes) - 1) + [-1])
+        for spec in contract.tensors
+        if spec.content == "category"
+    }
 
 
 def _require_samples(summary: Summary, what: str) -> None:

@@ -150,7 +150,7 @@ def _move_directions(matrix: Tensor, directions: Tensor) -> Tensor:
     length = directions.norm(dim=-1, keepdim=True)
     if bool((length == 0).any()):
         raise PoseError(
-            f"directions: {int((length == 0).sum())} of {length.numel()} have the length 0, and so no direction; drop them"
+            f"directions: {int((length == 0).sum())} of {length.numel()} have the length 0, so no direction; drop them"
         )
     return torch.nn.functional.normalize(directions / length @ linear.mT, dim=-1)
 
