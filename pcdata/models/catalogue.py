@@ -159,7 +159,10 @@ def _choose_voxel(chosen: ModelContract, size: Any) -> ModelContract:
 def _choose_channels(chosen: ModelContract, names: Any) -> ModelContract:
     original = CONTRACTS[chosen.name]
     known = [channel for tensor in original.tensors for channel in tensor.channels]
-    wanted = {names} if isinstance(names, str) else set(names)
+    listed = [names] if isinstance(names, str) else names
+    if not isinstance(listed, (list, tuple, set, frozenset)) or not all(isinstance(name, str) for name in listed):
+        raise ConfigError(f"{chosen.name}: channels must be {CHOICES['channels']}, got {names!r}")
+    wanted = set(listed)
     needed = {channel.name for channel in known if not channel.optional}
     if wanted - {channel.name for channel in known}:
         raise ConfigError(f"{chosen.name}: channels are {[channel.name for channel in known]}, got {sorted(wanted)}")
@@ -174,7 +177,7 @@ def _with_channels(tensor: InputTensor, wanted: set[str]) -> InputTensor:
 def _choose_category(chosen: ModelContract, category: Any) -> ModelContract:
     if "category" not in CONTRACTS[chosen.name].choices:
         return _unknown(chosen, "category")
-    if not isinstance(category, int) or not 0 <= category < 16:
+    if not isinstance(category, int) or isinstance(category, bool) or not 0 <= category < 16:
         raise ConfigError(f"{chosen.name}: category must be {CHOICES['category']}, got {category!r}")
     return replace(chosen, choices=tuple(choice for choice in chosen.choices if choice != "category"))
 

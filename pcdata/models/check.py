@@ -162,6 +162,10 @@ def _as_batch(
         return sample
     if isinstance(sample, (PointCloud, DepthFrame)):
         return batch_of([sample], contract, choices)
+    if not isinstance(sample, Mapping):
+        raise DTypeError(
+            f"a sample must be a batch, a cloud, a depth image or named tensors, got {type(sample).__name__}"
+        )
     tensors = {key: _as_tensor(key, value) for key, value in sample.items() if isinstance(value, (Tensor, np.ndarray))}
     return ModelBatch(
         tensors=tensors, frame_id=declared["frame_id"], unit=declared["unit"], channels=declared["channels"] or {}
@@ -169,9 +173,13 @@ def _as_batch(
 
 
 def _as_tensor(key: str, value: Tensor | np.ndarray) -> Tensor:
-    if isinstance(value, np.ndarray) and value.dtype.kind not in "biuf":
+    if isinstance(value, Tensor):
+        return value
+    if value.dtype.kind not in "biuf":
         raise DTypeError(f"{key}: must hold numbers, got {value.dtype}")
-    return value if isinstance(value, Tensor) else torch.from_numpy(np.ascontiguousarray(value))
+    native = value.dtype.newbyteorder("=") if value.dtype.itemsize <= 8 else np.dtype(np.float64)  # all that torch has
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(np.ascontiguousarray(value, native))
 
 
 def _samples(data: Any) -> Iterable[tuple[str, Any]]:

@@ -33,7 +33,7 @@ def layout_fault(tensor: Tensor, spec: InputTensor, contract: ModelContract) -> 
         if (axis == "C" and size != spec.width) or (axis.isdigit() and size != int(axis)):
             turned = "; are the axes swapped?" if spec.width in tensor.shape else ""
             return f"{spec.key} is {tuple(tensor.shape)}, not {wanted}{turned}"
-    return ""
+    return f"{spec.key} is {tuple(tensor.shape)}: there is nothing in it" if tensor.numel() == 0 else ""
 
 
 def verdict(name: str, fault: str, advice: str, *, found: str, unknown: bool = False) -> Check:

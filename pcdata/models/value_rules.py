@@ -30,11 +30,13 @@ _ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.
 
 
 def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
-    """Yield one check per rule; tensors whose layout is wrong are left out."""
+    """Yield one check per rule; tensors of a wrong layout or kind of number, which other rules say, are left out."""
     sound = [
         spec
         for spec in contract.tensors
-        if spec.key in batch.tensors and not layout_fault(batch[spec.key], spec, contract)
+        if spec.key in batch.tensors
+        and not layout_fault(batch[spec.key], spec, contract)
+        and batch[spec.key].is_floating_point() == spec.dtype.startswith("float")
     ]
     yield _finite(batch)
     if any(not bool(torch.isfinite(tensor).all()) for tensor in batch.values() if tensor.is_floating_point()):
