@@ -68,7 +68,7 @@ def machine() -> dict[str, Any]:
 def tensor(voxel_size: float, multiple: float, frames: int) -> dict[str, Any]:
     """Times, memory and agreement of pcdata and Open3D's tensor grid on the frames of a room."""
     lengths = ["--voxel-size", str(voxel_size), "--multiple", str(multiple), "--frames", str(frames)]
-    names = ["pcdata", "pcdata, carving", "Open3D tensor"]
+    names = ["pcdata", "pcdata, no carving", "Open3D tensor"]
     found = run(1, names, *lengths, "--agreement")
     found["two threads"] = run(2, names, *lengths)["libraries"]
     found["memory"] = {name: run(1, [name], *lengths, "--memory")["libraries"][name] for name in names}

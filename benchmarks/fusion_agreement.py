@@ -3,8 +3,8 @@
 Both average signed distances along z at the nearest pixel, so they can only differ in which readings join the average:
 
 * A reading more than a truncation behind a voxel is free space there. Open3D averages it in as a full truncation, in
-  the blocks of 16 x 16 x 16 that the view touches; pcdata leaves it out, unless ``carve=True`` (then in all voxels seen
-  before).
+  the blocks of 16 x 16 x 16 that the view touches; pcdata does so in the blocks of 8 x 8 x 8 that it touches, in voxels
+  that were seen before, and with ``carve="never"`` nowhere.
 * Open3D opens the blocks along every fourth pixel's ray, pcdata along every pixel's: at rims and on thin things some
   voxels near the surface belong to no block, or to none that this view touches.
 * Open3D does not read an image's last column and row: it asks that the coordinate of a pixel's corner, with its

@@ -30,8 +30,10 @@ from torch import Tensor
 
 import pcdata
 from pcdata.structures import DepthFrame, TSDFVolume
+from pcdata.structures.tsdf_volume import Carving
 
-LIBRARIES = ("pcdata", "pcdata, carving", "Open3D tensor", "Open3D legacy")
+_WAIT = 0.03  # seconds: OpenMP threads spin for 10 ms after they have worked
+LIBRARIES = ("pcdata", "pcdata, no carving", "Open3D tensor", "Open3D legacy")
 
 
 class Library(ABC):
@@ -74,7 +76,7 @@ class Library(ABC):
 class Ours(Library):
     """pcdata's volume."""
 
-    def __init__(self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: bool) -> None:
+    def __init__(self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: Carving) -> None:
         super().__init__()
         self._frames = frames
         self._lengths = {"voxel_size": voxel_size, "truncation": multiple * voxel_size}
@@ -198,7 +200,7 @@ def library(name: str, frames: Sequence[DepthFrame], arguments: argparse.Namespa
         return Theirs(frames, *lengths)
     if name == "Open3D legacy":
         return Legacy(frames, *lengths, arguments.legacy_python)
-    return Ours(frames, *lengths, carve=name == "pcdata, carving")
+    return Ours(frames, *lengths, carve="never" if name == "pcdata, no carving" else "near")
 
 
 def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size: float) -> dict[str, Any]:
@@ -207,12 +209,15 @@ def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size
     apart = {
         name: surfaces_apart(one.cloud, theirs.cloud, voxel_size) for name, one in used.items() if isinstance(one, Ours)
     }
-    causes = edges_by_cause(used["pcdata"].cloud, theirs.cloud, theirs.grid, frames, theirs.views)
+    causes = edges_by_cause(used["pcdata, no carving"].cloud, theirs.cloud, theirs.grid, frames, theirs.views)
     return {"apart": apart, "causes": causes}
 
 
 def timed(body: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds of the processor, all threads together, and of the clock."""
+    """Seconds of the processor, all threads together, and of the clock, once others' threads have come to rest."""
+    until = time.perf_counter() + _WAIT
+    while time.perf_counter() < until:
+        pass  # busy: an idle processor would clock down
     cpu, wall = time.process_time(), time.perf_counter()
     body()
     return time.process_time() - cpu, time.perf_counter() - wall

@@ -60,7 +60,7 @@ def _truth(result: dict[str, Any]) -> str:
         "noise": lambda row: row["noise"],
         "mean error": lambda row: f"{row['mean error, mm']:.2f} mm",
         "of the best view alone": lambda row: f"{row['best single view, mean error, mm']:.2f} mm",
-        "with carving": lambda row: f"{row['carving, mean error, mm']:.2f} mm",
+        "without carving": lambda row: f"{row['no carving, mean error, mm']:.2f} mm",
         "covered within 4 mm": lambda row: f"{100 * row['covered within 4 mm']:.2f} %",
         "median normal error on the table": lambda row: f"{row['median normal error, degrees']:.1f} degrees",
         "labels right away from contacts": lambda row: f"{100 * row['labels right away from contacts']:.2f} %",
@@ -109,7 +109,7 @@ def _agreement(runs: list[dict[str, Any]]) -> str:
         for name, row in run["apart"].items():
             apart = [_length(row[f"{way}, mm"]) for way in ("ours to theirs", "theirs to ours")]
             counts = [f"{row[kind] / 1e6:.2f} million" for kind in ("points", "Open3D points")]
-            setting = "carving" if "carving" in name else "as it is"
+            setting = "without carving" if "carving" in name else "as it is"
             rows.append([*_lengths(run), setting, f"{run['voxel mm'] / 4:.2f} mm", *apart, *counts])
     return _markdown(header, rows)
 

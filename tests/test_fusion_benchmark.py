@@ -62,7 +62,7 @@ def frames():
 def test_averages_computed_anew_put_the_points_where_the_volume_has_them(benchmark, frames) -> None:
     pytest.importorskip("open3d")
     agreement: ModuleType = benchmark("fusion_agreement")
-    volume = TSDFVolume(voxel_size=VOXEL)
+    volume = TSDFVolume(voxel_size=VOXEL, carve="never")
     for frame in frames:
         volume.integrate(frame)
     points = volume.extract_points().points
@@ -86,7 +86,7 @@ def test_every_difference_to_open3d_has_a_known_cause(benchmark, frames) -> None
     agreement, peer = benchmark("fusion_agreement"), benchmark("fusion_peer")
     views = [peer.Open3DView.of(frame) for frame in frames]
     grid = peer.Open3DGrid(VOXEL, MULTIPLE, peer.room_for(views, VOXEL, MULTIPLE))
-    volume = TSDFVolume(voxel_size=VOXEL)
+    volume = TSDFVolume(voxel_size=VOXEL, carve="never")
     for frame, view in zip(frames, views, strict=True):
         grid.integrate(view)
         volume.integrate(frame)
@@ -101,12 +101,13 @@ def test_every_difference_to_open3d_has_a_known_cause(benchmark, frames) -> None
 
 
 @pytest.mark.open3d
-def test_carving_gives_the_surface_of_open3d(benchmark, frames) -> None:
+@pytest.mark.parametrize("carve", ["near", "everywhere"])
+def test_carving_gives_the_surface_of_open3d(benchmark, frames, carve) -> None:
     """Like with like: both count free space, up to which voxels it is counted in."""
     pytest.importorskip("open3d")
     agreement, peer = benchmark("fusion_agreement"), benchmark("fusion_peer")
     theirs = peer.open3d_surface(frames, VOXEL)
-    volume = TSDFVolume(voxel_size=VOXEL, carve=True)
+    volume = TSDFVolume(voxel_size=VOXEL, carve=carve)
     for frame in frames:
         volume.integrate(frame)
     row = agreement.surfaces_apart(volume.extract_points().points, theirs, VOXEL)

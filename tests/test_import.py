@@ -50,10 +50,10 @@ print(json.dumps(sorted(set(sys.modules) - before)))
 
 def test_transforms_are_imported_in_a_blink():
     code = (
-        "import time, torch; start = time.perf_counter(); import pcdata, pcdata.transforms;"
-        "print(time.perf_counter() - start)"
+        "import time, torch; start = time.process_time(); import pcdata, pcdata.transforms;"
+        "print(time.process_time() - start)"
     )
-    # Another process may have had the core: one quick import of three is proof enough.
+    # The time on a core of one's own, whatever else the machine does; one quick import of three is proof enough.
     assert any(float(in_a_new_process(code)) < 0.3 for _ in range(3))
 
 

@@ -18,7 +18,12 @@ def add_to(commands: Any) -> None:
 
     build = commands.add_parser("build", help="build a dataset from captures")
     build.add_argument("config", metavar="CONFIG", help="YAML file; see configs/ for examples")
-    build.add_argument("--source", required=True, metavar="PATH", help="folder of captures, or one cloud file")
+    build.add_argument(
+        "--source",
+        required=True,
+        metavar="PATH",
+        help="folder of captures, or of several cameras' folders, or one cloud file",
+    )
     build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
     add_capture_options(build)
     build.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")

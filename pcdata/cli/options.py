@@ -11,10 +11,10 @@ def add_capture_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--kind", metavar="LAYOUT", help="capture layout, where it cannot be told from the files")
     command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
     command.add_argument(
-        "--calibration", metavar="FILE", help="calibration file that replaces the capture's intrinsics"
+        "--calibration", metavar="FILE", help="calibration file: its intrinsics, and with --frame its poses, are used"
     )
     command.add_argument("--camera", metavar="NAME", help="which camera of the calibration (default: the only one)")
-    command.add_argument("--frame", metavar="NAME", help="frame that the camera's pose leads to, such as base")
+    command.add_argument("--frame", metavar="NAME", help="frame that the poses lead to, such as base")
 
 
 def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:

@@ -19,13 +19,13 @@ FAILED = 1  # exit code of a step whose limits do not hold
 def add_steps(steps: Any) -> None:
     """Add both steps under ``pcdata calib``."""
     overlap = steps.add_parser("overlap", help="do several cameras agree, and if not, which one is wrong")
-    _add_rig_options(overlap)
+    _add_rig_options(overlap, needs_calibration=False)
     overlap.add_argument("--json", metavar="FILE", help="write every number there")
     overlap.add_argument("--figure", metavar="PNG", help="draw the cameras' points over each other there")
     overlap.set_defaults(run=_overlap)
 
     refine = steps.add_parser("refine", help="propose better poses for several cameras, into a new file")
-    _add_rig_options(refine)
+    _add_rig_options(refine, needs_calibration=True)
     refine.add_argument("--out", required=True, metavar="NEW", help="calibration file to write; must not exist")
     refine.add_argument("--fixed", metavar="NAME", help="camera that stays (default: the one that agrees best)")
     refine.add_argument("--method", default="pcdata", metavar="NAME", help="pcdata (default), small_gicp or open3d")
@@ -36,11 +36,14 @@ def add_steps(steps: Any) -> None:
     refine.set_defaults(run=_refine)
 
 
-def _add_rig_options(command: argparse.ArgumentParser) -> None:
+def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: bool) -> None:
     command.add_argument("source", metavar="SOURCE", help="folder with one folder of captures per camera, by its name")
-    command.add_argument("--calibration", required=True, metavar="FILE", help="calibration with the cameras and poses")
-    command.add_argument("--frame", default="base", metavar="NAME", help="frame they meet in (default: base)")
-    command.add_argument("--kind", metavar="LAYOUT", help="capture layout, where it cannot be told from the files")
+    command.add_argument(
+        "--calibration", required=needs_calibration, metavar="FILE", help="calibration with the cameras and poses"
+    )
+    command.add_argument(
+        "--frame", metavar="NAME", help="frame they meet in (default: base with a calibration, else the captures' own)"
+    )
     command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
     command.add_argument("--limit", type=positive, default=5, metavar="N", help="only the first N captures (default 5)")
 
@@ -49,7 +52,7 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
 
-    rig, _ = _open(arguments)
+    rig = _open(arguments, arguments.calibration)
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
     result = verify_overlap(*captures, names=rig.names)
     print(result.text())
@@ -61,12 +64,13 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
 
 
 def _refine(arguments: argparse.Namespace) -> None:
-    from pcdata.calibration import refine_extrinsics
+    from pcdata.calibration import Calibration, refine_extrinsics
     from pcdata.errors import ConfigError
 
     if Path(arguments.out).exists():
         raise ConfigError(f"calib refine: {arguments.out} exists; name a new file, a refinement replaces none")
-    rig, calibration = _open(arguments)
+    calibration = Calibration.load(arguments.calibration)
+    rig = _open(arguments, calibration)
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
     refinement = refine_extrinsics(
         captures,
@@ -81,11 +85,10 @@ def _refine(arguments: argparse.Namespace) -> None:
     print(f"\nwritten to {arguments.out}; {arguments.calibration} is unchanged")
 
 
-def _open(arguments: argparse.Namespace) -> tuple[RigSource, Calibration]:
-    from pcdata.calibration import Calibration
+def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> RigSource:
     from pcdata.io.rig import RigSource
 
-    calibration = Calibration.load(arguments.calibration)
-    options = {} if arguments.metres_per_unit is None else {"metres_per_unit": arguments.metres_per_unit}
-    rig = RigSource(arguments.source, calibration, frame_id=arguments.frame, kind=arguments.kind, **options)
-    return rig, calibration
+    frame = arguments.frame or (None if calibration is None else "base")
+    return RigSource(
+        arguments.source, calibration=calibration, frame_id=frame, metres_per_unit=arguments.metres_per_unit
+    )

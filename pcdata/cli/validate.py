@@ -15,8 +15,10 @@ from pcdata.cli.progress import Progress
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
-    validate = commands.add_parser("validate", help="check raw captures, each camera on its own, before any fusion")
-    validate.add_argument("path", metavar="PATH", help="folder of captures, or one cloud file")
+    validate = commands.add_parser("validate", help="check raw captures, each camera alone and against others")
+    validate.add_argument(
+        "path", metavar="PATH", help="folder of captures, or of several cameras' folders, or one cloud file"
+    )
     add_capture_options(validate)
     validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     depths = validate.add_mutually_exclusive_group()

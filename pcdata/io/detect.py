@@ -12,12 +12,13 @@ from pcdata.io.cloud_files import CloudFilesSource
 from pcdata.io.folder import FolderSource
 from pcdata.io.graspnet import GraspNetSource
 from pcdata.io.realsense_bag import RealSenseBagSource
+from pcdata.io.rig import RigSource
 from pcdata.io.seven_scenes import SevenScenesSource
 from pcdata.io.source import Source
 
 LAYOUTS: dict[str, type[Source]] = {
     layout.kind: layout
-    for layout in (FolderSource, GraspNetSource, SevenScenesSource, RealSenseBagSource, CloudFilesSource)
+    for layout in (FolderSource, RigSource, GraspNetSource, SevenScenesSource, RealSenseBagSource, CloudFilesSource)
 }
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from torch import Tensor
 
@@ -80,6 +81,7 @@ class FolderSource(Source):
         if frame_id and stated.frame_id not in (None, frame_id):
             raise CaptureError(f"{present[0]}: says frame_id {stated.frame_id!r}, the argument {frame_id!r}; drop one")
         self.frame_id = frame_id or stated.frame_id or "world"
+        self.frame_is_stated = bool(frame_id or stated.frame_id)
         self.camera = stated.camera
         self.world_from_camera: Tensor | None = None  # of a camera that stands still
         self._calibrated: dict[str, str] = {}
@@ -111,7 +113,7 @@ class FolderSource(Source):
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
         self._positions = sequence_positions(self._ids)
         times = path / _TIMESTAMPS
-        self._times = read_timestamps(times, self._ids) if times.is_file() else {}
+        self.timestamps = read_timestamps(times, self._ids) if times.is_file() else {}  # seconds by id
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -121,6 +123,14 @@ class FolderSource(Source):
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role."""
         return {role: found[sample_id] for role, found in self._files.items()}
+
+    def load(self, sample_id: str) -> DepthFrame:
+        """Read one sample, always a depth frame.
+
+        Raises:
+            CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
+        """
+        return cast(DepthFrame, super().load(sample_id))
 
     def _load(self, sample_id: str) -> DepthFrame:
         files = self.files(sample_id)
@@ -135,7 +145,7 @@ class FolderSource(Source):
                 **self.provenance(sample_id),
                 "metres_per_unit": self.metres_per_unit,
                 **self._calibrated,
-                **({"timestamps": [self._times[sample_id]]} if self._times else {}),
+                **({"timestamps": [self.timestamps[sample_id]]} if self.timestamps else {}),
             },
             background_label=self.background_label,
         )
@@ -163,7 +173,7 @@ def _override(
     frame: str | None,  # where the camera's pose shall lead to; None = its pose is not asked for
 ) -> tuple[Camera, Tensor | None, dict[str, str]]:  # camera, its pose, provenance
     """Take the camera from a calibration, and its pose too if that is asked for and there are transforms."""
-    known = calibration if isinstance(calibration, Calibration) else Calibration.load(calibration)
+    known, origin = opened_calibration(calibration)
     name = known.camera_name(name)
     camera = known.camera(name)
     if camera.size != stated.size:
@@ -172,5 +182,11 @@ def _override(
             f"{camera.size[1]}x{camera.size[0]}; calibrate at this resolution, or rescale with Camera.resized"
         )
     pose = known.transform(frame, name) if frame and known.transforms else None
-    origin = "given as an object" if calibration is known else Path(os.fspath(calibration)).name  # type: ignore[arg-type]
     return camera, pose, {"calibration": origin, "camera": name}
+
+
+def opened_calibration(calibration: Calibration | str | os.PathLike[str]) -> tuple[Calibration, str]:
+    """Return a calibration, read where a file is given, and what provenance tells of its origin."""
+    if isinstance(calibration, Calibration):
+        return calibration, "given as an object"
+    return Calibration.load(calibration), Path(os.fspath(calibration)).name

@@ -75,6 +75,11 @@ class Source(ABC):
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role, e.g. ``{"depth": ..., "color": ...}``; a cache may hash them."""
 
+    def depth_files(self, sample_id: str) -> list[Path]:
+        """Return the depth images of one sample, one for each view; none where depth is no file of its own."""
+        files = self.files(sample_id)
+        return [files["depth"]] if "depth" in files else []
+
     @abstractmethod
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         """Load one known sample."""

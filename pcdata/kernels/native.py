@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-INTERFACE_VERSION = 4
+INTERFACE_VERSION = 5
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.

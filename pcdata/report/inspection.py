@@ -66,6 +66,7 @@ def _frame_facts(frame: DepthFrame) -> list[list[str]]:
     span = f", {valid.min():.3f} to {valid.max():.3f} m" if len(valid) else ""
     return [
         ["camera", repr(frame.camera)],
+        *([["views", ", ".join(frame.provenance["cameras"])]] if "cameras" in frame.provenance else []),
         ["depth", f"{valid.numel():,} of {frame.depth.numel():,} pixels valid{span}"],
         ["poses", "none" if frame.frame_id is None else f"lead to {frame.frame_id!r}"],
     ]

@@ -22,10 +22,13 @@ class SurfaceMesh:
         check_tensors("SurfaceMesh", {"triangles": self.triangles}, {"triangles": "T 3 : int64"})
         if self.vertices.num_clouds != 1:
             raise ShapeError(f"SurfaceMesh: the vertices must be a single cloud, got {self.vertices.num_clouds}")
-        if len(self.triangles) and not (
-            int(self.triangles.min()) >= 0 and int(self.triangles.max()) < self.vertices.num_points
-        ):
-            raise ShapeError(f"SurfaceMesh: triangles must hold rows of the {self.vertices.num_points} vertices")
+        if len(self.triangles):
+            lowest, highest = self.triangles.aminmax()
+            if int(lowest) < 0 or int(highest) >= self.vertices.num_points:
+                raise ShapeError(
+                    f"SurfaceMesh: triangles must hold rows of the {self.vertices.num_points} vertices, got rows "
+                    f"{int(lowest)} to {int(highest)}"
+                )
 
     def __repr__(self) -> str:
         return f"SurfaceMesh({len(self.triangles)} triangles of {self.vertices!r})"

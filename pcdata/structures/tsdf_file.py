@@ -85,7 +85,7 @@ def _volume(where: str, about: dict[str, Any], *, max_bytes: int, device: str) -
             voxel_size=float(about["voxel_size"]),
             truncation=float(about["truncation"]),
             weighting=about["weighting"],
-            carve=bool(about["carve"]),
+            carve=about["carve"],
             min_confidence=None if level is None else Confidence(level),
             max_bytes=max_bytes,
             device=device,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,22 +20,30 @@ from pcdata.structures.fields import Kind
 from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
-_CAMERAS_KEPT = 8  # 5 MB each at 640x480
+_CAMERAS_KEPT = 8  # 7 MB each at 640x480
 _WEIGHTINGS = ("constant", "inverse_square", "angle")
+
+Carving = Literal["never", "near", "everywhere"]
 
 
 @dataclass(eq=False, kw_only=True)
 class TSDFVolume:
     """A sparse truncated signed distance field that averages depth images into one surface.
 
-    The result depends on the frames and their order alone: not on threads, and up to rounding not on the order
-    either, unless ``carve`` is set.
+    The result depends on the frames and their order alone, not on threads; with ``carve="never"`` not on the order
+    either, up to rounding.
+
+    ``carve`` says what a view does that sees past a voxel by more than the truncation: a full truncation joins the
+    voxel's average, so that a surface which others see through is worn away. ``"near"`` the surface it sees, in the
+    blocks the view opens, is how fields are averaged since Curless & Levoy, and merges the sheets that noise and drift
+    leave; ``"everywhere"`` also removes what has moved away, by a pass over all blocks per view; ``"never"`` keeps
+    every surface that any view saw. Voxels that no view saw near a surface stay unseen.
     """
 
     voxel_size: float = 0.002  # metres
     truncation: float | None = None  # metres on either side of a surface; None = 5 voxels
     weighting: tsdf.Weighting = "constant"  # how much a reading counts; see functional.tsdf.weight_image
-    carve: bool = False  # readings behind a surface seen before wear it away; costs a pass over all blocks per view
+    carve: Carving = "near"
     min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
     max_bytes: int = 4 << 30  # refuse to grow beyond
     device: torch.device | str = "cpu"
@@ -43,11 +51,13 @@ class TSDFVolume:
     frame_id: str | None = None  # the frame of the surface; None = that of the first frame
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
-    _kept_rays: dict[tuple[float, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+    _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.weighting not in _WEIGHTINGS:
             raise ConfigError(f"TSDFVolume: weighting must be one of {_WEIGHTINGS}, got {self.weighting!r}")
+        if self.carve not in get_args(Carving):
+            raise ConfigError(f"TSDFVolume: carve must be one of {get_args(Carving)}, got {self.carve!r}")
         if self.max_bytes < 1:
             raise ConfigError(f"TSDFVolume: max_bytes must be at least 1, got {self.max_bytes}")
         self.device = torch.device(self.device)
@@ -84,15 +94,18 @@ class TSDFVolume:
             UnitError: a reading lies 2^20 blocks or more from the origin.
         """
         views, touched = self._prepared(frame)
-        new = self._missing(touched)
+        found, new = self._found(touched)
         self._check_room(frame, len(new))
         if self.blocks is None:
             self.frame_id = frame.frame_id
             self.blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device)
         self.blocks.add(new)
-        for view, keys in zip(views, touched, strict=True):
-            rows = torch.arange(len(self.blocks), device=frame.device) if self.carve else self.blocks.find(keys)
-            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve, backend=self.backend)
+        if len(new) or not found:
+            found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
+        for view, rows in zip(views, found, strict=True):
+            if self.carve == "everywhere":
+                rows = torch.arange(len(self.blocks), device=frame.device)
+            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
@@ -102,16 +115,21 @@ class TSDFVolume:
             FrameError, CaptureError, DeviceError, UnitError: as :meth:`integrate`.
         """
         _, touched = self._prepared(frame)
-        return (self.num_blocks + len(self._missing(touched))) * self._planes_of(frame).bytes_per_block
+        return (self.num_blocks + len(self._found(touched)[1])) * self._planes_of(frame).bytes_per_block
 
     def _prepared(self, frame: DepthFrame) -> tuple[list[tsdf.FusionView], list[Tensor]]:
         self._check_frame(frame)
         views = [self._view(frame, index) for index in range(frame.num_views)]
         return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
 
-    def _missing(self, touched: list[Tensor]) -> Tensor:
-        keys = touched[0] if len(touched) == 1 else torch.cat(touched).unique()
-        return keys if self.blocks is None else self.blocks.missing(keys)
+    def _found(self, touched: list[Tensor]) -> tuple[list[Tensor], Tensor]:
+        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of those."""
+        if self.blocks is None:
+            found, missing = [], touched
+        else:
+            both = [tsdf.find_blocks(self.blocks, keys, backend=self.backend) for keys in touched]
+            found, missing = [rows for rows, _ in both], [keys for _, keys in both]
+        return found, missing[0] if len(missing) == 1 else torch.cat(missing).unique()
 
     def _check_room(self, frame: DepthFrame, new: int) -> None:
         per_block = self._planes_of(frame).bytes_per_block
@@ -125,8 +143,8 @@ class TSDFVolume:
             )
 
     def _planes_of(self, frame: DepthFrame) -> tsdf.Planes:
-        counted = self.weighting != "constant" or self.carve
-        return tsdf.Planes(colors=frame.colors is not None, labels=frame.labels is not None, views=counted)
+        images = {"colors": frame.colors is not None, "labels": frame.labels is not None}
+        return tsdf.Planes(**images, views=self.weighting != "constant")
 
     def _check_frame(self, frame: DepthFrame) -> None:
         if not isinstance(frame, DepthFrame):
@@ -149,14 +167,14 @@ class TSDFVolume:
                 f"TSDFVolume: every frame needs the images of the first, which had colours: {had.colors}, labels: "
                 f"{had.labels}; {frame!r} has colours: {has.colors}, labels: {has.labels}"
             )
-        if frame.labels is not None and int(frame.labels.abs().max()) >= 2**31:
+        if frame.labels is not None and not tsdf.fit_labels(frame.labels):
             raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
 
     def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
         camera = frame.camera
         k = camera.intrinsics[index]
         lens = None if camera.distortion is None else camera.distortion[index]
-        rays = self._rays(k, lens, frame)
+        rays, directions = self._rays(k, lens, frame)
         depth = frame.depth[index]
         if self.min_confidence is not None and frame.confidence is not None:
             depth = torch.where(frame.confidence[index] >= self.min_confidence, depth, 0.0)
@@ -165,24 +183,24 @@ class TSDFVolume:
         assert frame.world_from_camera is not None
         return tsdf.FusionView(
             depth=depth,
-            rays=rays,
+            rays=directions,
             pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
             distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
             world_from_camera=frame.world_from_camera[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
-            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index]),
-            label=None if frame.labels is None else frame.labels[index].int(),
+            color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
+            label=None if frame.labels is None else tsdf.pack_labels(frame.labels[index]),
         )
 
-    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> Tensor:
-        """Return the rays (H, W, 2) of a camera; those of a few cameras are kept: frames repeat them."""
+    def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> tuple[Tensor, Tensor]:
+        """Return the rays of a camera, (H, W, 2) float64 and (2, H, W) float32; kept, because frames repeat cameras."""
         coefficients = () if lens is None else tuple(lens.tolist())
         known = (*k.flatten().tolist(), *coefficients, *frame.size)
         if known not in self._kept_rays:
             if len(self._kept_rays) >= _CAMERAS_KEPT:
                 self._kept_rays.pop(next(iter(self._kept_rays)))
-            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0]
-            self._kept_rays[known] = rays.to(frame.device)
+            rays = pixel_rays(k[None], frame.size, None if lens is None else lens[None])[0].to(frame.device)
+            self._kept_rays[known] = rays, rays.permute(2, 0, 1).float().contiguous()
         return self._kept_rays[known]
 
     # -- out -------------------------------------------------------------------------------------------------------
@@ -201,7 +219,7 @@ class TSDFVolume:
         Raises:
             ConfigError: nothing was integrated yet.
         """
-        return self._cloud(*self._surface(min_weight), min_weight)
+        return self._cloud(self._surface(min_weight, edges=False), min_weight)
 
     def extract_mesh(self, *, min_weight: float = 0.0) -> SurfaceMesh:
         """Return the surface as triangles between the points of :meth:`extract_points`.
@@ -209,12 +227,11 @@ class TSDFVolume:
         Only cubes with eight seen corners hold triangles, so single views give a surface with gaps at its rim.
         Points that are in no triangle are left out.
         """
-        found, dropped = self._surface(min_weight)
+        found = self._surface(min_weight, edges=True)
         assert self.blocks is not None
-        triangles = tsdf.find_triangles(self.blocks, found, self._least_weight(min_weight))
-        used, renumbered = triangles.unique(return_inverse=True)
-        vertices = self._cloud(found.select(used), dropped, min_weight)
-        return SurfaceMesh(vertices=vertices, triangles=renumbered.reshape(-1, 3))
+        least = self._least_weight(min_weight)
+        used, triangles = tsdf.find_triangles(self.blocks, found.edge, min_weight=least, backend=self.backend)
+        return SurfaceMesh(vertices=self._cloud(found.select(used), min_weight), triangles=triangles)
 
     def _least_weight(self, min_weight: float) -> int:
         if not (math.isfinite(min_weight) and min_weight >= 0):
@@ -225,17 +242,13 @@ class TSDFVolume:
     def _unit(self) -> int:
         return 1 if self.weighting == "constant" else UNIT_WEIGHT
 
-    def _surface(self, min_weight: float) -> tuple[tsdf.Crossings, int]:
+    def _surface(self, min_weight: float, *, edges: bool) -> tsdf.Crossings:
         if self.blocks is None:
             raise ConfigError("TSDFVolume: nothing was integrated yet")
         least = self._least_weight(min_weight)
-        found = tsdf.find_crossings(self.blocks, self.grid, backend=self.backend)
-        if least == 1:
-            return found, 0
-        kept = found.select(found.weight >= least)
-        return kept, len(found.edge) - len(kept.edge)
+        return tsdf.find_crossings(self.blocks, self.grid, min_weight=least, edges=edges, backend=self.backend)
 
-    def _cloud(self, found: tsdf.Crossings, dropped: int, min_weight: float) -> PointCloud:
+    def _cloud(self, found: tsdf.Crossings, min_weight: float) -> PointCloud:
         assert self.frame_id is not None
         step: dict[str, Any] = {
             "step": "TSDFVolume",
@@ -245,8 +258,8 @@ class TSDFVolume:
             "carve": self.carve,
             "views": self.num_views,
             "min_weight": min_weight,
-            "dropped": dropped,
-            "points": len(found.edge),
+            "dropped": found.dropped,
+            "points": len(found.points),
         }
         return PointCloud(
             points=found.points,
@@ -254,7 +267,7 @@ class TSDFVolume:
             normals=found.normals,
             colors=found.colors,
             labels=found.labels,
-            extra={"num_views": found.views.long(), "weight": found.weight.float() / self._unit},
+            extra={"num_views": found.views, "weight": found.weight if self._unit == 1 else found.weight / self._unit},
             kinds={"num_views": Kind.INVARIANT, "weight": Kind.INVARIANT},
             frames={self.frame_id: torch.eye(4, dtype=torch.float64, device=found.points.device)[None]},
             history=[[step]],

@@ -28,7 +28,7 @@ class FuseTSDF(Transform):
     # On either side of the surface; None = 5 voxels. Three standard deviations of the noise should fit.
     truncation: Metres | None = None
     weighting: Literal["constant", "inverse_square", "angle"] = "constant"
-    carve: bool = False  # later views wear away what they see through
+    carve: Literal["never", "near", "everywhere"] = "near"  # what views see through is worn away; see TSDFVolume
     min_weight: NonNegative = 0.0  # of a point; with constant weights n asks for n views
     min_confidence: ConfidenceName | None = None  # leave out readings that are less to be trusted
     max_megabytes: Count = 4096  # refuse to take more memory

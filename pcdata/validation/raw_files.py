@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pcdata.io.raw_faults import RawFaults, count_raw_faults
 from pcdata.validation.check import Check, Verdict
 
 
-def raw_value_check(path: Path) -> Check:
-    """Judge the stored values: NaN and infinity warn, because programs differ on them; negative depth fails.
+def raw_value_checks(paths: Sequence[Path]) -> list[Check]:
+    """Judge the stored values of every view: NaN and infinity warn, as programs differ on them; negative depth fails.
 
     Raises:
-        CaptureError: the file is missing, damaged, or not a depth image.
+        CaptureError: a file is missing, damaged, or not a depth image.
     """
+    if len(paths) == 1:
+        return [_judged_file(paths[0])]
+    return [replace(_judged_file(path), view=view) for view, path in enumerate(paths)]
+
+
+def _judged_file(path: Path) -> Check:
     faults = count_raw_faults(path)
     if faults is None:
         return Check(

@@ -15,7 +15,7 @@ from pcdata.validation.clouds import cloud_checks
 from pcdata.validation.coverage import coverage_checks
 from pcdata.validation.limits import Limits
 from pcdata.validation.pose_direction import PoseDirectionOverTime, direction_checks
-from pcdata.validation.raw_files import raw_value_check
+from pcdata.validation.raw_files import raw_value_checks
 from pcdata.validation.readings import reading_checks
 from pcdata.validation.registration import frame_votes, registration_check
 from pcdata.validation.report import WHOLE, SampleReport
@@ -92,8 +92,8 @@ class _Series:
     def check(self, source: Captures, sample_id: str) -> list[Check]:
         checks: list[Check] = []
         try:
-            if isinstance(source, Source) and "depth" in (files := source.files(sample_id)):
-                checks.append(raw_value_check(files["depth"]))
+            if isinstance(source, Source):
+                checks += raw_value_checks(source.depth_files(sample_id))
             capture = source.load(sample_id)
         except PcdataError as error:
             return [*checks, check_of_error(error)]

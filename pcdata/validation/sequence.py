@@ -11,6 +11,7 @@ from torch import Tensor
 from pcdata.structures import DepthFrame
 from pcdata.validation.check import Check, Verdict, graded
 from pcdata.validation.limits import Limits
+from pcdata.validation.view_names import view_names
 
 _REMEMBERED = 10_000  # captures: an image that comes again later than this goes unnoticed
 _INTERVALS = 100  # the usual interval is the median of so many
@@ -79,13 +80,13 @@ class ClockChecks:
         times = frame.provenance.get("timestamps")
         if times is None:
             return []
-        checks = [self._sync(times)] if len(times) > 1 else []
+        checks = [self._sync(times, view_names(frame.provenance, len(times)))] if len(times) > 1 else []
         if len(self._last) == len(times):
             checks.append(self._interval(min(now - last for now, last in zip(times, self._last))))
         self._last = list(times)
         return checks
 
-    def _sync(self, times: list[float]) -> Check:
+    def _sync(self, times: list[float], names: list[str]) -> Check:
         apart = max(times) - min(times)
         early, late = times.index(min(times)), times.index(max(times))
         return graded(
@@ -93,7 +94,7 @@ class ClockChecks:
             apart,
             threshold=self._limits.sync[0],
             fails_at=self._limits.sync[1],
-            found=f"view {late} is {1e3 * apart:.1f} ms later than view {early}",
+            found=f"{names[late]} is {1e3 * apart:.1f} ms later than {names[early]}",
             advice="trigger the cameras together, or pair their images by nearest time; what moves is in two places",
             unit="s",
         )

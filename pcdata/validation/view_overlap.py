@@ -9,6 +9,7 @@ from pcdata.structures import DepthFrame
 from pcdata.validation.check import Check, Verdict
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult
+from pcdata.validation.view_names import view_names
 
 _VERDICTS = {
     "pass": Verdict.PASS,
@@ -26,7 +27,7 @@ def overlap_checks(frame: DepthFrame) -> list[Check]:
     if frame.num_views < 2 or frame.world_from_camera is None:
         return []
     try:
-        result = verify_overlap(frame, names=[f"view {view}" for view in range(frame.num_views)])
+        result = verify_overlap(frame, names=view_names(frame.provenance, frame.num_views))
     except PcdataError as error:
         return [Check(name="view_gap", verdict=Verdict.WARN, found=f"not measurable: {error}")]
     return [_gap(result), *(_pose(result, view) for view in range(frame.num_views))]
@@ -79,7 +80,7 @@ def _pose(result: OverlapResult, view: int) -> Check:
         threshold=passes,
         fails_at=fails,
         unit="m",
-        advice="" if verdict is Verdict.PASS else _advice(result, camera, view),
+        advice="" if verdict is Verdict.PASS else _advice(result, camera),
         view=view,
     )
 
@@ -91,9 +92,9 @@ def _is_certain(camera: CameraOverlap, limits: OverlapLimits) -> bool:
     return shift > limits.shift[0] or turn > limits.rotation_degrees[0]
 
 
-def _advice(result: OverlapResult, camera: CameraOverlap, view: int) -> str:
+def _advice(result: OverlapResult, camera: CameraOverlap) -> str:
     if not _is_certain(camera, result.limits):
         return "put objects with upright sides where the cameras overlap"
     if camera.name in result.wrong:
-        return f"recalibrate the camera of view {view}: the others agree without it"
+        return f"recalibrate the camera of {camera.name}: the others agree without it"
     return "; ".join(result.advice)

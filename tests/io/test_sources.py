@@ -91,10 +91,22 @@ def clouds(tmp_path: Path) -> Path:
     return root
 
 
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    root = tmp_path / "cell"
+    for seed, camera in enumerate(["left", "right"]):
+        for name in ("a_2", "a_10"):
+            image(root / camera / "depth" / f"{name}.png", depth_of(seed))
+            (root / camera / "poses").mkdir(exist_ok=True)
+            (root / camera / "poses" / f"{name}.txt").write_text(pose_text(seed))
+        (root / camera / "intrinsics.json").write_text(json.dumps(K | {"metres_per_unit": 0.001, "frame_id": "base"}))
+    return root
+
+
 # -- laws that every layout keeps --------------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=["folder", "seven_scenes", "graspnet", "clouds"])
+@pytest.fixture(params=["folder", "rig", "seven_scenes", "graspnet", "clouds"])
 def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "graspnet":
         return graspnet_frame(tmp_path / "set" / "frame_1").parent

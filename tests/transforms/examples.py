@@ -82,7 +82,12 @@ EXAMPLES: dict[str, list[Example]] = {
     "FuseTSDF": _of(
         T.FuseTSDF(frame="base", voxel_size=0.02),
         T.FuseTSDF(
-            frame="base", voxel_size=0.02, truncation=0.05, weighting="angle", carve=True, min_confidence="completed"
+            frame="base",
+            voxel_size=0.02,
+            truncation=0.05,
+            weighting="angle",
+            carve="everywhere",
+            min_confidence="completed",
         ),
         make=tabletop_with_counts,
     ),

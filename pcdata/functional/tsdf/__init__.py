@@ -1,11 +1,17 @@
 """Truncated signed distance fields: many depth images averaged into one surface."""
 
-from pcdata.functional.tsdf.backends import find_crossings, integrate_view, touched_blocks
+from pcdata.functional.tsdf.backends import (
+    find_blocks,
+    find_crossings,
+    find_triangles,
+    integrate_view,
+    pack_colors,
+    touched_blocks,
+)
 from pcdata.functional.tsdf.blocks import Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
-from pcdata.functional.tsdf.marching import find_triangles
 from pcdata.functional.tsdf.surface import Crossings
-from pcdata.functional.tsdf.views import FusionView, Weighting, pack_colors, weight_image
+from pcdata.functional.tsdf.views import FusionView, Weighting, fit_labels, pack_labels, weight_image
 
 __all__ = [
     "Crossings",
@@ -14,10 +20,13 @@ __all__ = [
     "VoxelBlocks",
     "VoxelGrid",
     "Weighting",
+    "find_blocks",
     "find_crossings",
     "find_triangles",
+    "fit_labels",
     "integrate_view",
     "pack_colors",
+    "pack_labels",
     "touched_blocks",
     "weight_image",
 ]

@@ -11,12 +11,13 @@ from torch import Tensor
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, EDGE, pack_keys, unpack_keys
 
-SIDE = EDGE + 3  # voxels -1 .. 9 of the block: place p holds voxel p - 1
+BEFORE, AFTER = 2, 3  # voxels of the margin: the last ends of a block's edges lie in the margin and have slopes too
+SIDE = BEFORE + EDGE + AFTER  # place p holds voxel p - BEFORE
 # Per step to a neighbour: its voxels, and their places.
 _PART = {
-    -1: (slice(EDGE - 1, EDGE), slice(0, 1)),
-    0: (slice(0, EDGE), slice(1, EDGE + 1)),
-    1: (slice(0, 2), slice(EDGE + 1, SIDE)),
+    -1: (slice(EDGE - BEFORE, EDGE), slice(0, BEFORE)),
+    0: (slice(0, EDGE), slice(BEFORE, BEFORE + EDGE)),
+    1: (slice(0, AFTER), slice(BEFORE + EDGE, SIDE)),
 }
 
 
@@ -39,7 +40,7 @@ class Neighbourhood:
         return Neighbourhood(blocks, block * EDGE, torch.where(exists, rows, -1).reshape(-1, 27))
 
     def plane(self, name: str) -> Tensor:
-        """Return one plane with its margin (N, 11, 11, 11), indexed z, y, x; 0 where there is no block."""
+        """Return one plane with its margin (N, SIDE, SIDE, SIDE), indexed z, y, x; 0 where there is no block."""
         padded: Tensor | None = None
         for place, (z, y, x) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
             whole = self.blocks.gather(name, self.rows[:, place]).reshape(-1, EDGE, EDGE, EDGE)
@@ -49,3 +50,9 @@ class Neighbourhood:
             padded[:, to_z, to_y, to_x] = whole[:, from_z, from_y, from_x]
         assert padded is not None
         return padded
+
+
+def own_places(device: torch.device) -> Tensor:
+    """Return (512,) int64: the places of a block's own voxels in a flattened plane with its margin."""
+    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=device) + BEFORE] * 3, indexing="ij")
+    return ((z * SIDE + y) * SIDE + x).flatten()

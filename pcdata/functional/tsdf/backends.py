@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.dispatch import AUTO_ORDER, BACKEND_MODULES, REFERENCE, backends, why_unavailable
 from pcdata.errors import BackendError, near_matches
-from pcdata.functional.tsdf import integrate, surface
+from pcdata.functional.tsdf import integrate, marching, surface, views
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
@@ -21,16 +21,31 @@ from pcdata.functional.tsdf.views import FusionView
 
 # (step, backend) -> body; the core's join when it is loaded.
 BODIES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("pack_colors", REFERENCE): views.pack_colors,
     ("touched_blocks", REFERENCE): integrate.touched_blocks,
+    ("find_blocks", REFERENCE): integrate.find_blocks,
     ("integrate_view", REFERENCE): integrate.integrate_view,
     ("find_crossings", REFERENCE): surface.find_crossings,
+    ("find_triangles", REFERENCE): marching.find_triangles,
 }
+
+
+def pack_colors(colors: Tensor, *, backend: str = "auto") -> Tensor:
+    """See :func:`pcdata.functional.tsdf.views.pack_colors`."""
+    packed: Tensor = _body("pack_colors", backend, colors.device)(colors)
+    return packed
 
 
 def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") -> Tensor:
     """See :func:`pcdata.functional.tsdf.integrate.touched_blocks`."""
     keys: Tensor = _body("touched_blocks", backend, view.depth.device)(view, grid)
     return keys
+
+
+def find_blocks(blocks: VoxelBlocks, keys: Tensor, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """See :func:`pcdata.functional.tsdf.integrate.find_blocks`."""
+    found: tuple[Tensor, Tensor] = _body("find_blocks", backend, blocks.device)(blocks, keys)
+    return found
 
 
 def integrate_view(
@@ -40,10 +55,21 @@ def integrate_view(
     _body("integrate_view", backend, blocks.device)(blocks, rows, view, grid, carve=carve)
 
 
-def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, backend: str = "auto") -> Crossings:
+def find_crossings(
+    blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False, backend: str = "auto"
+) -> Crossings:
     """See :func:`pcdata.functional.tsdf.surface.find_crossings`."""
-    found: Crossings = _body("find_crossings", backend, blocks.device)(blocks, grid)
+    body = _body("find_crossings", backend, blocks.device)
+    found: Crossings = body(blocks, grid, min_weight=min_weight, edges=edges)
     return found
+
+
+def find_triangles(
+    blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """See :func:`pcdata.functional.tsdf.marching.find_triangles`."""
+    used, triangles = _body("find_triangles", backend, blocks.device)(blocks, edge, min_weight=min_weight)
+    return used, triangles
 
 
 def _body(step: str, backend: str, device: torch.device) -> Callable[..., Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 
@@ -26,14 +28,26 @@ class Planes:
     views: bool = False  # count views apart from weights; without, every view weighs 1 and the weight is the count
 
     @property
+    def dtypes(self) -> dict[str, torch.dtype]:
+        """The planes of a block by name, in the order in which they lie in memory."""
+        found = {"tsdf": torch.int16, "weight": torch.int16}
+        found |= {"color": torch.int32} if self.colors else {}
+        found |= {"views": torch.int16} if self.views else {}
+        found |= {"label": torch.int32, "votes": torch.int16} if self.labels else {}
+        return found
+
+    @property
     def bytes_per_block(self) -> int:
         """The memory of one block: 4 bytes a voxel, 8 with colour."""
-        return VOXELS * (4 + 4 * self.colors + 6 * self.labels + 2 * self.views)
+        return VOXELS * sum(dtype.itemsize for dtype in self.dtypes.values())
 
 
 @dataclass(eq=False)
 class Chunk:
-    """The voxels of ``CHUNK`` blocks; all zero = never seen."""
+    """The voxels of ``CHUNK`` blocks; all zero = never seen.
+
+    The planes of one block lie behind one another, so that a block is one stretch of memory: with colour, a page.
+    """
 
     tsdf: Tensor  # (C, 512) int16: signed distance / truncation * TSDF_SCALE, positive in front of the surface
     weight: Tensor  # (C, 512) int16
@@ -49,22 +63,26 @@ class Chunk:
 
     @staticmethod
     def empty(planes: Planes, device: torch.device) -> Chunk:
-        """Reserve a chunk of zeros; on the CPU a page takes memory only once it is written."""
+        """Reserve a chunk of zeros; on the CPU a page, of 2 MB if possible, takes memory once it is written."""
+        room = _zeros(CHUNK * planes.bytes_per_block, device).reshape(CHUNK, planes.bytes_per_block)
+        found, start = {}, 0
+        for name, dtype in planes.dtypes.items():
+            end = start + VOXELS * dtype.itemsize
+            found[name] = room[:, start:end].view(dtype)
+            start = end
+        return Chunk(**found)
 
-        def zeros(dtype: torch.dtype) -> Tensor:
-            if device.type == "cpu":
-                numpy_dtype = {torch.int16: np.int16, torch.int32: np.int32}[dtype]
-                return torch.from_numpy(np.zeros((CHUNK, VOXELS), numpy_dtype))
-            return torch.zeros((CHUNK, VOXELS), dtype=dtype, device=device)
 
-        return Chunk(
-            tsdf=zeros(torch.int16),
-            weight=zeros(torch.int16),
-            color=zeros(torch.int32) if planes.colors else None,
-            views=zeros(torch.int16) if planes.views else None,
-            label=zeros(torch.int32) if planes.labels else None,
-            votes=zeros(torch.int16) if planes.labels else None,
-        )
+def _zeros(count: int, device: torch.device) -> Tensor:
+    if device.type != "cpu":
+        return torch.zeros(count, dtype=torch.uint8, device=device)
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return torch.from_numpy(np.zeros(count, np.uint8))
+    # A volume grows by tens of megabytes per view: page faults of 4 KB would take longer than filling these.
+    pages = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with contextlib.suppress(OSError):  # advice only: a system may be built without huge pages
+        pages.madvise(mmap.MADV_HUGEPAGE)
+    return torch.frombuffer(pages, dtype=torch.uint8)
 
 
 @dataclass(eq=False)
@@ -73,42 +91,69 @@ class VoxelBlocks:
 
     planes: Planes
     device: torch.device
-    keys: Tensor = field(init=False)  # (B,) int64 in the order of appearance
-    sorted_keys: Tensor = field(init=False)  # (B,) int64
-    sorted_rows: Tensor = field(init=False)  # (B,) int64: the row of each sorted key
     chunks: list[Chunk] = field(default_factory=list)
+    table: Tensor | None = None  # of hashed keys; the compiled core makes it and keeps it up to date
+    in_table: int = 0  # rows that the table has
+    _count: int = field(default=0, init=False)
+    _room: Tensor = field(init=False, repr=False)  # for keys; doubled when full
+    _sorted: tuple[Tensor, Tensor] = field(init=False, repr=False)  # keys, rows of the blocks there were at some time
 
     def __post_init__(self) -> None:
-        self.keys = self.sorted_keys = self.sorted_rows = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._room = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._sorted = self._room, self._room
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return self._count
 
-    def missing(self, keys: Tensor) -> Tensor:
-        """Return those of the sorted, distinct keys that have no block yet."""
-        return keys[self.find(keys) < 0]
+    @property
+    def keys(self) -> Tensor:
+        """The keys (B,) int64 in the order of appearance."""
+        return self._room[: self._count]
+
+    @property
+    def sorted_keys(self) -> Tensor:
+        """The keys (B,) int64 in their own order."""
+        return self._merged()[0]
+
+    @property
+    def sorted_rows(self) -> Tensor:
+        """The row (B,) int64 of every sorted key."""
+        return self._merged()[1]
 
     def add(self, keys: Tensor) -> None:
         """Open blocks for sorted, distinct keys that have none."""
-        rows = torch.arange(len(self), len(self) + len(keys), device=self.device)
-        self.keys = torch.cat([self.keys, keys])
-        # Merge the two sorted lists: what is new goes behind the known keys below it.
-        places = torch.searchsorted(self.sorted_keys, keys) + torch.arange(len(keys), device=self.device)
-        is_known = torch.ones(len(self.keys), dtype=torch.bool, device=self.device)
-        is_known[places] = False
-        merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
-        merged_keys[places], merged_rows[places] = keys, rows
-        merged_keys[is_known], merged_rows[is_known] = self.sorted_keys, self.sorted_rows
-        self.sorted_keys, self.sorted_rows = merged_keys, merged_rows
-        while len(self.chunks) * CHUNK < len(self):
+        count = self._count + len(keys)
+        if count > len(self._room):
+            room = self._room.new_empty(max(count, 2 * len(self._room)))
+            room[: self._count] = self.keys
+            self._room = room
+        self._room[self._count : count] = keys
+        self._count = count
+        while len(self.chunks) * CHUNK < count:
             self.chunks.append(Chunk.empty(self.planes, self.device))
 
     def find(self, keys: Tensor) -> Tensor:
         """Return the (N,) row of every key, -1 where there is no block."""
         if len(self) == 0:
             return torch.full_like(keys, -1)
-        place = torch.searchsorted(self.sorted_keys, keys).clamp_(max=len(self) - 1)
-        return torch.where(self.sorted_keys[place] == keys, self.sorted_rows[place], -1)
+        sorted_keys, sorted_rows = self._merged()
+        place = torch.searchsorted(sorted_keys, keys).clamp_(max=len(self) - 1)
+        return torch.where(sorted_keys[place] == keys, sorted_rows[place], -1)
+
+    def _merged(self) -> tuple[Tensor, Tensor]:
+        """Merge what was added since the last time into the sorted keys: it goes behind the known keys below it."""
+        known_keys, known_rows = self._sorted
+        known = len(known_keys)
+        if known < self._count:
+            keys, order = self.keys[known:].sort()
+            places = torch.searchsorted(known_keys, keys) + torch.arange(len(keys), device=self.device)
+            is_known = torch.ones(self._count, dtype=torch.bool, device=self.device)
+            is_known[places] = False
+            merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
+            merged_keys[places], merged_rows[places] = keys, order + known
+            merged_keys[is_known], merged_rows[is_known] = known_keys, known_rows
+            self._sorted = merged_keys, merged_rows
+        return self._sorted
 
     def in_chunks(self, rows: Tensor) -> Iterator[tuple[Chunk, Tensor, Tensor]]:
         """Split rows by chunk: the chunk, the rows within it, and where these stood in ``rows``."""

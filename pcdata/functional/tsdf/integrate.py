@@ -10,11 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.blocks import COLOR_SCALE, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
+from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid, pack_keys, unpack_keys, voxel_offsets
 from pcdata.functional.tsdf.views import FusionView
 
 _TOGETHER = 2048  # blocks updated in one go: a million voxels
+_FURTHEST = 2.0**40  # blocks; beyond what keys reach
+_SHARE_STEPS = 1 << 15  # of a pixel's share in a colour, which is mixed in integers
 
 
 def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
@@ -22,23 +24,42 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
 
     Along the ray of every reading, blocks are looked up half a block apart, from one truncation in front to one behind.
     """
+    turn, fraction, camera = camera_in_blocks(view, grid)
     read = view.depth > 0
-    depth, rays = view.depth[read].double(), view.rays[read]
-    rotation, translation = view.world_from_camera[:3, :3].tolist(), view.world_from_camera[:3, 3].tolist()
-    per_block = 1.0 / grid.block_size
+    depth, (x, y) = view.depth[read], view.rays[:, read]
+    along = [(t[0] * x + t[1] * y) + t[2] for t in turn]
     found = []
-    for offset in grid.band:
+    for offset in band(grid):
         z = depth + offset
-        x, y = rays[:, 0] * z, rays[:, 1] * z
-        block = torch.stack(
-            [
-                ((((r[0] * x + r[1] * y) + r[2] * z) + t) * per_block).floor()
-                for r, t in zip(rotation, translation, strict=True)
-            ],
-            dim=-1,
-        )
-        found.append(pack_keys(block[z > 0].long()).unique())
+        place = torch.stack([(a * z + start).floor() for a, start in zip(along, fraction, strict=True)], dim=-1)
+        found.append(pack_keys(place[z > 0].long() + camera).unique())
     return torch.cat(found).unique()
+
+
+def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the row (N,) of every key, -1 where there is no block, and the keys (M,) of which this is true."""
+    rows = blocks.find(keys)
+    return rows, keys[rows < 0]
+
+
+def camera_in_blocks(view: FusionView, grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
+    """Return how to count blocks from the camera's own, in float32 without losing any, however far the origin is.
+
+    The rotation in blocks per metre (3, 3) float32, the camera's place within its block (3,) float32, and that block
+    (3,) int64.
+    """
+    place = view.world_from_camera[:3, 3] / grid.block_size
+    block = place.floor()
+    return (
+        (view.world_from_camera[:3, :3] / grid.block_size).float(),
+        (place - block).float(),
+        block.clamp(-_FURTHEST, _FURTHEST).long(),
+    )
+
+
+def band(grid: VoxelGrid) -> Tensor:
+    """Return the offsets along z at which blocks are looked up, float32 metres."""
+    return torch.tensor(grid.band, dtype=torch.float32)
 
 
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
@@ -75,19 +96,33 @@ def _update(chunk: Chunk, rows: Tensor, keys: Tensor, view: FusionView, grid: Vo
     if chunk.label is not None and chunk.votes is not None and view.label is not None:
         _vote(chunk.label, chunk.votes, rows, view.label.flatten()[pixel], near)
     if chunk.views is not None:
-        chunk.views[rows] = torch.where(near, (count.int() + 1).clamp(max=MAX_WEIGHT), count.int()).short()
+        chunk.views[rows] = torch.where(seen, (count.int() + 1).clamp(max=MAX_WEIGHT), count.int()).short()
+
+
+def image_from_world(view: FusionView) -> Tensor:
+    """Return (3, 4) float64: the place of a point in the image, times its depth, and the depth.
+
+    Pixel (u, v) is where the place is in [u, u + 1) x [v, v + 1). With a lens, which is not linear: the point in the
+    camera's frame.
+    """
+    if view.distortion is not None:
+        return view.camera_from_world[:3]
+    fx, skew, cx, fy, cy = view.pinhole
+    image = [[fx, skew, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]]
+    pose = view.camera_from_world
+    return torch.tensor(image, dtype=torch.float64, device=pose.device) @ pose[:3]
 
 
 def block_corners(keys: Tensor, view: FusionView, grid: VoxelGrid) -> Tensor:
-    """Return the first voxel of every block in the camera's frame, (N, 3) float32, rounded once from float64."""
-    pose = view.camera_from_world.tolist()
+    """Return the first voxel of every block, as the view maps it, (N, 3) float32, rounded once from float64."""
+    pose = image_from_world(view).tolist()
     x, y, z = (unpack_keys(keys).double() * grid.block_size).unbind(-1)
-    return torch.stack([((r[0] * x + r[1] * y) + r[2] * z) + r[3] for r in pose[:3]], dim=-1).float()
+    return torch.stack([((r[0] * x + r[1] * y) + r[2] * z) + r[3] for r in pose], dim=-1).float()
 
 
 def voxel_steps(view: FusionView, grid: VoxelGrid) -> Tensor:
-    """Return (3, 512) float32: where a block's voxels lie from its first one, in the camera's frame."""
-    steps = (view.camera_from_world[:3, :3] * grid.voxel_size).float()
+    """Return (3, 512) float32: where a block's voxels lie from its first one, as the view maps them."""
+    steps = (image_from_world(view)[:, :3] * grid.voxel_size).float()
     x, y, z = voxel_offsets(steps.device).float().unbind(-1)
     return torch.stack([(x * s[0] + y * s[1]) + z * s[2] for s in steps])
 
@@ -97,14 +132,14 @@ def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tens
     height, width = view.depth.shape
     x, y, z = (corner[:, None] + step for corner, step in zip(corners.unbind(-1), voxel_steps(view, grid), strict=True))
     inverse = 1.0 / z
-    x, y = x * inverse, y * inverse
+    u, v = x * inverse, y * inverse
     ahead = z > 0
     if view.distortion is not None:
-        radius = x * x + y * y
+        radius = u * u + v * v
         ahead &= radius < torch.tensor(view.fold, dtype=torch.float32)
-        x, y = bend(x, y, radius, view.distortion.float())
-    fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32).unbind()
-    u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
+        x, y = bend(u, v, radius, view.distortion.float())
+        fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32).unbind()
+        u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
     inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     pixel = torch.where(inside, v, 0.0).long() * width + torch.where(inside, u, 0.0).long()
     reading = view.depth.flatten()[pixel]
@@ -128,12 +163,12 @@ def _mixed_color(old: Tensor, pixel: Tensor, share: Tensor, count: Tensor) -> Te
     differences for good once the weights are large.
     """
     voxel = torch.arange(old.shape[1], dtype=torch.int32, device=old.device)
-    turn = ((count.int() * 159 + voxel * 83) & 255).float() * (1 / 256)
-    mixed = torch.zeros_like(old)
-    for channel in range(3):
-        before = ((old >> 10 * channel) & 1023).float()
-        now = ((pixel >> 8 * channel) & 255).float() * COLOR_SCALE
-        mixed |= ((before + (now - before) * share) + turn).int() << 10 * channel
+    turn = ((count.int() * 159 + voxel * 83) & 255) * (_SHARE_STEPS // 256)
+    steps = (share * _SHARE_STEPS).round().int()
+    mixed = old.clone()
+    for shift in (0, 10, 20):
+        apart = ((pixel >> shift) & 1023) - ((old >> shift) & 1023)
+        mixed += ((apart * steps + turn) >> 15) << shift
     return mixed
 
 

@@ -11,10 +11,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.apron import SIDE, Neighbourhood
+from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
-from pcdata.functional.tsdf.surface import Crossings
 
 _TOGETHER = 512  # blocks
 Edge = tuple[int, int]  # the corners it joins; corner c lies at (c & 1, c >> 1 & 1, c >> 2)
@@ -65,25 +64,32 @@ def _edge(a: int, b: int) -> Edge:
     return min(a, b), max(a, b)
 
 
-def find_triangles(blocks: VoxelBlocks, vertices: Crossings, min_weight: int) -> Tensor:
-    """Return (T, 3) int64 rows of ``vertices``: the surface within the cubes whose eight corners were seen enough.
+def find_triangles(
+    blocks: VoxelBlocks,
+    edge: Tensor,  # (M,) int64, rising: the edges with a vertex, numbered as in Crossings
+    *,
+    min_weight: int = 1,
+) -> tuple[Tensor, Tensor]:  # used (K,) int64 rows of the vertices, rising; triangles (T, 3) int64 rows of used
+    """Find the surface within the cubes whose eight corners were seen, with ``min_weight`` at least.
 
-    A triangle with a corner that is not among the vertices is left out.
+    Triangles are ordered by cube. One with a corner that has no vertex is left out.
     """
     keys = blocks.sorted_keys
-    tables = _tensor_tables(blocks.device)
+    tables = tensor_tables(blocks.device)
     parts = [
         _triangles_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), keys, min_weight, tables)
         for start in range(0, len(keys), _TOGETHER)
     ]
     edges = torch.cat(parts) if parts else torch.empty((0, 3), dtype=torch.int64, device=blocks.device)
-    if len(vertices.edge) == 0:
-        return edges[:0]
-    place = torch.searchsorted(vertices.edge, edges).clamp_(max=len(vertices.edge) - 1)
-    return place[(vertices.edge[place] == edges).all(1)]
+    if len(edge) == 0:
+        return edge, edges[:0]
+    place = torch.searchsorted(edge, edges).clamp_(max=len(edge) - 1)
+    complete = place[(edge[place] == edges).all(1)]
+    used, triangles = complete.unique(return_inverse=True)
+    return used, triangles.reshape(-1, 3)
 
 
-def _tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return first triangle of each case (257,), and per corner of a triangle (K, 3) its edge's start and axis."""
     table = triangle_table()
     counts = torch.tensor([0, *(len(triangles) for triangles in table)]).cumsum(0)
@@ -100,8 +106,7 @@ def _triangles_of(
     count = len(some.corner)
     seen = some.plane("weight").reshape(count, -1) >= min_weight
     inside = some.plane("tsdf").reshape(count, -1) < 0
-    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=seen.device)] * 3, indexing="ij")
-    own = (((z + 1) * SIDE + (y + 1)) * SIDE + (x + 1)).flatten()
+    own = own_places(seen.device)
     case = torch.zeros((count, VOXELS), dtype=torch.int64, device=seen.device)
     complete = torch.ones_like(case, dtype=torch.bool)
     for corner in range(8):

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.apron import SIDE, Neighbourhood
+from pcdata.functional.ragged import pick_rows
+from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
 from pcdata.functional.tsdf.blocks import COLOR_SCALE, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS, VoxelGrid
 
@@ -23,97 +24,122 @@ _STRIDE = (1, SIDE, SIDE * SIDE)  # of x, y, z in a flattened margin array
 class Crossings:
     """Zero crossings, ordered by edge."""
 
-    edge: Tensor  # (M,) int64: 3 * (512 * place of the block in key order + voxel) + axis
+    edge: Tensor  # (M,) int64: 3 * (512 * place of the block in key order + voxel) + axis; (0,) if not asked for
     points: Tensor  # (M, 3) float32 metres
     normals: Tensor  # (M, 3) float32 unit, out of the surface
-    weight: Tensor  # (M,) int32: of the end that was seen less
-    views: Tensor  # (M,) int32: likewise
+    weight: Tensor  # (M,) float32: the stored weight of the end that was seen less
+    views: Tensor  # (M,) int64: likewise
     colors: Tensor | None  # (M, 3) float32 in [0, 1]
     labels: Tensor | None  # (M,) int64
+    dropped: int  # how many more there are whose ends were seen less than asked for
 
-    def select(self, keep: Tensor) -> Crossings:
-        """Keep some rows."""
-        rows: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        chosen: dict[str, Any] = {name: None if value is None else value[keep] for name, value in rows.items()}
+    def select(self, rows: Tensor) -> Crossings:
+        """Keep some rows (K,) int64, without their edges."""
+        columns = {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and name != "edge"}
+        chosen: dict[str, Any] = {**vars(self), "edge": rows[:0], **pick_rows(columns, rows)}
         return Crossings(**chosen)
 
     @staticmethod
     def cat(parts: list[Crossings]) -> Crossings:
         """Put parts one after another."""
-        columns = {entry.name: [getattr(part, entry.name) for part in parts] for entry in fields(Crossings)}
-        joined: dict[str, Any] = {name: None if v[0] is None else torch.cat(v) for name, v in columns.items()}
-        return Crossings(**joined)
+        joined: dict[str, Any] = {}
+        for entry in fields(Crossings):
+            column = [getattr(part, entry.name) for part in parts]
+            joined[entry.name] = torch.cat(column) if isinstance(column[0], Tensor) else column[0]
+        return Crossings(**{**joined, "dropped": sum(part.dropped for part in parts)})
 
 
-def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid) -> Crossings:
-    """Find every zero crossing between two seen neighbours along x, y and z.
+def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False) -> Crossings:
+    """Find every zero crossing between neighbours along x, y and z that were both seen, with ``min_weight`` at least.
 
-    The point is interpolated linearly, as is the colour; normal and label are those of the nearer end, of the first at
-    equal distance; the normal is the gradient's direction there. An edge whose ends differ by more than a truncation
+    Point, colour and gradient are interpolated linearly between the ends; the label is that of the nearer end, of the
+    first at equal distance; the normal is the gradient's direction. An edge whose ends differ by more than a truncation
     belongs to no surface.
     """
     keys = blocks.sorted_keys
     parts = [
-        _crossings_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), start, grid)
+        _crossings_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), start, grid, min_weight, edges)
         for start in range(0, max(len(keys), 1), _TOGETHER)
     ]
     return Crossings.cat(parts)
 
 
-def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid) -> Crossings:
+def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid, min_weight: int, edges: bool) -> Crossings:
     if len(some.corner) == 0:
         return _none(some.blocks)
     count = len(some.corner)
     tsdf = some.plane("tsdf").reshape(count, -1).float()
-    weight = some.plane("weight").reshape(count, -1).int()
+    weight = some.plane("weight").reshape(count, -1).float()
     value = torch.where(weight > 0, tsdf, torch.nan)
-    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=tsdf.device)] * 3, indexing="ij")
-    own = (((z + 1) * SIDE + (y + 1)) * SIDE + (x + 1)).flatten()  # places of the block's own voxels
+    own = own_places(tsdf.device)
     here = value[:, own, None]
     there = torch.stack([value[:, own + stride] for stride in _STRIDE], dim=-1)
     crosses = ((here < 0) != (there < 0)) & ((here - there).abs() <= MAX_STEP)  # false with a NaN
     block, voxel, axis = crosses.nonzero(as_tuple=True)
     start = own[voxel]
     end = start + torch.tensor(_STRIDE, device=tsdf.device)[axis]
+    least = torch.minimum(weight[block, start], weight[block, end])
+    kept = least >= min_weight
+    block, voxel, axis, start, end, least = (column[kept] for column in (block, voxel, axis, start, end, least))
     before, after = value[block, start], value[block, end]
     fraction = before / (before - after)
     offset = torch.stack([voxel % EDGE, voxel // EDGE % EDGE, voxel // EDGE**2], dim=-1)
     place = (some.corner[block] + offset).double()
     place[torch.arange(len(axis)), axis] += fraction.double()
-    views = weight if some.blocks.planes.views is False else some.plane("views").reshape(count, -1).int()
     nearer = torch.where(fraction <= 0.5, start, end)
-    gradient = _gradient(value, block, nearer)
     return Crossings(
-        edge=3 * (VOXELS * (first + block) + voxel) + axis,
+        edge=3 * (VOXELS * (first + block) + voxel) + axis if edges else axis[:0],
         points=(place * grid.voxel_size).float(),
-        normals=_unit(gradient, axis, after - before),
-        weight=torch.minimum(weight[block, start], weight[block, end]),
-        views=torch.minimum(views[block, start], views[block, end]),
+        normals=_unit(_gradient(value, block, start, end, fraction), axis, after - before),
+        weight=least,
+        views=_least_views(some, block, start, end) if some.blocks.planes.views else least.long(),
         colors=_colors(some, block, start, end, fraction) if some.blocks.planes.colors else None,
         labels=some.plane("label").reshape(count, -1)[block, nearer].long() if some.blocks.planes.labels else None,
+        dropped=len(kept) - len(least),
     )
 
 
-def _gradient(value: Tensor, block: Tensor, place: Tensor) -> Tensor:
-    """Return (M, 3): the slope per voxel at a seen voxel, smoothed across; 0 along an axis without a seen neighbour.
+def _gradient(value: Tensor, block: Tensor, start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
+    """Return (M, 3): the slope per voxel at a crossing, smoothed; 0 along an axis without a seen neighbour.
 
-    Central differences of the nine pairs of neighbours along each axis, weighted 4, 2, 1 from the middle to the
-    corners (Sobel's); where no pair was seen whole, the difference to the one neighbour that was.
+    The mean rise between the two voxels on one side and the two on the other, over the nine lines along the axis,
+    weighted 4, 2, 1 from the middle to the corners: per step the weighted rises of the pairs that were seen whole, by
+    their weighted steps. Both ends of the edge count by how near they are. Where no pair was seen whole, it is the
+    difference to the one neighbour of the nearer end that was.
+
+    A distance is that of the nearest pixel, so the field has stairs a pixel wide, and the difference of the next two
+    voxels alone follows them. Source: the operator of Sobel & Feldman, A 3x3 Isotropic Gradient Operator, 1968, with a
+    difference of boxes of two voxels along the axis.
     """
     slopes = []
-    for axis, stride in enumerate(_STRIDE):
-        one, other = (across for b, across in enumerate(_STRIDE) if b != axis)
-        total, weight = torch.zeros_like(value[block, place]), torch.zeros_like(value[block, place])
-        for i in (-1, 0, 1):
-            for j in (-1, 0, 1):
-                middle = place + (i * one + j * other)
-                rise = value[block, middle + stride] - value[block, middle - stride]
+    for axis in range(3):
+        rise, steps = (
+            one + (other - one) * fraction
+            for one, other in zip(_rise(value, block, start, axis), _rise(value, block, end, axis), strict=True)
+        )
+        nearer = torch.where(fraction <= 0.5, start, end)
+        slopes.append(torch.where(steps > 0, rise / (2 * steps), _one_sided(value, block, nearer, _STRIDE[axis])))
+    return torch.stack(slopes, dim=-1)
+
+
+def _rise(value: Tensor, block: Tensor, place: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """Sum up, with their weights, the rises (M,) of the pairs of seen voxels around a place, and their steps (M,).
+
+    A pair lies one or two steps below and above. Whole numbers below 2^24, so sums are exact in any order.
+    """
+    stride = _STRIDE[axis]
+    one, other = (across for a, across in enumerate(_STRIDE) if a != axis)
+    rises, steps = torch.zeros_like(value[block, place]), torch.zeros_like(value[block, place])
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            middle = place + (i * one + j * other)
+            for step in (1, 2):
+                rise = value[block, middle + step * stride] - value[block, middle - step * stride]
                 share = float((2 - abs(i)) * (2 - abs(j)))
                 seen = ~rise.isnan()
-                total += torch.where(seen, share * rise, 0.0)
-                weight += torch.where(seen, share, 0.0)
-        slopes.append(torch.where(weight > 0, total / (2 * weight), _one_sided(value, block, place, stride)))
-    return torch.stack(slopes, dim=-1)
+                rises += torch.where(seen, share * rise, 0.0)
+                steps += torch.where(seen, share * step, 0.0)
+    return rises, steps
 
 
 def _one_sided(value: Tensor, block: Tensor, place: Tensor, stride: int) -> Tensor:
@@ -129,6 +155,11 @@ def _unit(gradient: Tensor, axis: Tensor, step: Tensor) -> Tensor:
     along = torch.zeros_like(gradient)
     along[torch.arange(len(axis)), axis] = step.sign()
     return torch.where((length > 0)[:, None], gradient / length[:, None], along)
+
+
+def _least_views(some: Neighbourhood, block: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    views = some.plane("views").reshape(len(some.corner), -1)
+    return torch.minimum(views[block, start], views[block, end]).long()
 
 
 def _colors(some: Neighbourhood, block: Tensor, start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
@@ -147,8 +178,9 @@ def _none(blocks: VoxelBlocks) -> Crossings:
         edge=empty.long(),
         points=empty.reshape(0, 3),
         normals=empty.reshape(0, 3),
-        weight=empty.int(),
-        views=empty.int(),
+        weight=empty,
+        views=empty.long(),
         colors=empty.reshape(0, 3) if blocks.planes.colors else None,
         labels=empty.long() if blocks.planes.labels else None,
+        dropped=0,
     )

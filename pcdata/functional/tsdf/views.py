@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.functional import rigid
 from pcdata.functional.lens import fold_radius
+from pcdata.functional.tsdf.blocks import COLOR_SCALE
 
 Weighting = Literal["constant", "inverse_square", "angle"]
 
@@ -22,12 +24,12 @@ class FusionView:
     """What one camera saw, in the form that the kernels read."""
 
     depth: Tensor  # (H, W) float32 metres, 0 = no reading
-    rays: Tensor  # (H, W, 2) float64, x/z and y/z of every pixel
+    rays: Tensor  # (2, H, W) float32, x/z and y/z of every pixel
     pinhole: tuple[float, float, float, float, float]  # fx, skew, cx, fy, cy
     distortion: Tensor | None  # (12,) float64 coefficients
     world_from_camera: Tensor  # (4, 4) float64
     weight: Tensor | None = None  # (H, W) int32 at least 1; None = 1 everywhere
-    color: Tensor | None = None  # (H, W) int32: r | g << 8 | b << 16
+    color: Tensor | None = None  # (H, W) int32: r | g << 10 | b << 20, in steps of a stored colour
     label: Tensor | None = None  # (H, W) int32
 
     @property
@@ -42,9 +44,22 @@ class FusionView:
 
 
 def pack_colors(colors: Tensor) -> Tensor:
-    """Pack (..., 3) uint8 RGB into (...) int32."""
-    r, g, b = colors.int().unbind(-1)
-    return r | (g << 8) | (b << 16)
+    """Pack (..., 3) uint8 RGB into (...) int32, as voxels store it."""
+    r, g, b = (colors.int() * COLOR_SCALE).unbind(-1)
+    return r | (g << 10) | (b << 20)
+
+
+def fit_labels(labels: Tensor) -> bool:
+    """Say whether int64 labels fit the 32 bits of a voxel."""
+    found = labels.numpy() if labels.device.type == "cpu" else labels  # see pcdata.checks on NumPy
+    return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
+
+
+def pack_labels(labels: Tensor) -> Tensor:
+    """Convert int64 labels that fit to int32, as voxels store them."""
+    if labels.device.type == "cpu":
+        return torch.from_numpy(labels.numpy().astype(np.int32))
+    return labels.int()
 
 
 def weight_image(

@@ -1,5 +1,5 @@
-// The grid of a truncated signed distance field and what a view needs to be averaged into it. The layout of keys, blocks
-// and planes is that of pcdata/functional/tsdf; results equal that reference bit for bit.
+// The grid of a truncated signed distance field and what a view needs to be averaged into it. The layout of keys,
+// blocks and planes is that of pcdata/functional/tsdf; results equal that reference bit for bit.
 #pragma once
 
 #include <cmath>
@@ -32,14 +32,16 @@ struct BlockPlace {
 template <class T>
 struct Plane {
   static constexpr int64_t kChunk = 8192;  // blocks
-  const int64_t* chunks;                   // addresses
+  const int64_t* chunks;                   // addresses of the plane in each chunk's first block
+  int64_t stride;                          // bytes from block to block
 
   explicit operator bool() const { return chunks != nullptr; }
   T* block(int64_t row) const {
-    return reinterpret_cast<T*>(static_cast<uintptr_t>(chunks[row / kChunk])) + row % kChunk * kVoxels;
+    return reinterpret_cast<T*>(static_cast<uintptr_t>(chunks[row / kChunk] + row % kChunk * stride));
   }
 };
 
+// The planes of a block lie behind one another.
 struct VoxelPlanes {
   Plane<int16_t> tsdf, weight;
   Plane<int32_t> color;
@@ -48,7 +50,17 @@ struct VoxelPlanes {
   Plane<int16_t> votes;
 
   explicit VoxelPlanes(const int64_t* const* planes)
-      : tsdf{planes[0]}, weight{planes[1]}, color{planes[2]}, views{planes[3]}, label{planes[4]}, votes{planes[5]} {}
+      : VoxelPlanes(planes, kVoxels * (4 + (planes[2] ? 4 : 0) + (planes[3] ? 2 : 0) + (planes[4] ? 4 : 0) +
+                                       (planes[5] ? 2 : 0))) {}
+
+ private:
+  VoxelPlanes(const int64_t* const* planes, int64_t stride)
+      : tsdf{planes[0], stride},
+        weight{planes[1], stride},
+        color{planes[2], stride},
+        views{planes[3], stride},
+        label{planes[4], stride},
+        votes{planes[5], stride} {}
 };
 
 typedef int16_t ShortLanes __attribute__((vector_size(2 * kLanes)));
@@ -58,10 +70,37 @@ inline void store_short(int16_t* to, const IntLanes& lanes) { store(to, __builti
 inline FloatLanes as_float(const IntLanes& lanes) { return __builtin_convertvector(lanes, FloatLanes); }
 inline IntLanes truncated(const FloatLanes& lanes) { return __builtin_convertvector(lanes, IntLanes); }
 
-// To the nearest integer, the even one of two; for values below 2^22.
-inline FloatLanes rounded(const FloatLanes& x) {
+// The greatest integer that is not above; INT32_MIN for what no int32 holds.
+inline IntLanes floored(const FloatLanes& x) {
+#if defined(__AVX512DQ__)
+  constexpr int down = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+  return reinterpret_cast<IntLanes>(_mm512_maskz_cvt_roundps_epi32(0xffff, reinterpret_cast<__m512>(x), down));
+#elif defined(__AVX2__)
+  return reinterpret_cast<IntLanes>(_mm256_cvtps_epi32(_mm256_floor_ps(reinterpret_cast<__m256>(x))));
+#else
+  const IntLanes whole = truncated(x);
+  return whole + (as_float(whole) > x);  // a comparison is -1 where it holds
+#endif
+}
+
+// The nearest integer, the even one of two; for values below 2^22.
+inline IntLanes rounded(const FloatLanes& x) {
+#if defined(__AVX512DQ__)
+  return reinterpret_cast<IntLanes>(_mm512_maskz_cvtps_epi32(0xffff, reinterpret_cast<__m512>(x)));
+#elif defined(__AVX2__)
+  return reinterpret_cast<IntLanes>(_mm256_cvtps_epi32(reinterpret_cast<__m256>(x)));
+#else
   constexpr float shift = 12582912.0f;
-  return (x + shift) - shift;
+  return truncated((x + shift) - shift);
+#endif
+}
+
+// The first `count` numbers, or as many as there are lanes; the rest is 0.
+inline FloatLanes load_up_to(const float* from, int64_t count) {
+  if (count >= kLanes) return load<FloatLanes>(from);
+  FloatLanes lanes = {};
+  std::memcpy(&lanes, from, static_cast<size_t>(count) * sizeof(float));
+  return lanes;
 }
 
 inline FloatLanes gather(const float* from, const IntLanes& index) {

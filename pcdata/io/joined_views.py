@@ -1,0 +1,58 @@
+"""From frames of one moment to a frame of all their views."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.structures import Camera, DepthFrame
+
+
+def join_views(frames: Sequence[DepthFrame], provenance: Mapping[str, Any]) -> DepthFrame:
+    """Return the views of all frames as one frame, in their order, with the sample id of the first.
+
+    Lenses with fewer coefficients than others get zeros for the rest, which bend nothing.
+
+    Raises:
+        ShapeError: sizes differ, or not all frames have an image or a pose that one of them has.
+    """
+    first = frames[0]
+    return DepthFrame(
+        depth=torch.cat([frame.depth for frame in frames]),
+        camera=_join_cameras([frame.camera for frame in frames]),
+        colors=_join([frame.colors for frame in frames]),
+        labels=_join([frame.labels for frame in frames]),
+        confidence=_join([frame.confidence for frame in frames]),
+        mask=_join([frame.mask for frame in frames]),
+        world_from_camera=_join([frame.world_from_camera for frame in frames]),
+        frame_id=first.frame_id,
+        capture_index=first.capture_index,
+        sample_id=first.sample_id,
+        provenance=provenance,
+    )
+
+
+def _join(images: Sequence[Tensor | None]) -> Tensor | None:
+    """Join what is there; fewer than there are views, and the frame refuses them."""
+    present = [image for image in images if image is not None]
+    return torch.cat(present) if present else None
+
+
+def _join_cameras(cameras: Sequence[Camera]) -> Camera:
+    lenses = [camera.distortion for camera in cameras]
+    widest = max(0 if lens is None else lens.shape[1] for lens in lenses)
+    padded = [
+        torch.zeros(camera.num_views, widest, dtype=torch.float64)
+        if lens is None
+        else torch.nn.functional.pad(lens, (0, widest - lens.shape[1]))
+        for camera, lens in zip(cameras, lenses)
+    ]
+    return Camera(
+        intrinsics=torch.cat([camera.intrinsics for camera in cameras]),
+        size=cameras[0].size,
+        distortion=torch.cat(padded) if widest else None,
+        is_window=any(camera.is_window for camera in cameras),
+    )

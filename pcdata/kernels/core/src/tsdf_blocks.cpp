@@ -1,0 +1,66 @@
+// Finding the rows of blocks by their keys, and packing colours as voxels store them.
+#include "pc/tsdf.hpp"
+#include "pc/voxel_table.hpp"
+
+namespace pc {
+namespace {
+
+// Rows of blocks by their keys: open addressing, at most half full. A slot holds a row, or -1.
+struct RowTable {
+  const int64_t* keys;  // of all rows
+  int32_t* slots;
+  int64_t num_slots;  // a power of two
+
+  int64_t first(int64_t key) const {
+    const int shift = 64 - __builtin_ctzll(static_cast<uint64_t>(num_slots));
+    return static_cast<int64_t>(PackedVoxel::mixed(static_cast<uint64_t>(key)) >> shift);
+  }
+  void add(int64_t row) {
+    int64_t at = first(keys[row]);
+    while (slots[at] >= 0) at = (at + 1) & (num_slots - 1);
+    slots[at] = static_cast<int32_t>(row);
+  }
+  int64_t find(int64_t key) const {
+    int64_t at = first(key);
+    while (slots[at] >= 0 && keys[slots[at]] != key) at = (at + 1) & (num_slots - 1);
+    return slots[at];
+  }
+  // A look leads from a slot to a key, both somewhere in memory: go a step at a time.
+  void prefetch_slot(int64_t key) const { __builtin_prefetch(slots + first(key)); }
+  void prefetch_key(int64_t key) const { __builtin_prefetch(keys + std::max<int32_t>(0, slots[first(key)])); }
+};
+
+}  // namespace
+}  // namespace pc
+
+// Bring a table of rows (num_slots,) up to date, from the first num_known rows of keys (num_blocks,) to all, and look
+// up wanted (num_wanted,): rows (num_wanted,), -1 where there is no block; missing (*count,) are the keys of these.
+PC_EXPORT int32_t pc_tsdf_find(const pc_context*, const int64_t* keys, int64_t num_blocks, int32_t* slots,
+                               int64_t num_slots, int64_t num_known, const int64_t* wanted, int64_t num_wanted,
+                               int64_t* rows, int64_t* missing, int64_t* count) {
+  return pc::guarded([&] {
+    constexpr int64_t kSlots = 24, kKeys = 12;  // ahead
+    pc::RowTable table{keys, slots, num_slots};
+    for (int64_t row = num_known; row < num_blocks; ++row) {
+      if (row + kSlots < num_blocks) table.prefetch_slot(keys[row + kSlots]);
+      table.add(row);
+    }
+    int64_t none = 0;
+    for (int64_t i = 0; i < num_wanted; ++i) {
+      if (i + kSlots < num_wanted) table.prefetch_slot(wanted[i + kSlots]);
+      if (i + kKeys < num_wanted) table.prefetch_key(wanted[i + kKeys]);
+      rows[i] = table.find(wanted[i]);
+      missing[none] = wanted[i];
+      none += rows[i] < 0;
+    }
+    *count = none;
+  });
+}
+
+// colors (count, 3) -> packed (count,): r | g << 10 | b << 20, in steps of a stored colour.
+PC_EXPORT int32_t pc_tsdf_pack_colors(const pc_context*, const uint8_t* colors, int64_t count, int32_t* packed) {
+  return pc::guarded([&] {
+    for (int64_t i = 0; i < count; ++i)
+      packed[i] = colors[3 * i] << 2 | colors[3 * i + 1] << 12 | colors[3 * i + 2] << 22;
+  });
+}
