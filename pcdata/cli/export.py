@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.options import add_capture_options, name_and_value, open_captures, positive
 from pcdata.cli.progress import Progress
 
 
@@ -20,7 +20,7 @@ def add_to(commands: Any) -> None:
         action="append",
         default=[],
         metavar="OPTION=VALUE",
-        type=_pair,
+        type=name_and_value,
         help="option of the target; repeatable",
     )
     add_capture_options(export)
@@ -69,10 +69,3 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 _CAPTURE_OPTIONS = ("kind", "metres_per_unit", "calibration", "camera", "frame", "limit")
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, sign, value = text.partition("=")
-    if not sign or not name:
-        raise argparse.ArgumentTypeError(f"must be OPTION=VALUE, got {text!r}")
-    return name, value

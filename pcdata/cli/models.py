@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import Any
 
-from pcdata.cli.options import positive
+from pcdata.cli.options import name_and_value, positive
 
 
 def add_to(commands: Any) -> None:
@@ -18,6 +18,14 @@ def add_to(commands: Any) -> None:
     check.add_argument("--frame", metavar="NAME", help="frame that you train in; of a foreign file also its frame")
     check.add_argument("--unit", choices=["m", "normalized"], help="unit of a foreign file")
     check.add_argument("--num-points", type=positive, metavar="N", help="count, where the model is used with several")
+    check.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="CHOICE=VALUE",
+        type=name_and_value,
+        help="another choice that the model leaves open, such as category=3; repeatable",
+    )
     check.add_argument("--limit", type=positive, metavar="N", help="only the first N samples")
     check.add_argument("--json", metavar="FILE", help="write the outcome to a new file")
     check.set_defaults(run=_check)
@@ -48,13 +56,28 @@ def _holds(path: str, name: str) -> bool:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any]:
+    from pcdata.errors import ConfigError
     from pcdata.models import CONTRACTS, contract
 
     contract(arguments.model)  # an unknown name is an error here
     choices = {} if arguments.num_points is None else {"num_points": arguments.num_points}
     if arguments.frame and not CONTRACTS[arguments.model].frame:
         choices["frame"] = arguments.frame
+    for name, value in arguments.set:
+        if name in choices:
+            raise ConfigError(f"check: {name} is given twice; give it once")
+        choices[name] = _parsed(value)
     return choices
+
+
+def _parsed(value: str) -> Any:
+    """Read numbers, boxes and lists as Python writes them; anything else is a text."""
+    import ast
+
+    try:
+        return ast.literal_eval(value)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return value
 
 
 def _check_cache(arguments: argparse.Namespace) -> Any:

@@ -31,6 +31,14 @@ def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = 
     return open_source(path, kind=arguments.kind, limit=limit, **options)
 
 
+def name_and_value(text: str) -> tuple[str, str]:
+    """Split NAME=VALUE."""
+    name, sign, value = text.partition("=")
+    if not sign or not name:
+        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
+    return name, value
+
+
 def positive(text: str) -> int:
     """Parse a whole number of at least 1."""
     if not text.isdecimal() or int(text) < 1:

@@ -39,6 +39,7 @@ class DP3(Target):
             :func:`pcdata.exports.episodes.read_episodes`.
         colors: store xyz and rgb, as the simulated data sets have it; False = xyz alone.
         frame: the frame that the clouds must be in; None = that of the first.
+        num_points: points of every cloud, where they are others than the 512 and 1024 that DP3 is used with.
         compression: of the chunks.
     """
 
@@ -50,6 +51,7 @@ class DP3(Target):
     episodes: Given | None = None
     colors: bool = True
     frame: str | None = None
+    num_points: int | None = None
     compression: Compression = "zlib"
 
     def items(self, ids: Sequence[str]) -> list[Item]:
@@ -84,7 +86,8 @@ class DP3(Target):
             if frame is None:  # the policy is fed one frame: that of the first
                 frame = cloud.frame_id
             rows = self._points(where, cloud)
-            require_cloud(where, self, cloud, frame=frame, crop=None, channels=channels)
+            stated = {} if self.num_points is None else {"num_points": self.num_points}
+            require_cloud(where, self, cloud, frame=frame, crop=None, channels=channels, **stated)
             if clouds is None:
                 count = cloud.num_points
                 clouds = self._rows(folder, "point_cloud", (total, *rows.shape), "<f4")

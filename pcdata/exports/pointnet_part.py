@@ -70,15 +70,17 @@ class PointNetPart(PointNet):
         low, high = int(cloud.labels.min()), int(cloud.labels.max())
         if low < 0 or high >= _MAX_PARTS:
             raise CaptureError(
-                f"{where}: labels must be part numbers 0 .. {_MAX_PARTS - 1} at every point, got {low} .. {high}; drop "
-                "unlabelled points (-1) and renumber"
+                f"{where}: labels must be part numbers 0 .. {_MAX_PARTS - 1} at every point, got {low} .. {high}; give "
+                "unlabelled points (-1) a part, or cut them away, and renumber, before 'pcdata build'"
             )
         for part in cloud.labels.unique().tolist():
             owner = class_of_part.setdefault(part, class_name)
             if owner != class_name:
+                free = max(class_of_part) + 1
                 raise CaptureError(
-                    f"{where}: part {part} belongs to class {owner!r} in samples before, to {class_name!r} here; "
-                    "number parts through all classes"
+                    f"{where}: its labels are {low} .. {high}, but part {part} belongs to class {owner!r} in samples "
+                    f"before, to {class_name!r} here; number parts through all classes: add {free} to the labels of "
+                    f"every sample of {class_name!r}, before 'pcdata build'"
                 )
         file["pid"][number] = cloud.labels.numpy()
 
@@ -91,7 +93,7 @@ class PointNetPart(PointNet):
         if missing:
             raise CaptureError(
                 f"{self.name}: part numbers must go from 0 to {count - 1} without gaps, since the loader counts them, "
-                f"but no sample has {missing[:10]}; renumber the labels"
+                f"but no sample has the labels {missing[:10]}; renumber those above, before 'pcdata build'"
             )
         owners = [class_of_part[part] for part in range(count)]
         parts = [[owner, owners[:part].count(owner)] for part, owner in enumerate(owners)]

@@ -6,11 +6,11 @@ import os
 from typing import Any
 
 from pcdata.datasets import CachedCloudDataset
-from pcdata.errors import CaptureError, ConfigError, DTypeError
+from pcdata.errors import ConfigError
 from pcdata.exports.target import Target
 from pcdata.io import open_source
 from pcdata.io.manifest import FILE_NAME
-from pcdata.io.source import CaptureSource, absolute
+from pcdata.io.source import CaptureSource, absolute, checked_ids
 from pcdata.structures import PointCloud
 
 
@@ -58,14 +58,7 @@ def open_for(target: Target, source: Any) -> CaptureSource:
         source = BuiltClouds(source) if built else open_source(source)
     elif isinstance(source, CachedCloudDataset):
         source = BuiltClouds(source.folder)
-    if not hasattr(source, "ids") or not hasattr(source, "load"):
-        raise DTypeError(f"export: source must be a path or have ids and load(id), got {type(source).__name__}")
-    ids = list(source.ids)
-    if not ids:
-        raise CaptureError(f"export: {source!r} has no samples")
-    if len(set(ids)) != len(ids):
-        twice = next(name for name in ids if ids.count(name) > 1)
-        raise CaptureError(f"export: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    checked_ids("export", source)
     opened: CaptureSource = source
     return opened
 

@@ -187,7 +187,8 @@ def _search_size(
     available = distinct(points) if len(points) >= num_points else len(points)
     if available < num_points:
         raise TooFewPointsError(
-            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {available} distinct ones"
+            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {available} distinct ones; "
+            "ask for fewer (num_points), or give it more points, as by a wider crop"
         )
     extent = float((points.amax(0).double() - points.amin(0)).max())
     too_large = 3.0 * extent or 1.0  # everything lies in one voxel

@@ -10,7 +10,7 @@ import errno
 import os
 import pickletools
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -19,15 +19,13 @@ import numpy as np
 import torch
 
 from pcdata.errors import CacheError
+from pcdata.io.claimed_sizes import checked_dataset, checked_members, read_npy
 from pcdata.io.record import Record, parse_info
 
 Format = Literal["hdf5", "npz", "pt"]
 Compression = Literal["none", "lzf", "gzip"]
 
 INFO = "pcdata"  # the name that the JSON text is stored under
-
-# Deflate cannot pack tighter than 1032:1, LZF not tighter than 100:1; a larger claim is a bomb or a damaged header.
-_MAX_RATIO = 1100
 
 # All that a dict of tensors and one text needs. weights_only allows more, such as bytearray(10**12), which allocates.
 _PT_GLOBALS = frozenset(
@@ -87,8 +85,8 @@ class NpzStore(Store):
         """Read one file."""
         path = self.path_of(key)
         with _damage_named(path), zipfile.ZipFile(path) as archive:
-            members = _checked_members(archive, path)
-            arrays = {member.filename.removesuffix(".npy"): _read_npy(archive, member) for member in members}
+            members = checked_members(archive, path)
+            arrays = {member.filename.removesuffix(".npy"): read_npy(archive, member) for member in members}
             if INFO not in arrays:
                 raise CacheError(f"has no member {INFO!r}")
             return Record(arrays, parse_info(str(arrays.pop(INFO))))
@@ -113,7 +111,7 @@ class PtStore(Store):
         path = self.path_of(key)
         with _damage_named(path):
             with zipfile.ZipFile(path) as archive:
-                _check_pt(archive, _checked_members(archive, path))
+                _check_pt(archive, checked_members(archive, path))
             stored = torch.load(path, weights_only=True, map_location="cpu")
             if not isinstance(stored, dict) or not isinstance(text := stored.pop(INFO, None), str):
                 raise CacheError(f"must hold a dict with tensors and a text {INFO!r}")
@@ -166,7 +164,7 @@ class Hdf5Store(Store):
             group = file[key]
             if not isinstance(group, h5py.Group):
                 raise CacheError(f"{key!r} must be a group, not a {type(group).__name__}")
-            arrays = {name: _checked_dataset(group, name) for name in group}
+            arrays = {name: checked_dataset(group, name)[()] for name in group}
             if INFO not in arrays:
                 raise CacheError(f"group {key!r} has no dataset {INFO!r}")
             return Record(arrays, parse_info(bytes(arrays.pop(INFO))))
@@ -252,41 +250,6 @@ def _damage_named(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _checked_members(archive: zipfile.ZipFile, path: Path) -> list[zipfile.ZipInfo]:
-    """Return a zip file's members if the sizes that it claims can be true."""
-    members = archive.infolist()
-    size = path.stat().st_size
-    if sum(member.compress_size for member in members) > size:
-        raise CacheError(f"its members claim more bytes than its {size}")
-    if len({member.filename for member in members}) != len(members):
-        raise CacheError("two members have one name")
-    for member in members:
-        if member.file_size > _MAX_RATIO * member.compress_size:
-            raise CacheError(f"member {member.filename!r} claims {member.file_size} bytes from {member.compress_size}")
-    return members
-
-
-def _read_npy(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array after comparing the size that its header claims with the bytes it has."""
-    readers: dict[tuple[int, int], Callable[..., Any]] = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version not in readers:
-            raise CacheError(f"member {member.filename!r} has npy version {version}")
-        try:
-            shape, by_columns, dtype = readers[version](stream)
-        except MemoryError as error:  # Python's parser on nested signs, not a lack of memory
-            raise CacheError(f"member {member.filename!r} has a header that cannot be parsed") from error
-        expected = int(np.prod(shape, dtype=object)) * dtype.itemsize
-        if dtype.hasobject or expected + stream.tell() != member.file_size:
-            raise CacheError(f"member {member.filename!r} claims shape {shape} of {dtype} in {member.file_size} bytes")
-        content = bytearray(stream.read())  # to the end, where zipfile compares the checksum
-    return np.ndarray(shape, dtype, buffer=content, order="F" if by_columns else "C")
-
-
 def _check_pt(archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]) -> None:
     """Refuse a .pt file that is compressed, or whose pickle names anything but tensors."""
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
@@ -298,22 +261,3 @@ def _check_pt(archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]) -> N
         named = opcode.name == "GLOBAL" and argument not in _PT_GLOBALS
         if named or opcode.name in _PT_FORBIDDEN:
             raise CacheError(f"its pickle asks for {argument or opcode.name!r}, which no tensor needs; it was not run")
-
-
-def _checked_dataset(group: Any, name: str) -> np.ndarray:
-    """Read a dataset that is stored inside this very file and is no larger than its bytes allow."""
-    import h5py
-
-    dataset = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-    if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
-        raise CacheError(f"{group.name}/{name} must be a dataset stored in this file, not a link to another")
-    if dataset.shape is None or dataset.dtype.kind not in "biufS":
-        raise CacheError(f"{group.name}/{name} must hold numbers or one text, got {dataset.dtype}")
-    stored = dataset.id.get_storage_size()
-    chunks = [] if dataset.chunks is None else [dataset.chunks]  # unpacked whole, however little of one is used
-    for shape in [dataset.shape, *chunks]:
-        claimed = int(np.prod(shape, dtype=object)) * dataset.dtype.itemsize
-        if claimed > (stored if dataset.compression is None else _MAX_RATIO * stored):
-            raise CacheError(f"{group.name}/{name} claims shape {shape} of {dataset.dtype} but stores {stored} bytes")
-    array: np.ndarray = dataset[()]
-    return array

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import io
 import itertools
 import json
 import lzma
+import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,13 +19,15 @@ import numpy as np
 from pcdata.errors import CacheError
 from pcdata.extras import require
 
-# Codecs of the standard library; numcodecs has the others.
-_DECODERS: dict[str, Callable[[bytes], bytes]] = {
-    "zlib": zlib.decompress,
-    "gzip": gzip.decompress,
-    "bz2": bz2.decompress,
-    "lzma": lzma.decompress,
+# Codecs of the standard library; numcodecs has the others. Each unpacks no more bytes than it is told.
+_DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
+    "zlib": lambda content, most: zlib.decompressobj().decompress(content, most),
+    "gzip": lambda content, most: gzip.GzipFile(fileobj=io.BytesIO(content)).read(most),
+    "bz2": lambda content, most: bz2.BZ2Decompressor().decompress(content, most),
+    "lzma": lambda content, most: lzma.LZMADecompressor().decompress(content, most),
 }
+_MAX_CHUNK = 1 << 31  # bytes; Blosc's own limit
+_MAX_FILTERED = 8  # a filter may store numbers as wider ones, at most from one byte to eight
 
 
 def zarr_arrays(folder: str | Path) -> dict[str, ZarrArray]:
@@ -59,16 +63,37 @@ class ZarrArray:
             self._codecs: list[dict[str, Any]] = [codec for codec in codecs if codec is not None]
             self._order, self._fill = header["order"], header["fill_value"]
             self._separator: str = header.get("dimension_separator", ".")
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            if not all(isinstance(codec["id"], str) for codec in self._codecs):
+                raise TypeError("a codec without a name")
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise CacheError(f"{folder}: its .zarray cannot be read: {error!r}") from error
         self._last: tuple[tuple[int, ...], np.ndarray] | None = None
+        if not all(isinstance(size, int) and size >= 0 for size in (*self.shape, *self.chunks)):
+            raise CacheError(f"{folder}: sizes must be whole numbers, got shape {self.shape}, chunks {self.chunks}")
         if len(self.chunks) != len(self.shape) or 0 in self.chunks:
             raise CacheError(f"{folder}: every axis needs chunks of at least 1, got {header}")
+        if self._chunk_bytes > _MAX_CHUNK:
+            raise CacheError(
+                f"{folder}: a chunk {self.chunks} of {self.dtype} has {self._chunk_bytes} bytes, more than {_MAX_CHUNK}"
+            )
 
     @property
     def ndim(self) -> int:
         """The number of axes."""
         return len(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the whole array in bytes, as its header claims."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def _chunk_bytes(self) -> int:
+        return math.prod(self.chunks) * self.dtype.itemsize
+
+    def stored_bytes(self) -> int:
+        """Return the size of the chunks on disk."""
+        return sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
 
     def __getitem__(self, index: Any) -> np.ndarray:
         """Read one row of the first axis, or everything for ``...``."""
@@ -84,7 +109,10 @@ class ZarrArray:
     def _filled(self, shape: tuple[int, ...]) -> np.ndarray:
         if self.dtype.hasobject:  # only when it is asked for: a store may hold texts beside its numbers
             raise CacheError(f"{self.folder}: must hold numbers, got {self.dtype}")
-        return np.full(shape, 0 if self._fill is None else self._fill, self.dtype)
+        try:
+            return np.full(shape, 0 if self._fill is None else self._fill, self.dtype)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise CacheError(f"{self.folder}: its fill value cannot be {self._fill!r:.100}: {error}") from error
 
     def _scalar(self) -> np.ndarray:
         empty = self._filled(())
@@ -115,15 +143,18 @@ class ZarrArray:
         try:
             content = self._decoded(path.read_bytes())
             block = np.frombuffer(content, self.dtype).reshape(self.chunks, order=self._order)
-        except (OSError, ValueError, EOFError, RuntimeError, zlib.error, lzma.LZMAError) as error:
+        except (
+            OSError, ValueError, TypeError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
+        ) as error:  # fmt: skip
             raise CacheError(f"{path}: this chunk cannot be read: {error}") from error
         self._last = (position, block)
         return block
 
     def _decoded(self, content: bytes) -> bytes:
+        most = _MAX_FILTERED * self._chunk_bytes + 1  # one more than any chunk: too long is an error, not a cut
         for codec in self._codecs:
             if codec["id"] in _DECODERS:
-                content = _DECODERS[codec["id"]](content)
+                content = _DECODERS[codec["id"]](content, most)
             else:
                 content = bytes(require("numcodecs").get_codec(codec).decode(content))
         return content

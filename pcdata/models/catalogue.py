@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.models.contract import MIN_POINTS, InputTensor, ModelContract
 from pcdata.models.tables import grasping, images, pointnet, policies, scenes
 from pcdata.structures import CAMERA_FRAME
 
@@ -21,7 +21,7 @@ CHOICES = {
     "frame": "the name of the frame that you train in, as the captures call it: frame='base'",
     "crop": "the workspace ((x, y, z), (x, y, z)), smallest and largest, metres in that frame; or None for no crop",
     "category": "the object's category as the model numbers it, 0 to 15",
-    "num_points": "one of the counts that the model's code is used with",
+    "num_points": "the number of points of every cloud",
     "sampler": "one of the samplers that the model's code offers",
     "window": "edge length in pixels of the square that is cut from the middle of the image",
     "voxel_size": "edge length in metres",
@@ -35,10 +35,14 @@ def contract(name: str, **choices: Any) -> ModelContract:
     Raises:
         ConfigError: no such model or choice, or a value that the model's code does not allow.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"a model contract must be named by a text, such as 'dp3_sim', got {type(name).__name__}")
     if name not in CONTRACTS:
         hint = near_matches(name, CONTRACTS) or f"; known: {', '.join(sorted(CONTRACTS))}"
         raise ConfigError(f"no model contract {name!r}{hint}")
     chosen = CONTRACTS[name]
+    if chosen.voxel_count is not None and {"num_points", "voxel_size"} <= choices.keys():
+        raise ConfigError(f"{name}: num_points finds the voxel size that voxel_size gives; give one of the two")
     for choice, value in choices.items():
         chosen = _MAKERS[choice](chosen, value) if choice in _MAKERS else _unknown(chosen, choice)
     return chosen
@@ -52,10 +56,10 @@ def missing_choices(chosen: ModelContract) -> str:
 def possible_choices(chosen: ModelContract) -> dict[str, str]:
     """Return what may be chosen for a model, required choices first, with what each wants."""
     names = list(chosen.required_choices)
-    names += ["num_points"] if chosen.counts else []
+    names += ["num_points"] if chosen.counts or chosen.any_count or chosen.voxel_count is not None else []
     names += ["sampler"] if chosen.samplers else []
     names += ["window"] if chosen.window is not None else []
-    names += ["voxel_size"] if chosen.voxel is not None and chosen.count_range is not None else []
+    names += ["voxel_size"] if chosen.voxel_count is not None else []
     names += ["channels"] if any(channel.optional for tensor in chosen.tensors for channel in tensor.channels) else []
     names += ["crop"] if chosen.crop is not None and "crop" not in names else []
     return {name: CHOICES[name] for name in names}
@@ -94,14 +98,35 @@ def _choose_crop(chosen: ModelContract, crop: Any) -> ModelContract:
 
 def _choose_count(chosen: ModelContract, count: Any) -> ModelContract:
     original = CONTRACTS[chosen.name]
-    allowed = () if original.count is None else (original.count, *original.counts)
-    if count not in allowed:
-        raise ConfigError(
-            f"{chosen.name}: num_points must be one of {sorted(allowed)}, got {count!r}"
-            if allowed
-            else f"{chosen.name}: takes any number of points; leave num_points out"
-        )
-    return replace(chosen, count=count)
+    if original.count is None and original.voxel_count is None:
+        raise ConfigError(f"{chosen.name}: takes any number of points; leave num_points out")
+    is_count = isinstance(count, int) and not isinstance(count, bool)
+    if not is_count or not _is_allowed(original, count):
+        raise ConfigError(f"{chosen.name}: num_points must be {allowed_counts(original)}, got {count!r}")
+    return replace(chosen, voxel_count=count) if original.count is None else replace(chosen, count=count)
+
+
+def _is_allowed(original: ModelContract, count: int) -> bool:
+    if original.count is None:
+        low, high = _voxel_counts(original)
+        return low <= count <= high
+    return count in (original.count, *original.counts) or (original.any_count and count >= MIN_POINTS)
+
+
+def allowed_counts(original: ModelContract) -> str:
+    """Say what ``num_points`` may be for a model."""
+    if original.count is None:
+        low, high = _voxel_counts(original)
+        return f"the wanted number of voxels, {low} to {high}"
+    used = ", ".join(str(count) for count in sorted({original.count, *original.counts}))
+    return f"{used}, or any other that you state, {MIN_POINTS} or more" if original.any_count else f"one of {used}"
+
+
+def _voxel_counts(original: ModelContract) -> tuple[int, int]:
+    """The counts that may be asked for: the size found can leave a few more, most where depth comes in coarse steps."""
+    assert original.count_range is not None
+    low, high = original.count_range
+    return low, high - high // 20
 
 
 def _choose_sampler(chosen: ModelContract, sampler: Any) -> ModelContract:
@@ -128,13 +153,16 @@ def _choose_voxel(chosen: ModelContract, size: Any) -> ModelContract:
         return _unknown(chosen, "voxel_size")
     if not isinstance(size, float) or not 0.001 <= size <= 0.1:
         raise ConfigError(f"{chosen.name}: voxel_size must be metres, 0.001 to 0.1, got {size!r}")
-    return replace(chosen, voxel=size)
+    return replace(chosen, voxel=size, voxel_count=None)
 
 
 def _choose_channels(chosen: ModelContract, names: Any) -> ModelContract:
     original = CONTRACTS[chosen.name]
     known = [channel for tensor in original.tensors for channel in tensor.channels]
-    wanted = {names} if isinstance(names, str) else set(names)
+    listed = [names] if isinstance(names, str) else names
+    if not isinstance(listed, (list, tuple, set, frozenset)) or not all(isinstance(name, str) for name in listed):
+        raise ConfigError(f"{chosen.name}: channels must be {CHOICES['channels']}, got {names!r}")
+    wanted = set(listed)
     needed = {channel.name for channel in known if not channel.optional}
     if wanted - {channel.name for channel in known}:
         raise ConfigError(f"{chosen.name}: channels are {[channel.name for channel in known]}, got {sorted(wanted)}")
@@ -149,7 +177,7 @@ def _with_channels(tensor: InputTensor, wanted: set[str]) -> InputTensor:
 def _choose_category(chosen: ModelContract, category: Any) -> ModelContract:
     if "category" not in CONTRACTS[chosen.name].choices:
         return _unknown(chosen, "category")
-    if not isinstance(category, int) or not 0 <= category < 16:
+    if not isinstance(category, int) or isinstance(category, bool) or not 0 <= category < 16:
         raise ConfigError(f"{chosen.name}: category must be {CHOICES['category']}, got {category!r}")
     return replace(chosen, choices=tuple(choice for choice in chosen.choices if choice != "category"))
 

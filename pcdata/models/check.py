@@ -50,6 +50,7 @@ def check(
 
     Raises:
         ConfigError: an unknown model or choice.
+        ContractError: there is no sample to judge.
         DTypeError: something that is no data.
     """
     contract_named(model, **choices)
@@ -59,6 +60,7 @@ def check(
             break
         declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
         summary.add(SampleReport(name, tuple(_checks(sample, model, choices, declared, cheap))))
+    _require_samples(summary, "the data")
     return summary
 
 
@@ -84,14 +86,20 @@ def check_files(
         choices: what the contract leaves open.
 
     Raises:
-        CacheError: the file cannot be read, or has no such array.
+        CacheError, CaptureError: the file cannot be read, has no such array, or claims sizes that cannot be true.
         ConfigError: an unknown model, choice or key.
+        ContractError: there is no sample to judge.
+        DTypeError: an array that holds no numbers.
+        ShapeError: arrays without samples, or that do not go together.
     """
     contract = contract_named(model, **choices)
     summary = Summary()
-    for name, arrays, channels in itertools.islice(read_samples(path, contract, keys), limit):
+    made = _category_tensors(contract, choices)
+    for name, stored, channels in itertools.islice(read_samples(path, contract, keys), limit):
+        arrays = {**made, **stored}
         declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
         summary.add(SampleReport(name, tuple(_checks(arrays, model, choices, declared, False))))
+    _require_samples(summary, str(path))
     return summary
 
 
@@ -129,6 +137,24 @@ def _checks(
     return checks if cheap else [*checks, *value_checks(batch, contract)]
 
 
+def _category_tensors(contract: ModelContract, choices: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the one-hot tensors that a chosen category makes: files hold its number, or nothing."""
+    if "category" not in choices:
+        return {}
+    return {
+        spec.key: np.eye(spec.width, dtype=spec.dtype)[choices["category"]].reshape([1] * (len(spec.axes) - 1) + [-1])
+        for spec in contract.tensors
+        if spec.content == "category"
+    }
+
+
+def _require_samples(summary: Summary, what: str) -> None:
+    if not sum(summary.samples.values()):
+        raise ContractError(
+            f"check: there is nothing to judge: {what} hold 0 samples; give at least one, and a limit of at least 1"
+        )
+
+
 def _as_batch(
     sample: Any, contract: ModelContract, choices: Mapping[str, Any], declared: Mapping[str, Any]
 ) -> ModelBatch:
@@ -136,14 +162,24 @@ def _as_batch(
         return sample
     if isinstance(sample, (PointCloud, DepthFrame)):
         return batch_of([sample], contract, choices)
-    tensors = {key: _as_tensor(value) for key, value in sample.items() if isinstance(value, (Tensor, np.ndarray))}
+    if not isinstance(sample, Mapping):
+        raise DTypeError(
+            f"a sample must be a batch, a cloud, a depth image or named tensors, got {type(sample).__name__}"
+        )
+    tensors = {key: _as_tensor(key, value) for key, value in sample.items() if isinstance(value, (Tensor, np.ndarray))}
     return ModelBatch(
         tensors=tensors, frame_id=declared["frame_id"], unit=declared["unit"], channels=declared["channels"] or {}
     )
 
 
-def _as_tensor(value: Tensor | np.ndarray) -> Tensor:
-    return value if isinstance(value, Tensor) else torch.from_numpy(np.ascontiguousarray(value))
+def _as_tensor(key: str, value: Tensor | np.ndarray) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    if value.dtype.kind not in "biuf":
+        raise DTypeError(f"{key}: must hold numbers, got {value.dtype}")
+    native = value.dtype.newbyteorder("=") if value.dtype.itemsize <= 8 else np.dtype(np.float64)  # all that torch has
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(np.ascontiguousarray(value, native))
 
 
 def _samples(data: Any) -> Iterable[tuple[str, Any]]:

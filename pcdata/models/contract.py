@@ -8,6 +8,8 @@ from typing import Literal
 
 from pcdata.structures import CAMERA_FRAME, METRE, NORMALIZED
 
+MIN_POINTS = 32  # fewer describe no surface, whatever the model
+
 Vec3 = tuple[float, float, float]
 Sampler = Literal["none", "random", "random with replacement", "farthest point"]
 
@@ -89,11 +91,13 @@ class ModelContract:
     far: float | None = None  # metres: readings beyond are dropped before anything else
     count: int | None = None  # points per cloud; None = any
     counts: tuple[int, ...] = ()  # other counts that the model's code is used with
+    any_count: bool = False  # the network takes any count that is stated: preset(..., num_points=2048)
     count_range: tuple[int, int] | None = None  # where count is None: the usual counts
     sampler: Sampler = "none"
     samplers: tuple[Sampler, ...] = ()  # others that the model's code offers
     pad: Literal["error", "repeat", "tile", "zeros", "keep"] = "keep"
     voxel: float | None = None  # edge length in metres
+    voxel_count: int | None = None  # where voxel is None: the size is found that leaves so many, cloud by cloud
     voxel_rule: Literal["mean", "first", "random"] = "mean"
     crop_before_voxels: bool = True
 

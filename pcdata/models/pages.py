@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pcdata.models.catalogue import CONTRACTS, possible_choices
+from pcdata.models.catalogue import CONTRACTS, allowed_counts, possible_choices
 from pcdata.models.contract import Channel, ModelContract
 
 # Answers that make an example of every open choice.
@@ -68,7 +68,7 @@ def _table(contract: ModelContract) -> str:
         "points per cloud": _count(contract),
         "sampler": " or ".join([contract.sampler, *contract.samplers]),
         "short clouds": _short(contract),
-        "voxels": "none" if contract.voxel is None else f"{contract.voxel * 1000:g} mm, {contract.voxel_rule} point",
+        "voxels": _voxels(contract),
         "centring and scaling": _normalised(contract),
         "crop": _crop(contract),
         "table": {"kept": "kept", "removed": "removed: one object", "open": "left to you"}[contract.table],
@@ -107,9 +107,9 @@ def _example(contract: ModelContract) -> str:
     ]
     choices = possible_choices(contract)
     said = [f"- `{name}`: {what}" for name, what in choices.items()]
-    if contract.counts:
-        allowed = ", ".join(str(count) for count in sorted({contract.count or 0, *contract.counts}))
-        said = [f"{line} ({allowed})" if line.startswith("- `num_points`") else line for line in said]
+    if "num_points" in choices:
+        allowed = allowed_counts(CONTRACTS[contract.name])
+        said = [f"{line}: {allowed}" if line.startswith("- `num_points`") else line for line in said]
     if contract.samplers:
         offered = ", ".join(f'"{sampler}"' for sampler in (contract.sampler, *contract.samplers))
         said = [f"{line} ({offered})" if line.startswith("- `sampler`") else line for line in said]
@@ -122,6 +122,12 @@ def _count(contract: ModelContract) -> str:
     if contract.count is None:
         return "any" if contract.count_range is None else "{:,} to {:,}".format(*contract.count_range)
     return f"{contract.count:,}"
+
+
+def _voxels(contract: ModelContract) -> str:
+    if contract.voxel_count is not None:
+        return f"about {contract.voxel_count:,}, their size found cloud by cloud, {contract.voxel_rule} point"
+    return "none" if contract.voxel is None else f"{contract.voxel * 1000:g} mm, {contract.voxel_rule} point"
 
 
 def _window(contract: ModelContract) -> str:

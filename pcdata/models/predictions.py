@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pcdata.errors import FrameError, PoseError, ShapeError
+from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.functional import rigid
 from pcdata.models.batch import ModelBatch
 from pcdata.structures import PointCloud
@@ -32,16 +32,22 @@ def to_source(
     points: Tensor | None = None,  # (B, M, 3)
     poses: Tensor | None = None,  # (B, M, 4, 4) rigid
     grasps: Tensor | None = None,  # (B, M, 17) graspnetAPI rows
-    directions: Tensor | None = None,  # (B, M, 3), approach vectors and the like
+    directions: Tensor | None = None,  # (B, M, 3) of any length but 0: approach vectors, surface normals
 ) -> Predictions:
     """Move predictions from the coordinates of the clouds they were made on to the source frame, in metres.
 
-    A normalisation's scale moves points and grasp widths, never rotations. For one cloud the axis B may be left out of
-    the input; the result has it.
+    A normalisation's scale moves points and grasp widths, never rotations; directions come back with unit length. For
+    one cloud the axis B may be left out of the input; the result has it.
+
+    Points alone come back from a cloud that was scaled differently along its axes (NormalizeWorkspace): there a tangent
+    and a normal that are one vector on the cloud are two in the source frame, and an approach is neither.
 
     Raises:
-        PoseError: the cloud was mirrored, or scaled differently along its axes: poses have no image then.
+        PoseError: the cloud was mirrored, or scaled differently along its axes: poses, grasps and directions have no
+            image then; or a direction has the length 0.
         ShapeError: a shape, or another number of clouds.
+        DTypeError: not a tensor of numbers.
+        NonFiniteError: NaN or infinity, with how many.
     """
     matrix, frame = _source_of(cloud)
     return _moved(matrix, frame, points, poses, grasps, directions)
@@ -61,7 +67,7 @@ def to_frame(
 
     Raises:
         FrameError: the cloud does not know the frame, and no extrinsics are given.
-        PoseError, ShapeError: as :func:`to_source`; or the extrinsics are not rigid.
+        PoseError, ShapeError, DTypeError, NonFiniteError: as :func:`to_source`; or the extrinsics are not rigid.
     """
     matrix, source = _source_of(cloud)
     if frame_from_source is not None:
@@ -104,12 +110,21 @@ def _moved(
 
 
 def _batched(name: str, values: Tensor, batch: int, tail: tuple[int, ...]) -> Tensor:
-    """Return (B, M, *tail) float64."""
+    """Return (B, M, *tail) float64, all of it finite."""
+    if not isinstance(values, Tensor) or values.dtype == torch.bool or values.is_complex():
+        given = f"a tensor of {values.dtype}" if isinstance(values, Tensor) else type(values).__name__
+        raise DTypeError(f"{name} must be a tensor of real numbers, got {given}; torch.as_tensor makes one of an array")
     if batch == 1 and values.ndim == len(tail) + 1:
         values = values[None]
     if values.ndim != len(tail) + 2 or tuple(values.shape[2:]) != tail or len(values) != batch:
         wanted = ", ".join(map(str, (batch, "M", *tail)))
         raise ShapeError(f"{name} must be ({wanted}) for a batch of {batch} clouds, got {tuple(values.shape)}")
+    finite = torch.isfinite(values).flatten(2).all(dim=2)
+    if not bool(finite.all()):
+        raise NonFiniteError(
+            f"{name}: {int((~finite).sum())} of {finite.numel()} have NaN or infinite values, the first being "
+            f"{tuple(torch.nonzero(~finite)[0].tolist())} (cloud, number); drop what the model did not predict"
+        )
     return values.double()
 
 
@@ -127,7 +142,23 @@ def _move_directions(matrix: Tensor, directions: Tensor) -> Tensor:
     linear = matrix[:, :3, :3].to(directions.device)
     if bool((torch.linalg.det(linear) <= 0).any()):
         raise PoseError("directions: the cloud was mirrored; an approach direction has no image under that")
-    return torch.nn.functional.normalize(directions @ linear.mT, dim=-1)
+    if not _is_similarity(linear):
+        raise PoseError(
+            "directions: the cloud was scaled differently along its axes, under which a tangent and a normal that are "
+            "one vector part; give two points of a tangent (points=), or normalise by NormalizeUnitSphere"
+        )
+    length = directions.norm(dim=-1, keepdim=True)
+    if bool((length == 0).any()):
+        raise PoseError(
+            f"directions: {int((length == 0).sum())} of {length.numel()} have the length 0, so no direction; drop them"
+        )
+    return torch.nn.functional.normalize(directions / length @ linear.mT, dim=-1)
+
+
+def _is_similarity(linear: Tensor) -> bool:
+    """Say whether (B, 3, 3) matrices turn and scale all axes alike."""
+    scale = torch.linalg.det(linear).abs().pow(1 / 3)
+    return rigid.is_rigid(rigid.from_rotation_translation(linear / scale[:, None, None], linear.new_zeros(3)))
 
 
 def _move_grasps(matrix: Tensor, grasps: Tensor) -> Tensor:

@@ -120,6 +120,10 @@ def batch_of(
     samples: Sequence[PointCloud | DepthFrame], contract: ModelContract, choices: Mapping[str, Any]
 ) -> ModelBatch:
     """Make the contract's tensors of clouds or depth images, without judging them."""
+    kind = DepthFrame if contract.takes == "depth image" else PointCloud
+    for sample in samples:
+        if not isinstance(sample, kind):
+            raise DTypeError(f"{contract.name}: takes a {kind.__name__}, got a {type(sample).__name__}")
     channels = {tensor.key: tensor.channel_names for tensor in contract.tensors}
     if contract.takes == "depth image":
         frames = [sample for sample in samples if isinstance(sample, DepthFrame)]

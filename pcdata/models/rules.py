@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from pcdata.models.batch import ModelBatch
-from pcdata.models.contract import InputTensor, ModelContract
+from pcdata.models.catalogue import CONTRACTS, possible_choices
+from pcdata.models.contract import MIN_POINTS, InputTensor, ModelContract
 from pcdata.models.images import size_step
 from pcdata.structures import METRE
 from pcdata.validation import Check, Verdict
-
-MIN_POINTS = 32  # fewer describe no surface, whatever the model
 
 
 def cheap_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
@@ -34,7 +33,7 @@ def layout_fault(tensor: Tensor, spec: InputTensor, contract: ModelContract) -> 
         if (axis == "C" and size != spec.width) or (axis.isdigit() and size != int(axis)):
             turned = "; are the axes swapped?" if spec.width in tensor.shape else ""
             return f"{spec.key} is {tuple(tensor.shape)}, not {wanted}{turned}"
-    return ""
+    return f"{spec.key} is {tuple(tensor.shape)}: there is nothing in it" if tensor.numel() == 0 else ""
 
 
 def verdict(name: str, fault: str, advice: str, *, found: str, unknown: bool = False) -> Check:
@@ -124,23 +123,45 @@ def _count(batch: ModelBatch, contract: ModelContract) -> Check:
     if contract.count is not None and {low, high} == {contract.count}:
         return verdict("count", "", "", found=found)
     if contract.count is not None:
-        known = low == high and low in contract.counts
-        how = "FarthestPointSample" if contract.sampler == "farthest point" else "RandomSample"
-        return verdict(
-            "count",
-            f"{found} points per cloud, the model's default is {contract.count}"
-            if known
-            else f"{found} points per cloud, the model takes {contract.count}",
-            f"say num_points={low} if you mean it"
-            if known
-            else f"end with {how}(num_points={contract.count}, if_short={contract.pad!r})",
-            found=found,
-            unknown=known,
-        )
+        return _other_count(contract, low, high, found)
     lowest, highest = contract.count_range or (MIN_POINTS, None)
     fault = "" if lowest <= low and (highest is None or high <= highest) else f"{found} points per cloud"
     wanted = f"at least {lowest}" if highest is None else f"{lowest} to {highest}"
-    return verdict("count", fault, f"the model takes {wanted}: check crop, voxel size and frame", found=found)
+    remedy = denser(contract) if low < lowest else sparser(contract)
+    return verdict("count", fault, f"the model takes {wanted}: {remedy}", found=found)
+
+
+def _other_count(contract: ModelContract, low: int, high: int, found: str) -> Check:
+    """Judge counts that are not the contract's: known ones warn, all may be stated where the network takes any."""
+    known = low == high and low in contract.counts
+    how = "FarthestPointSample" if contract.sampler == "farthest point" else "RandomSample"
+    advice = f"end with {how}(num_points={contract.count}, if_short={contract.pad!r})"
+    if known:
+        advice = f"say num_points={low} if you mean it"
+    elif contract.any_count and low == high >= MIN_POINTS:
+        advice += f", or say num_points={low}: the network takes any count that is stated"
+    takes = "the model's default is" if known else "the model takes"
+    return verdict("count", f"{found} points per cloud, {takes} {contract.count}", advice, found=found, unknown=known)
+
+
+def denser(contract: ModelContract) -> str:
+    """Name the choices, or the steps, that leave more points."""
+    choices = possible_choices(CONTRACTS[contract.name])
+    ways = ["widen the crop (crop=)"] if "crop" in choices else []
+    if contract.voxel is not None:
+        ways.append("use finer voxels" + (" (a smaller voxel_size=)" if "voxel_size" in choices else ""))
+    if "num_points" in choices and contract.voxel is None:
+        ways.append("ask for fewer points (num_points=)")
+    return ", ".join([*ways, "or give captures with more readings" if ways else "give captures with more readings"])
+
+
+def sparser(contract: ModelContract) -> str:
+    """Name the choices, or the steps, that leave fewer points."""
+    choices = possible_choices(CONTRACTS[contract.name])
+    ways = ["narrow the crop (crop=)"] if "crop" in choices else []
+    if "voxel_size" in choices:
+        ways += ["use coarser voxels (a larger voxel_size=)", "or leave voxel_size out: then the size is found"]
+    return ", ".join(ways) or "end with a step that samples"
 
 
 def _sizes(batch: ModelBatch, contract: ModelContract) -> list[int]:

@@ -91,6 +91,8 @@ def _crop(contract: ModelContract) -> list[Transform]:
 
 
 def _voxels(contract: ModelContract) -> list[Transform]:
+    if contract.voxel_count is not None:
+        return [VoxelDownsample(num_points=contract.voxel_count)]
     if contract.voxel is None:
         return []
     rules = {"mean": VoxelDownsample, "first": VoxelSample, "random": RandomVoxelSample}

@@ -107,8 +107,8 @@ def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor)
     """(B, V, C, H, W): every point back at its pixel, 0 where there was no reading."""
     if clouds.layout is None or clouds.source_index is None:
         raise ShapeError(
-            f"{contract.name}: takes organised clouds, one point per pixel; these left their depth images: remove the "
-            "steps that sample, merge or average points"
+            f"{contract.name}: takes organised clouds, one point per pixel; these have no pixels: give depth images, "
+            "not cloud files, and remove the steps that sample, merge or average points"
         )
     height, width = clouds.layout.size
     views = list(Counter(entry.get("sample", number) for number, entry in enumerate(clouds.meta)).values())

@@ -10,8 +10,8 @@ from torch import Tensor
 from pcdata.functional.planes import ransac_plane
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import is_camera
-from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
-from pcdata.models.rules import layout_fault, verdict
+from pcdata.models.contract import MIN_POINTS, Channel, InputTensor, ModelContract, Role
+from pcdata.models.rules import denser, layout_fault, verdict
 from pcdata.structures import METRE
 from pcdata.validation import Check
 from pcdata.validation.check import graded
@@ -30,11 +30,13 @@ _ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.
 
 
 def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
-    """Yield one check per rule; tensors whose layout is wrong are left out."""
+    """Yield one check per rule; tensors of a wrong layout or kind of number, which other rules say, are left out."""
     sound = [
         spec
         for spec in contract.tensors
-        if spec.key in batch.tensors and not layout_fault(batch[spec.key], spec, contract)
+        if spec.key in batch.tensors
+        and not layout_fault(batch[spec.key], spec, contract)
+        and batch[spec.key].is_floating_point() == spec.dtype.startswith("float")
     ]
     yield _finite(batch)
     if any(not bool(torch.isfinite(tensor).all()) for tensor in batch.values() if tensor.is_floating_point()):
@@ -210,13 +212,17 @@ def _crop(clouds: list[Tensor], contract: ModelContract) -> Check:
 
 
 def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Check:
-    share = max(1.0 - len(torch.unique(cloud, dim=0)) / len(cloud) for cloud in clouds)
-    fault = f"{share:.0%} of the points are repeated" if share > contract.max_duplicates else ""
+    distinct = [len(torch.unique(cloud, dim=0)) for cloud in clouds]
+    share = max(1.0 - count / len(cloud) for count, cloud in zip(distinct, clouds))
+    found = f"{share:.0%} of the points are repeated"
+    fault = found if share > contract.max_duplicates else ""
+    if min(distinct) < MIN_POINTS:  # filled up with zeros, none is repeated
+        fault = f"a cloud has {min(distinct)} different points, and fewer than {MIN_POINTS} describe no surface"
     return verdict(
         "duplicates",
         fault,
-        f"at most {contract.max_duplicates:.0%} is usual: the clouds are too thin, widen the crop or use finer voxels",
-        found=f"{share:.0%} of the points are repeated",
+        f"at most {contract.max_duplicates:.0%} repeated is usual: the clouds are too thin; {denser(contract)}",
+        found=found,
     )
 
 

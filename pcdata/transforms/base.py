@@ -191,7 +191,10 @@ class Transform(nn.Module):
                         f"0 of {before[b]} points; check its fields against the cloud's extent and frame"
                     )
             elif count == 0:
-                raise TooFewPointsError(f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points")
+                raise TooFewPointsError(
+                    f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
+                    "before left none (masks, ranges, crops); leave the capture out, or widen those"
+                )
             steps.append({**self._step(), "params": _small(params, b, len(after)), **facts})
         return result.with_steps(steps)
 

@@ -87,7 +87,7 @@ class _Sample(SelectTransform, abstract=True):
             if have < want and (self.if_short == "error" or (have == 0 and self.if_short != "keep")):
                 raise TooFewPointsError(
                     f"{type(self).__name__}: cloud {b}{sample_name(cloud, b)} has {have} points, fewer than the "
-                    f"{want} asked; ask for fewer" + ("" if have == 0 else ", or choose if_short")
+                    f"{want} asked; ask for fewer (num_points)" + ("" if have == 0 else ", or choose if_short")
                 )
         seeds = [0] * cloud.num_clouds if streams is None else streams.seeds().tolist()
         sampled = self.sample(cloud, [min(pair) for pair in zip(wanted, available, strict=True)], seeds)

@@ -217,3 +217,15 @@ def test_clouds_are_not_kept_and_memory_does_not_grow_with_their_number(tmp_path
 def test_options_are_plain_in_the_record():
     assert DP3(episodes=Path("robot")).options()["episodes"] == "robot"
     assert DP3(episodes={"b": {}, "a": {}}).options()["episodes"] == ["a", "b"]
+
+
+def test_another_count_is_exported_where_it_is_stated_and_refused_where_it_is_not(tmp_path):
+    source = clouds(count=2048)
+    with pytest.raises(ContractError, match=r"count: 2048 points .*say num_points=2048"):
+        export_dataset(source, "dp3", tmp_path / "out.zarr", episodes=episodes())
+    export_dataset(source, "dp3", tmp_path / "out.zarr", episodes=episodes(), num_points=2048)
+    assert replay_buffer(tmp_path / "out.zarr")["point_cloud"].shape == (5, 2048, 6)
+    with pytest.raises(ContractError, match="count: 512 points per cloud, the model takes 2048"):
+        export_dataset(clouds(), "dp3", tmp_path / "other.zarr", episodes=episodes(), num_points=2048)
+    with pytest.raises(ConfigError, match="num_points must be 512, 1024, or any other"):
+        export_dataset(source, "dp3", tmp_path / "few.zarr", episodes=episodes(), num_points=3)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from pcdata.cli import main
 from pcdata.errors import CacheError, CaptureError, ConfigError
 from pcdata.exports import TARGETS, export_dataset
 from pcdata.exports.record import FILE_NAME
+from pcdata.exports.registry import target_named
 from pcdata.io.raw import write_capture
 from pcdata.synthetic import SyntheticSource
 from tests.exports.samples import Samples, cloud, frame, tree
@@ -188,6 +191,24 @@ def test_an_array_of_all_samples_is_continued_as_a_whole(tmp_path):
     assert tree(tmp_path / "out") == tree(tmp_path / "one go")
 
 
+KEPT = re.compile(r"says: of (`[^;]*`) every finished sample; .* of (`[^;]*`), whose files hold all samples in common")
+
+
+def test_the_page_says_which_targets_keep_finished_samples_and_which_start_over():
+    """What one item holds decides: a sample, or all of them."""
+    ids = [f"f{number}" for number in range(4)]
+    robot = {"e": {"samples": np.array(ids), "state": np.zeros((4, 1)), "action": np.zeros((4, 1))}}
+    given = {"dp3": {"episodes": robot}, "graspnet_scene": {"frames_per_scene": 2}}
+    table = {name: {"class": "mug", "split": "train"} for name in ids}
+    given |= {name: {"table": table} for name in ("pointnet", "pointnet_part", "modelnet", "pointcept")}
+    parts = {name: len(target_named(name, given.get(name, {})).items(ids)) for name in TARGETS}
+    assert parts["graspnet_scene"] == 2
+    text = (Path(__file__).parents[2] / "docs" / "exports.md").read_text(encoding="utf-8")
+    kept, over = (set(re.findall(r"`(\w+)`", said)) for said in KEPT.search(" ".join(text.split())).groups())
+    assert kept == {name for name, count in parts.items() if count == 4}
+    assert over == {name for name, count in parts.items() if count == 1}
+
+
 def test_the_record_lists_samples_and_files(tmp_path):
     export_dataset(captures(2), "contact_graspnet", tmp_path / "out", label_offset=1)
     record = json.loads((tmp_path / "out" / FILE_NAME).read_text())
@@ -299,7 +320,7 @@ def test_the_command_exports_a_dataset(capsys, built, tmp_path):
 def test_the_command_says_what_is_wrong_with_the_request(capsys, capture_folder, tmp_path):
     for options, message in [
         (["--to", "dp2"], "did you mean 'dp3'"),
-        (["--to", "dp3", "--set", "episodes"], "must be OPTION=VALUE"),
+        (["--to", "dp3", "--set", "episodes"], "must be NAME=VALUE"),
         (["--to", "dp3", "--set", "frame=a", "--set", "frame=b"], "set twice"),
         (["--to", "dp3", "--set", "frames=a"], "did you mean 'frame'"),
         (["--to", "dp3"], "needs the option episodes"),

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -10,8 +13,13 @@ import numpy as np
 import pytest
 import torch
 
+from pcdata.build import build_dataset, config_from_yaml
+from pcdata.cli import main
+from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import CaptureError, ConfigError, ContractError, TooFewPointsError
 from pcdata.exports import export_dataset, pointnet
+from pcdata.structures import DepthFrame
+from pcdata.synthetic import SyntheticSource
 from tests.exports.samples import Samples, cloud, shape
 
 TABLE = {
@@ -126,10 +134,44 @@ def test_pointnet_part_refuses_labels_that_are_no_parts(tmp_path, labels, messag
         export_dataset(source, "pointnet_part", tmp_path / "out", table={"a": {"class": "mug"}})
 
 
-def test_a_part_of_two_classes_is_refused(tmp_path):
+def test_a_part_of_two_classes_is_refused_and_the_fix_that_the_message_names_is_one(tmp_path):
     table = {name: {"class": row["class"]} for name, row in TABLE.items()}
-    with pytest.raises(CaptureError, match="number parts through all classes"):
-        export_dataset(shapes(), "pointnet_part", tmp_path / "out", table=table)
+    source = shapes()
+    with pytest.raises(CaptureError, match=r"labels are 0 \.\. 3, but part 0 .*add 4 to the labels") as caught:
+        export_dataset(source, "pointnet_part", tmp_path / "out", table=table)
+    (shifted,) = re.findall(r"every sample of '(\w+)'", str(caught.value))
+    for name, sample in source.samples.items():
+        if TABLE[name]["class"] == shifted:
+            source.samples[name] = sample.with_fields(labels=sample.labels + 4)
+    export_dataset(source, "pointnet_part", tmp_path / "out", table=table)
+
+
+def test_captures_with_part_labels_go_through_build_export_and_check_by_commands_alone(tmp_path):
+    source = SyntheticSource(num_scenes=2, size=(120, 160), num_objects=2)
+    config = "cloud: [{ToFrame: {frame: base}}, {FarthestPointSample: {num_points: 2048}}, NormalizeUnitSphere]"
+    relabelled = {name: partial(part_labels, source, name) for name in source.ids}
+    captures = Samples(relabelled)
+    build_dataset(config_from_yaml(f"depth: [Deproject]\n{config}"), captures, tmp_path / "built")
+    table = tmp_path / "table.csv"
+    table.write_text("\n".join(["sample,class,split", *(f"{name},mug,train" for name in source.ids)]) + "\n")
+    given = ["export", str(tmp_path / "built"), "--to", "pointnet_part", "--out", str(tmp_path / "out")]
+    assert main([*given, "--set", f"table={table}"]) == 0
+    built = CachedCloudDataset(tmp_path / "built")
+    with h5py.File(tmp_path / "out" / "ply_data_train0.h5") as file:
+        for row, cloud in enumerate(built):
+            assert np.array_equal(file["data"][row], cloud.points.numpy())
+            assert np.array_equal(file["pid"][row], cloud.labels.numpy())
+        assert set(np.unique(file["pid"])) == {0, 1, 2, 3}
+    check = ["check", str(tmp_path / "out" / "ply_data_train0.h5"), "--model", "pointnet_part", "--frame", "base"]
+    assert main([*check, "--unit", "normalized", "--keys", "points=data", "--set", "category=0"]) == 0
+    check[1] = str(tmp_path / "built")
+    assert main([*check, "--set", "category=0"]) == 0
+
+
+def part_labels(source: SyntheticSource, name: str) -> DepthFrame:
+    """The capture with parts from 0 on at every pixel: floor, table and objects."""
+    frame = source.load(name)
+    return replace(frame, labels=frame.labels + 1)
 
 
 # -- ModelNet texts ------------------------------------------------------------------------------------------------

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from pcdata.errors import FrameError, PoseError, ShapeError
+from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.functional import rigid
 from pcdata.models import preset, to_frame, to_source
 from pcdata.rng import seeded
@@ -129,3 +130,56 @@ def test_one_cloud_needs_no_batch_axis():
     made = preset("graspnet_baseline")
     batch = made.collate([made.pipeline(capture(), generator=seeded(0))])
     assert to_source(batch, points=torch.rand(5, 3)).points.shape == (1, 5, 3)
+
+
+@pytest.mark.parametrize("given", [[1, 2, 3], "a", np.zeros((5, 3)), torch.zeros(5, 3, dtype=torch.bool)])
+@pytest.mark.parametrize("name", ["points", "poses", "grasps", "directions"])
+def test_what_is_no_tensor_of_numbers_is_refused_by_name(name, given):
+    with pytest.raises(DTypeError, match=f"{name} must be a tensor of real numbers, got"):
+        to_source(cloud_in_base((50,)), **{name: given})
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    ("name", "whole"),
+    [
+        ("points", torch.rand(2, 6, 3)),
+        ("poses", random_poses(2, 6)),
+        ("grasps", torch.rand(2, 6, 17)),
+        ("directions", torch.rand(2, 6, 3) + 0.1),
+    ],
+)
+def test_predictions_that_are_not_finite_are_refused_with_which_and_how_many(name, whole, bad):
+    broken = whole.clone()
+    broken[1, 2].view(-1)[0] = broken[1, 5].view(-1)[1] = bad
+    with pytest.raises(NonFiniteError, match=rf"{name}: 2 of 12 have NaN or infinite .*\(1, 2\) \(cloud, number\)"):
+        to_source(cloud_in_base((50, 60)), **{name: broken})
+
+
+def test_directions_without_a_length_are_refused_and_short_ones_come_back_with_length_one():
+    cloud, _ = changed()
+    directions = torch.tensor([[0.0, 0.0, 2.0], [0.0, 1e-30, 0.0]], dtype=torch.float64).expand(3, 2, 3)
+    back = to_frame(cloud, "base", directions=directions).directions
+    assert torch.allclose(back.norm(dim=-1), torch.ones(3, 2, dtype=torch.float64))
+    with pytest.raises(PoseError, match="directions: 3 of 6 have the length 0"):
+        to_source(cloud, directions=directions * torch.tensor([[1.0], [0.0]]))
+
+
+def test_axes_scaled_differently_part_tangents_and_normals_so_directions_are_refused():
+    cloud = NormalizeWorkspace(**BOX)(CropWorkspace(**BOX)(cloud_in_base((120,))))
+    linear = cloud.source_from_cloud[0, :3, :3]
+    slanted = torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+    tangent, normal = linear @ slanted, torch.linalg.inv(linear).T @ slanted
+    assert float(rigid.angle_between(tangent, normal)) > 0.1  # one vector, two images
+    for given in ({"directions": slanted.expand(1, 2, 3)}, {"grasps": grasp_rows(1, 2)}):
+        with pytest.raises(PoseError, match=r"scaled differently|scales the axes differently"):
+            to_source(cloud, **given)
+    ends = torch.stack([torch.zeros(3, dtype=torch.float64), slanted])[None]
+    moved = to_source(cloud, points=ends).points
+    assert torch.allclose(moved[0, 1] - moved[0, 0], tangent)
+
+
+def grasp_rows(*shape: int) -> torch.Tensor:
+    poses = random_poses(*shape)
+    size = torch.full((*shape, 4), 0.05, dtype=torch.float64)
+    return torch.cat([size, poses[..., :3, :3].flatten(-2), poses[..., :3, 3], size[..., :1]], dim=-1)

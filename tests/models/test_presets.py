@@ -10,12 +10,13 @@ import torch
 from torch.utils.data import DataLoader
 
 from pcdata.errors import ConfigError, ContractError, DTypeError, NoReadingError
-from pcdata.models import CONTRACTS, Preset, contract, preset
+from pcdata.models import CONTRACTS, Preset, check, contract, preset, require
 from pcdata.models.steps import pipeline_of
 from pcdata.rng import seeded
 from pcdata.structures import NORMALIZED, PointCloud
 from pcdata.synthetic import SyntheticSource, tabletop
 from pcdata.transforms import Pipeline, RandomSample
+from pcdata.validation import Verdict
 from tests.models.captures import answers, capture, correct_batch, made_preset, sample_of
 
 each_contract = pytest.mark.parametrize("name", CONTRACTS)
@@ -80,7 +81,7 @@ def test_crop_none_is_a_choice_and_means_no_crop():
     ("choices", "message"),
     [
         ({"frame": "base"}, "works in the frame 'camera'"),
-        ({"num_points": 1000}, "one of"),
+        ({"num_points": 1000}, "one of 15000, 20000, got 1000"),
         ({"speed": 3}, "no choice 'speed'"),
     ],
 )
@@ -92,6 +93,31 @@ def test_choices_that_the_code_does_not_allow_are_refused(choices, message):
 def test_the_counts_that_the_code_is_used_with_can_be_chosen():
     made = preset("dp3_sim", frame="base", crop=None, num_points=1024)
     assert made.collate([made.pipeline(capture())])["point_cloud"].shape == (1, 1024, 6)
+
+
+def test_another_count_must_be_stated_and_then_holds():
+    made = preset("dp3_sim", frame="base", crop=None, num_points=2048)
+    batch = made.collate([made.pipeline(capture())])
+    assert batch["point_cloud"].shape == (1, 2048, 6)
+    assert check(batch, "dp3_sim").verdict is Verdict.PASS
+    assert Preset.from_yaml(made.to_yaml()).contract == made.contract
+    array = {"point_cloud": batch["point_cloud"].numpy()}
+    assert check(array, "dp3_sim", num_points=2048).checks["count", None].counts[Verdict.PASS] == 1
+    with pytest.raises(ContractError, match=r"count: 2048 points per cloud, the model takes 512.*say num_points=2048"):
+        require(array, "dp3_sim", cheap=True)
+    with pytest.raises(ContractError, match="count: 512 points per cloud, the model takes 2048"):
+        preset("dp3_sim", frame="base", crop=None, num_points=2048).collate([sample_of("dp3_sim")])
+    for count in (0, 31, 2048.0, True, "2048"):
+        with pytest.raises(ConfigError, match="512, 1024, or any other that you state, 32 or more"):
+            preset("dp3_sim", frame="base", crop=None, num_points=count)
+
+
+def test_a_model_is_named_by_a_text():
+    for name in (None, 3, ["dp3_sim"]):
+        with pytest.raises(ConfigError, match="must be named by a text"):
+            preset(name)
+        with pytest.raises(ConfigError, match="must be named by a text"):
+            check({}, name)
 
 
 def test_a_view_of_nothing_inside_the_box_does_not_stop_a_preset():

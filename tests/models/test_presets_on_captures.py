@@ -1,0 +1,118 @@
+"""Presets on noisy, thin and real captures: what a preset makes, its own check takes, or the choice is named."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from pcdata.errors import ConfigError, ContractError, ShapeError, TooFewPointsError
+from pcdata.io import open_source
+from pcdata.models import CONTRACTS, check, preset, require
+from pcdata.rng import seeded
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.synthetic import tabletop
+from pcdata.transforms import DecimateDepth, VoxelDownsample
+from pcdata.validation import Verdict
+from tests.models.captures import answers, made_preset
+
+each_contract = pytest.mark.parametrize("name", CONTRACTS)
+
+TABLE_BOX = ((-0.4, -0.4, -0.01), (0.4, 0.4, 0.5))
+NARROW_BOX = ((-0.2, -0.2, -0.01), (0.2, 0.2, 0.5))
+
+
+@cache
+def noisy(num_views: int) -> DepthFrame:
+    """Views of a table of 640x480 pixels with a stereo camera's noise."""
+    return tabletop(5, num_objects=5, num_views=num_views, size=(480, 640), noise="stereo", sample_id="noisy").frame
+
+
+def affordable(name: str, data: DepthFrame | PointCloud) -> DepthFrame | PointCloud:
+    """Fewer pixels for models with normals, which take seconds per view where the compiled kernels are missing."""
+    with_normals = any(channel.name == "normals" for spec in CONTRACTS[name].tensors for channel in spec.channels)
+    wide = isinstance(data, DepthFrame) and with_normals and CONTRACTS[name].voxel is None
+    return DecimateDepth(factor=4)(data) if wide else data
+
+
+@pytest.mark.parametrize("num_views", [1, 2])
+@pytest.mark.parametrize("crop", [TABLE_BOX, NARROW_BOX, None])
+@pytest.mark.parametrize("choices", [{}, {"num_points": 5000}, {"num_points": 19000}])
+def test_the_voxel_size_is_found_for_the_count_whatever_the_crop(num_views, crop, choices):
+    made = preset("dp3_guide", frame="base", crop=crop, **choices)
+    batch = made.collate([made.pipeline(noisy(num_views))])
+    wanted = choices.get("num_points", 10000)
+    assert wanted <= batch.counts[0] <= 1.05 * wanted
+    assert check(batch, "dp3_guide").verdict is Verdict.PASS
+
+
+def test_a_voxel_size_that_was_chosen_stays_and_a_count_it_cannot_reach_names_the_choice():
+    made = preset("dp3_guide", frame="base", crop=TABLE_BOX, voxel_size=0.003)
+    assert [step.voxel_size for step in made.pipeline.cloud if isinstance(step, VoxelDownsample)] == [0.003]
+    with pytest.raises(ContractError, match=r"takes 5000 to 20000: .*crop=.*voxel_size="):
+        made.collate([made.pipeline(noisy(2))])
+    coarse = preset("dp3_guide", frame="base", crop=TABLE_BOX, voxel_size=0.05)
+    with pytest.raises(ContractError, match=r"widen the crop \(crop=\), use finer voxels \(a smaller voxel_size=\)"):
+        coarse.collate([coarse.pipeline(noisy(1))])
+    for count in (4999, 20000):
+        with pytest.raises(ConfigError, match="wanted number of voxels, 5000 to 19000"):
+            preset("dp3_guide", frame="base", crop=None, num_points=count)
+    with pytest.raises(ConfigError, match="give one of the two"):
+        preset("dp3_guide", frame="base", crop=None, num_points=6000, voxel_size=0.005)
+
+
+@each_contract
+@pytest.mark.parametrize("num_views", [1, 2])
+def test_noisy_captures_through_a_preset_are_what_its_own_check_takes(name, num_views):
+    given = answers(name) | ({"crop": TABLE_BOX} if "crop" in CONTRACTS[name].required_choices else {})
+    made = preset(name, **given)
+    sample = made.pipeline(affordable(name, noisy(num_views)), generator=seeded(0) if made.pipeline.is_random else None)
+    assert check(made.collate([sample]), name).samples[Verdict.FAIL] == 0
+
+
+@each_contract
+@pytest.mark.parametrize("side", [4, 16, 40])
+def test_a_few_readings_pass_or_are_refused_with_what_to_change(name, side):
+    """A preset may pad; what it cannot repair is an error or a verdict that names a choice, or asks for more."""
+    frame, inside = noisy(1), torch.zeros(480, 640)
+    inside[240 - side // 2 : 240 + side // 2, 320 - side // 2 : 320 + side // 2] = 1
+    few = replace(frame, depth=frame.depth * inside)
+    made = made_preset(name)
+    fault = ""
+    try:
+        sample = made.pipeline(few, generator=seeded(0) if made.pipeline.is_random else None)
+        require(made.collate([sample]), name)
+    except (ContractError, TooFewPointsError) as error:
+        fault = str(error)
+    assert not fault or re.search(r"crop=|num_points|voxel_size=|more readings|min_points|has no points", fault)
+    if side == 4 and CONTRACTS[name].takes == "cloud":
+        assert fault  # 16 readings are no surface
+
+
+@each_contract
+@pytest.mark.parametrize("capture_name", ["graspnet_frame", "osd", "seven_scenes"])
+def test_real_captures_through_a_preset_are_what_its_own_check_takes(name, capture_name):
+    if "PCDATA_TEST_DATA" not in os.environ:
+        pytest.skip("PCDATA_TEST_DATA is not set: no real captures")
+    source = open_source(Path(os.environ["PCDATA_TEST_DATA"]) / capture_name)
+    real = source.load(source.ids[0])
+    if isinstance(real, PointCloud) and (
+        CONTRACTS[name].takes == "depth image" or CONTRACTS[name].main.content == "organised"
+    ):
+        pytest.skip("the model takes depth images, and this is a cloud")
+    box = {"frame": "camera", "crop": ((-2.0, -2.0, 0.1), (2.0, 2.0, 3.0)), "category": 3}
+    made = preset(name, **{choice: box[choice] for choice in CONTRACTS[name].required_choices})
+    sample = made.pipeline(affordable(name, real), generator=seeded(0) if made.pipeline.is_random else None)
+    assert check(made.collate([sample]), name).samples[Verdict.FAIL] == 0
+
+
+def test_clouds_without_pixels_are_refused_for_organised_models():
+    made = made_preset("3d_diffuser_actor")
+    cloud = PointCloud(points=torch.rand(500, 3), frame_id="base", colors=torch.rand(500, 3))
+    with pytest.raises(ShapeError, match="give depth images, not cloud files"):
+        made.collate([cloud])
