@@ -280,6 +280,7 @@ def changed_values(value: Any) -> list[Any]:
             "mean",
             "angle",
             "floor",
+            "never",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]

@@ -126,7 +126,7 @@ def test_unknown_sections_and_faults_in_any_section_are_told_together():
     assert str(caught.value).splitlines() == [
         "p.yaml:2:5: unknown transform 'Deprojekt'; did you mean 'Deproject'?",
         "p.yaml:3:1: unknown section 'augmentation'; a pipeline has depth, cloud, augment",
-        "p.yaml:5:5: unknown transform 'Centre'; did you mean 'Center'?",
+        "p.yaml:5:5: unknown transform 'Centre'; did you mean 'Center' or 'CropCenter'?",
     ]
     with pytest.raises(ConfigError, match=r"^p\.yaml: Pipeline: .* must end in points"):
         T.Pipeline.from_yaml("depth: [MaskDepth]", name="p.yaml")
