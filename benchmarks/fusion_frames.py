@@ -29,8 +29,8 @@ from fusion_peer import LegacyVolume, Open3DGrid, Open3DView, positions, room_fo
 from torch import Tensor
 
 import pcdata
+from pcdata.functional.tsdf import Carving
 from pcdata.structures import DepthFrame, TSDFVolume
-from pcdata.structures.tsdf_volume import Carving
 
 _WAIT = 0.03  # seconds: OpenMP threads spin for 10 ms after they have worked
 LIBRARIES = ("pcdata", "pcdata, no carving", "Open3D tensor", "Open3D legacy")

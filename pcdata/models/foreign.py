@@ -38,6 +38,8 @@ def read_samples(path: str | Path, contract: ModelContract, keys: Mapping[str, s
         if name not in known:
             raise ConfigError(f"{contract.name}: no key {name!r}{near_matches(name, known)}; it has {', '.join(known)}")
     if not keys:
+        with stored_arrays(path, ()):
+            pass  # what kind of file is wrong comes before which array is what
         raise ConfigError(
             f"{contract.name}: say which array is what, as in --keys points=NAME; the keys are {', '.join(known)}"
         )

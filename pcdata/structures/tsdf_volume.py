@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -21,9 +21,6 @@ from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
 _CAMERAS_KEPT = 8  # 7 MB each at 640x480
-_WEIGHTINGS = ("constant", "inverse_square", "angle")
-
-Carving = Literal["never", "near", "everywhere"]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -43,7 +40,7 @@ class TSDFVolume:
     voxel_size: float = 0.002  # metres
     truncation: float | None = None  # metres on either side of a surface; None = 5 voxels
     weighting: tsdf.Weighting = "constant"  # how much a reading counts; see functional.tsdf.weight_image
-    carve: Carving = "near"
+    carve: tsdf.Carving = "near"
     min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
     max_bytes: int = 4 << 30  # refuse to grow beyond
     device: torch.device | str = "cpu"
@@ -54,10 +51,9 @@ class TSDFVolume:
     _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.weighting not in _WEIGHTINGS:
-            raise ConfigError(f"TSDFVolume: weighting must be one of {_WEIGHTINGS}, got {self.weighting!r}")
-        if self.carve not in get_args(Carving):
-            raise ConfigError(f"TSDFVolume: carve must be one of {get_args(Carving)}, got {self.carve!r}")
+        for name, known in (("weighting", get_args(tsdf.Weighting)), ("carve", get_args(tsdf.Carving))):
+            if getattr(self, name) not in known:
+                raise ConfigError(f"TSDFVolume: {name} must be one of {known}, got {getattr(self, name)!r}")
         if self.max_bytes < 1:
             raise ConfigError(f"TSDFVolume: max_bytes must be at least 1, got {self.max_bytes}")
         self.device = torch.device(self.device)
@@ -209,8 +205,8 @@ class TSDFVolume:
         """Return the points where the field crosses zero along the edges of its grid.
 
         They carry normals out of the surface, colours and labels where the frames had them, and
-        ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less. The label is the one that
-        most views gave if more than half did. The history says what ``min_weight`` dropped.
+        ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less; views that wear it away count
+        too. The label is the one that most views gave if more than half did. The history says what ``min_weight`` dropped.
 
         Args:
             min_weight: the least weight of both ends of an edge. 0 keeps whatever was seen, right for few views; with

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pcdata.errors import ConfigError
+from pcdata.functional.tsdf import Carving, Weighting
 from pcdata.sensors import SensorProfile
 from pcdata.structures import DepthFrame, PointCloud, TSDFVolume
 from pcdata.transforms.base import Params, Transform
@@ -27,8 +28,8 @@ class FuseTSDF(Transform):
     voxel_size: Annotated[Metres, FromSensor(SensorProfile.voxel_size)] = 0.002
     # On either side of the surface; None = 5 voxels. Three standard deviations of the noise should fit.
     truncation: Metres | None = None
-    weighting: Literal["constant", "inverse_square", "angle"] = "constant"
-    carve: Literal["never", "near", "everywhere"] = "near"  # what views see through is worn away; see TSDFVolume
+    weighting: Weighting = "constant"
+    carve: Carving = "near"  # what views see through is worn away; see TSDFVolume
     min_weight: NonNegative = 0.0  # of a point; with constant weights n asks for n views
     min_confidence: ConfidenceName | None = None  # leave out readings that are less to be trusted
     max_megabytes: Count = 4096  # refuse to take more memory

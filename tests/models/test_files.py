@@ -200,6 +200,14 @@ def test_channels_first_models_take_the_rows_that_files_hold(tmp_path):
     assert not summary.samples[Verdict.FAIL]
 
 
+@pytest.mark.parametrize(("name", "words"), [("folder", "holds no zarr v2 array"), ("scan.pcd", r"is no \.npz")])
+def test_what_is_no_file_of_arrays_is_told_before_keys_are_asked_for(tmp_path, name, words):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "scan.pcd").write_text("VERSION .7")
+    with pytest.raises(CacheError, match=words):
+        check_files(tmp_path / name, "graspnet_baseline", {})
+
+
 def test_keys_and_arrays_that_do_not_exist_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, xyz=np.zeros((10, 3), np.float32))

@@ -11,9 +11,10 @@ from pcdata.functional.tsdf.backends import (
 from pcdata.functional.tsdf.blocks import Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
-from pcdata.functional.tsdf.views import FusionView, Weighting, fit_labels, pack_labels, weight_image
+from pcdata.functional.tsdf.views import Carving, FusionView, Weighting, fit_labels, pack_labels, weight_image
 
 __all__ = [
+    "Carving",
     "Crossings",
     "FusionView",
     "Planes",

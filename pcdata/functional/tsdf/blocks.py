@@ -52,7 +52,7 @@ class Chunk:
     tsdf: Tensor  # (C, 512) int16: signed distance / truncation * TSDF_SCALE, positive in front of the surface
     weight: Tensor  # (C, 512) int16
     color: Tensor | None = None  # (C, 512) int32: r | g << 10 | b << 20
-    views: Tensor | None = None  # (C, 512) int16: in how many views the voxel lay near the surface
+    views: Tensor | None = None  # (C, 512) int16: how many views joined its average
     label: Tensor | None = None  # (C, 512) int32: the candidate of the vote
     votes: Tensor | None = None  # (C, 512) int16: how far it leads
 

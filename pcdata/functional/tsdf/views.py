@@ -14,6 +14,7 @@ from pcdata.functional.lens import fold_radius
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
 
 Weighting = Literal["constant", "inverse_square", "angle"]
+Carving = Literal["never", "near", "everywhere"]  # see structures.TSDFVolume
 
 UNIT_WEIGHT = 64  # steps of the weight 1, where weights are not all 1
 _STEEPEST = 0.1  # the least weight by angle: a surface seen at 84 degrees or more
