@@ -44,7 +44,7 @@ def zarr_arrays(folder: str | Path) -> dict[str, ZarrArray]:
         for path in sorted(folder.rglob(".zarray"))
     }
     if not arrays:
-        raise CacheError(f"{folder}: holds no zarr v2 array (no .zarray)")
+        raise CacheError(f"{folder}: holds no zarr v2 array (no .zarray); is it the folder of a dataset?")
     return arrays
 
 

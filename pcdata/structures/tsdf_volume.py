@@ -205,8 +205,9 @@ class TSDFVolume:
         """Return the points where the field crosses zero along the edges of its grid.
 
         They carry normals out of the surface, colours and labels where the frames had them, and
-        ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less; views that wear it away count
-        too. The label is the one that most views gave if more than half did. The history says what ``min_weight`` dropped.
+        ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less; views that wear it away
+        count too. The label is the one that most views gave if more than half did. The history says what ``min_weight``
+        dropped.
 
         Args:
             min_weight: the least weight of both ends of an edge. 0 keeps whatever was seen, right for few views; with
