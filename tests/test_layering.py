@@ -16,7 +16,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "rng", "extras"},
+    {"checks", "lengths", "rng", "extras"},
     {"dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -40,6 +40,7 @@ OUTSIDE = {
     "extras": set(),
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},
+    "lengths": {"numpy"},
     "rng": {"torch", "numpy"},
     "dispatch": {"torch", "numpy", "typing_extensions"},
     "functional": {"torch", "numpy"},

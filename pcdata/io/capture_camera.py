@@ -16,7 +16,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, PoseError, near_matches
 from pcdata.functional import rigid
 from pcdata.io.files import map_npy, read_text, replacing
-from pcdata.io.images import check_metres_per_unit
+from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera
 
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, DTypeError, ShapeError, UnitError
-from pcdata.io.images import check_metres_per_unit
+from pcdata.lengths import check_metres
 from pcdata.structures import METRE, Kind, PointCloud
 from pcdata.structures.fields import CORE_KINDS
 
-_LARGEST_SPREAD = 100.0  # metres; a 200 mm object read as metres is 200 m wide
 _FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
 
 # What torch can hold and compute with; unsigned integers go to the next wider signed type.
@@ -53,8 +52,9 @@ def to_cloud(
     if len(keep) and not keep.any():
         raise CaptureError(f"{where}: none of the {len(keep)} points has finite coordinates; drop this file")
     rows = slice(None) if keep.all() else keep
-    points = _metres(where, arrays.xyz[rows], metres_per_unit)
-    unit = 1.0 if metres_per_unit is None else metres_per_unit
+    xyz = arrays.xyz[rows]
+    unit = check_metres(where, xyz, metres_per_unit, viewpoint=viewpoint or (0.0, 0.0, 0.0))
+    points = _metres(where, xyz, unit)
     extra: dict[str, torch.Tensor] = {}
     for name, values in arrays.extra.items():
         name = _free_name(name, extra)
@@ -121,18 +121,8 @@ def narrowest_int(where: str, values: NDArray[np.int64], choices: Sequence[str])
     raise DTypeError(f"{where}: values {values.min()} .. {values.max()} do not fit any integer type of this format")
 
 
-def _metres(where: str, xyz: NDArray[Any], metres_per_unit: float | None) -> NDArray[np.float32]:
-    wide = xyz.astype(np.float64)
-    if metres_per_unit is not None:
-        wide *= check_metres_per_unit(where, metres_per_unit)
-    elif len(wide):
-        sample = wide[:: max(1, len(wide) >> 14)]  # 16,384 points tell as much as all
-        spread = float(np.median(np.abs(sample - np.median(sample, axis=0)).max(axis=1)))
-        if spread > _LARGEST_SPREAD:
-            raise UnitError(
-                f"{where}: half of the points lie {spread:.4g} or more from their middle; is the file in millimetres? "
-                "Pass metres_per_unit=0.001, or metres_per_unit=1.0 when these are metres indeed"
-            )
+def _metres(where: str, xyz: NDArray[Any], unit: float) -> NDArray[np.float32]:
+    wide = xyz.astype(np.float64) * unit
     with np.errstate(over="ignore"):
         points = wide.astype(np.float32)
     if xyz.dtype != np.float32 and len(wide) and not float(np.abs(points - wide).max()) <= _FINEST:

@@ -14,9 +14,10 @@ from pcdata.errors import CaptureError, ConfigError, UnitError
 from pcdata.io.calibration import Calibration
 from pcdata.io.capture_camera import read_capture_camera
 from pcdata.io.frame_files import make_frame
-from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, check_metres_per_unit, read_depth
+from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
 from pcdata.io.source import Source, absolute, by_stem, check_partners, sequence_positions
 from pcdata.io.timestamps import read_timestamps
+from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")

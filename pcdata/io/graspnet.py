@@ -16,8 +16,9 @@ from pcdata.errors import CaptureError
 from pcdata.functional import rigid
 from pcdata.io.files import existing_file
 from pcdata.io.frame_files import make_frame
-from pcdata.io.images import check_metres_per_unit, read_depth
+from pcdata.io.images import read_depth
 from pcdata.io.source import Source, absolute, sequence_positions
+from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame
 
 _REQUIRED = {"depth": "depth.png", "color": "color.png", "meta": "meta.mat"}

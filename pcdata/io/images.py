@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, NoReadingError, UnitError
 from pcdata.io.files import existing_file, map_npy
+from pcdata.lengths import check_metres_per_unit
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30
@@ -28,20 +29,6 @@ _FORMATS = {".png": _PNG, ".tif": _TIFF, ".tiff": _TIFF, ".jpg": _JPEG, ".jpeg":
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame lies outside
-
-
-def check_metres_per_unit(where: str, metres_per_unit: float) -> float:
-    """Return the factor as a float; it must lie in (0, 1].
-
-    No sensor stores a unit longer than a metre, and the bound catches a divisor (1000, 5000) given in its place.
-    """
-    ok = isinstance(metres_per_unit, (int, float)) and not isinstance(metres_per_unit, bool)
-    if not ok or not 0 < metres_per_unit <= 1:
-        raise UnitError(
-            f"{where}: metres_per_unit must be a number above 0 and at most 1, got {metres_per_unit!r}; "
-            "0.001 for millimetres, 1.0 for metres, 1 / factor where a data set documents a divisor"
-        )
-    return float(metres_per_unit)
 
 
 def read_depth(

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
 from pcdata.functional import rigid
-from pcdata.io.images import check_metres_per_unit, check_plausible, metres_of_value
+from pcdata.io.images import check_plausible, metres_of_value
 from pcdata.io.rosbag import MAGIC, Bag, depth_units, opened_bag, rgb_pixels
 from pcdata.io.source import Source, absolute
+from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame, register_to_color
 
 _IMAGES = re.compile(r"(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>Depth|Color)_\d+/image/data")

@@ -13,8 +13,9 @@ from pathlib import Path
 from pcdata.errors import CaptureError
 from pcdata.io.capture_camera import read_intrinsics
 from pcdata.io.frame_files import make_frame
-from pcdata.io.images import check_metres_per_unit, read_depth
+from pcdata.io.images import read_depth
 from pcdata.io.source import Source, absolute, check_partners, visible_files
+from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame
 
 _FILE = re.compile(r"(?P<id>frame-(?P<number>[0-9]{1,18}))\.(?P<role>depth\.png|color\.png|color\.jpg|pose\.txt)")
