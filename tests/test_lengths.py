@@ -55,7 +55,7 @@ def test_a_few_flying_pixels_do_not_make_a_table_a_hall() -> None:
 
 
 def test_a_small_patch_far_from_its_sensor_is_not_in_metres() -> None:
-    patch = box(9.0) + [0, 0, 640.0]  # 9 mm of a part 640 mm from the camera
+    patch = box(9.0) + np.array([0, 0, 640.0])  # 9 mm of a part 640 mm from the camera
     with pytest.raises(UnitError, match="half of the points are 640"):
         check_metres("here", patch, None)
     assert check_metres("here", patch, None, viewpoint=(0, 0, 638.0)) == 1.0

@@ -143,7 +143,7 @@ def test_optional_header_lines_may_be_absent_and_lines_may_end_in_crlf(tmp_path:
 
 def test_clouds_in_millimetres_are_noticed_and_converted_on_request(tmp_path: Path) -> None:
     path = write(tmp_path / "c.pcd", pcd(XYZ, (COORDINATES * 1000).T, "binary", VIEWPOINT="0 0 500 1 0 0 0"))
-    with pytest.raises(UnitError, match="metres_per_unit=0.001 if these are millimetres"):
+    with pytest.raises(UnitError, match=r"metres_per_unit=0\.001 if these are millimetres"):
         read_pcd(path)
     cloud = read_pcd(path, metres_per_unit=0.001)
     assert np.allclose(cloud.points.numpy(), COORDINATES, atol=1e-6)
@@ -156,7 +156,7 @@ def test_coordinates_that_float32_would_blur_are_refused(tmp_path: Path) -> None
     fields = [(name, "F", 8, 1) for name in "xyz"]
     far = COORDINATES.astype(np.float64) + np.array([500_000.123, 0, 0])
     with pytest.raises(CaptureError, match="subtract a common offset"):
-        read_pcd(write(tmp_path / "c.pcd", pcd(fields, far.T, "binary")))
+        read_pcd(write(tmp_path / "c.pcd", pcd(fields, far.T, "binary")), metres_per_unit=1.0)
     near = read_pcd(write(tmp_path / "c.pcd", pcd(fields, COORDINATES.astype(np.float64).T, "binary")))
     assert np.array_equal(near.points.numpy(), COORDINATES)
 

@@ -119,7 +119,7 @@ def test_millimetres_are_noticed(tmp_path: Path) -> None:
     path = write(
         tmp_path / "c.ply", ply("ascii", XYZ.format(3), ("", (0, 0, 500)), ("", (300, 0, 900)), ("", (0, 400, 1)))
     )
-    with pytest.raises(UnitError, match="metres_per_unit=0.001 if these are millimetres"):
+    with pytest.raises(UnitError, match=r"metres_per_unit=0\.001 if these are millimetres"):
         read_ply(path)
     assert read_ply(path, metres_per_unit=0.001).points[1].tolist() == pytest.approx([0.3, 0, 0.9])
 
