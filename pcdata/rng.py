@@ -31,7 +31,7 @@ def generator_for(seed: int, epoch: int, sample_id: str) -> Generator:
 
 def child_seed(generator: Generator) -> int:
     """Draw one 62-bit seed."""
-    return int(torch.randint(0, 2**62, (), generator=generator))
+    return int(torch.randint(0, 2**62, (), generator=generator, device="cpu"))
 
 
 class Streams:
@@ -68,18 +68,18 @@ class Streams:
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """Draw (B, *shape) float64 values in [low, high)."""
-        unit = [torch.rand(shape, generator=one, dtype=torch.float64) for one in self.generators]
+        unit = [torch.rand(shape, generator=one, dtype=torch.float64, device="cpu") for one in self.generators]
         return low + (high - low) * _stack(unit, shape)
 
     def normal(self, *shape: int) -> Tensor:
         """Draw (B, *shape) float64 standard normal values."""
-        values = [torch.randn(shape, generator=one, dtype=torch.float64) for one in self.generators]
+        values = [torch.randn(shape, generator=one, dtype=torch.float64, device="cpu") for one in self.generators]
         return _stack(values, shape)
 
     def seeds(self) -> Tensor:
         """Draw (B,) int64 seeds, for decisions too large to keep (per-point noise, permutations)."""
-        return torch.tensor([child_seed(one) for one in self.generators], dtype=torch.int64)
+        return torch.tensor([child_seed(one) for one in self.generators], dtype=torch.int64, device="cpu")
 
 
 def _stack(values: list[Tensor], shape: tuple[int, ...]) -> Tensor:
-    return torch.stack(values) if values else torch.empty((0, *shape), dtype=torch.float64)
+    return torch.stack(values) if values else torch.empty((0, *shape), dtype=torch.float64, device="cpu")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -167,3 +168,18 @@ def differences(a: Any, b: Any, *, tolerance: float = 0.0, path: str = "") -> li
 def assert_same(a: Any, b: Any, *, tolerance: float = 0.0) -> None:
     """Compare everything two structures hold, bit for bit unless a tolerance is given."""
     assert not differences(tree(a), tree(b), tolerance=tolerance)
+
+
+@contextlib.contextmanager
+def torch_defaults(*, dtype: torch.dtype | None = None, device: str | None = None) -> Iterator[None]:
+    """Another package's choice of torch's global defaults, undone at the end."""
+    before = torch.get_default_dtype()
+    try:
+        if dtype is not None:
+            torch.set_default_dtype(dtype)
+        if device is not None:
+            torch.set_default_device(device)
+        yield
+    finally:
+        torch.set_default_dtype(before)
+        torch.set_default_device(None)

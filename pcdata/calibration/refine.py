@@ -181,7 +181,7 @@ def refine_extrinsics(
     else:
         alignment = _held(alignment, stays)
     judged = judge_alignment(alignment, names, limits, reference=stays)
-    corrections = [torch.tensor(camera.correction, dtype=torch.float64) for camera in judged.cameras]
+    corrections = [torch.tensor(camera.correction, dtype=torch.float64, device="cpu") for camera in judged.cameras]
     if method == "pcdata":
         change = held_out_change(surfaces, poses[0])
     else:

@@ -152,7 +152,7 @@ def _from_csv(text: str, name: str) -> RobotPoses:
 
 def _pose_of_row(what: str, cells: Sequence[str]) -> Tensor:
     try:
-        values = torch.tensor([float(cell) for cell in cells], dtype=torch.float64)
+        values = torch.tensor([float(cell) for cell in cells], dtype=torch.float64, device="cpu")
     except ValueError as error:
         raise CalibrationError(f"{what}: must be seven numbers: {error}") from error
     length = float(values[3:].norm())

@@ -32,7 +32,7 @@ class SampleDataset(Dataset[PointCloud]):
         self.transform = transform
         self.seed = seed
         # Shared memory: workers that live through several epochs see the change too.
-        self._epoch = _shared(torch.zeros((), dtype=torch.int64))
+        self._epoch = _shared(torch.zeros((), dtype=torch.int64, device="cpu"))
 
     @property
     def epoch(self) -> int:

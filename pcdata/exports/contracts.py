@@ -44,7 +44,7 @@ def require_depth(where: str, target: Target, frame: DepthFrame) -> None:
     """
     cloud = Deproject()(frame)
     step = -(-cloud.num_points // _MANY) or 1
-    index = torch.arange(0, cloud.num_points, step)
+    index = torch.arange(0, cloud.num_points, step, dtype=torch.int64, device="cpu")
     thin = cloud.select(index, ptr_from_counts([len(index)]))
     require_cloud(where, target, thin)
 

@@ -43,12 +43,12 @@ class Groups:
         counts = counts_from_ptr(ptr)
         group_ptr = ptr_from_counts((counts + size - 1) // size)
         cloud = cloud_of_rows(group_ptr)
-        rank = torch.arange(len(cloud), device=ptr.device) - group_ptr[cloud]
+        rank = torch.arange(len(cloud), dtype=torch.int64, device=ptr.device) - group_ptr[cloud]
         return cls(group_ptr, ptr[cloud] + rank * size, (counts[cloud] - rank * size).clamp(max=size), size)
 
     def table(self) -> tuple[Tensor, Tensor]:
         """Return (M, size) rows and the (M, size) mask of real slots; the others repeat the group's last row."""
-        slot = torch.arange(self.size, device=self.first.device)
+        slot = torch.arange(self.size, dtype=torch.int64, device=self.first.device)
         return self.first[:, None] + torch.minimum(slot, self.count[:, None] - 1), slot < self.count[:, None]
 
 
@@ -134,8 +134,8 @@ def box_gap(low: Tensor, high: Tensor, other_low: Tensor, other_high: Tensor) ->
 def expand_ranges(first: Tensor, count: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
     """Replace each range of rows by one (owner, row) pair per row, in order."""
     total = torch.cumsum(count, 0)
-    source = torch.repeat_interleave(torch.arange(len(first), device=first.device), count)
-    rank = torch.arange(len(source), device=first.device) - (total - count)[source]
+    source = torch.repeat_interleave(torch.arange(len(first), dtype=torch.int64, device=first.device), count)
+    rank = torch.arange(len(source), dtype=torch.int64, device=first.device) - (total - count)[source]
     return owner[source], first[source] + rank
 
 
@@ -146,7 +146,7 @@ def spatial_order(points: Tensor, cloud: Tensor) -> Tensor:
     point a kilometre away does not blur the order of the rest.
     """
     segment, order = torch.sort(cloud, stable=True)
-    place = torch.arange(len(points), device=points.device)
+    place = torch.arange(len(points), dtype=torch.int64, device=points.device)
     while len(place):
         _, segment = torch.unique_consecutive(segment, return_inverse=True)
         code = _morton_code(points[order[place]], segment)
@@ -197,7 +197,7 @@ def _bounds(points: Tensor, segment: Tensor) -> tuple[Tensor, Tensor]:
 
 def _first_copies(ordered: Tensor, ptr: Tensor, max_copies: int) -> Tensor:
     """Return a (N,) mask without the copies after the first ``max_copies`` in a cloud's runs of equal (N,3) points."""
-    place = torch.arange(len(ordered), device=ordered.device)
+    place = torch.arange(len(ordered), dtype=torch.int64, device=ordered.device)
     if len(place) == 0:
         return place.bool()
     begins = torch.ones(len(ordered), dtype=torch.bool, device=ordered.device)

@@ -46,7 +46,7 @@ class Cells:
         cloud = cloud_of_rows(ptr)
         index = cloud[:, None].expand(-1, 3)
         low = points.new_full((len(ptr) - 1, 3), torch.inf).scatter_reduce_(0, index, points, "amin").double()
-        side = float(torch.tensor(radius, dtype=torch.float32)) / math.sqrt(3.0) * (1 - _MARGIN)
+        side = float(torch.tensor(radius, dtype=torch.float32, device="cpu")) / math.sqrt(3.0) * (1 - _MARGIN)
         scaled = (points - low[cloud]) / side
         if len(points):
             require_cells(where, radius, float(scaled.max()))
@@ -71,7 +71,7 @@ class Cells:
         """Yield every pair of cells that may hold points within the radius, once, nearest cells first."""
         yz, z = self.keys[2] // self.spans[2], self.keys[2] % self.spans[2]
         x, y = self.keys[1][yz] // self.spans[1], self.keys[1][yz] % self.spans[1]
-        every = torch.arange(len(self), device=z.device)
+        every = torch.arange(len(self), dtype=torch.int64, device=z.device)
         columns = [(dx, dy) for dx in range(_REACH + 1) for dy in range(-_REACH, _REACH + 1) if (dx, dy) >= (0, 0)]
         for dx, dy in sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2):
             column, found = _find(self.keys[0], self.keys[0][x] + dx)

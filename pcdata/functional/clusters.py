@@ -109,10 +109,10 @@ def _join(cells: Cells, points: Tensor, eps: float) -> Tensor:
     index = cells.cell[order][:, None].expand(-1, 3)
     low = points.new_full((len(cells), 3), torch.inf).scatter_reduce_(0, index, members, "amin")
     high = points.new_full((len(cells), 3), -torch.inf).scatter_reduce_(0, index, members, "amax")
-    slot = torch.arange(_SAMPLES, device=points.device)
+    slot = torch.arange(_SAMPLES, dtype=torch.int64, device=points.device)
     sample = members[start[:-1, None] + cells.count[:, None] * slot // _SAMPLES]  # repeats in a small cell
 
-    parent = torch.arange(len(cells), device=points.device)
+    parent = torch.arange(len(cells), dtype=torch.int64, device=points.device)
     open_pairs = [parent.new_empty((2, 0))]
     for pairs in cells.neighbor_pairs():
         for begin in range(0, len(pairs[0]), _PAIRS_PER_CHUNK):
@@ -141,7 +141,9 @@ def _any_within(members: Tensor, start: Tensor, low: Tensor, high: Tensor, a: Te
     limit = largest_squared(eps, members.device)
     sides = []
     for mine, other in ((a, b), (b, a)):
-        pair, row = expand_ranges(start[mine], start[mine + 1] - start[mine], torch.arange(len(a), device=a.device))
+        pair, row = expand_ranges(
+            start[mine], start[mine + 1] - start[mine], torch.arange(len(a), dtype=torch.int64, device=a.device)
+        )
         point = members[row]
         near = box_gap(point, point, low[other[pair]], high[other[pair]]) <= limit
         counts = torch.bincount(pair[near], minlength=len(a))

@@ -92,7 +92,7 @@ def _fill_inwards(depth: Tensor, wanted: Tensor, *, farthest: bool) -> tuple[Ten
     values = torch.nn.functional.pad(depth, (1, 1, 1, 1)).flatten()
     waiting = torch.nn.functional.pad(wanted, (1, 1, 1, 1)).flatten()
     distance = torch.zeros_like(values, dtype=torch.int64)
-    around = torch.tensor([[-width - 2], [-1], [1], [width + 2]], device=depth.device)
+    around = torch.tensor([[-width - 2], [-1], [1], [width + 2]], dtype=torch.int64, device=depth.device)
     layer = waiting.nonzero().squeeze(1)
     layer = layer[(values[layer + around] > 0).any(0)]
     step = 0
@@ -109,7 +109,7 @@ def _fill_inwards(depth: Tensor, wanted: Tensor, *, farthest: bool) -> tuple[Ten
         waiting[layer] = False
         candidates = near[waiting[near]]
         # Several neighbours lead to one pixel: the last to sign for it keeps it.
-        distance[candidates] = ticket = torch.arange(len(candidates), device=depth.device)
+        distance[candidates] = ticket = torch.arange(len(candidates), dtype=torch.int64, device=depth.device)
         layer = candidates[distance[candidates] == ticket]
     return tuple(  # type: ignore[return-value]
         image.reshape(views, height + 2, width + 2)[:, 1:-1, 1:-1].contiguous() for image in (values, distance)

@@ -128,8 +128,10 @@ def _fit(depth: Tensor, half: int, first: int, stride: int) -> _Fit:
     moment = _window_moments(inverse, half, first, stride, 2)
     square = _window_moments(inverse.square(), half, first, stride, 0)[..., 0, 0]
     # Moment (v, u) of degree 4 and of degree 2, in the order of the unknowns.
-    pairs = torch.tensor([[5 * (v + b) + u + a for a, b in _POWERS] for u, v in _POWERS], device=depth.device)
-    singles = torch.tensor([3 * v + u for u, v in _POWERS], device=depth.device)
+    pairs = torch.tensor(
+        [[5 * (v + b) + u + a for a, b in _POWERS] for u, v in _POWERS], dtype=torch.int64, device=depth.device
+    )
+    singles = torch.tensor([3 * v + u for u, v in _POWERS], dtype=torch.int64, device=depth.device)
     normal = weight.flatten(-2)[..., pairs.flatten()].unflatten(-1, (6, 6))
     right = moment.flatten(-2)[..., singles]
     count = normal[..., 0, 0]
@@ -149,7 +151,7 @@ def _fit(depth: Tensor, half: int, first: int, stride: int) -> _Fit:
 def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: int) -> Tensor:
     """Sum image * v^i u^j over each window, i, j = 0 to degree: (h, w, degree + 1, degree + 1), in half windows."""
     offset = torch.arange(-half, half + 1, dtype=torch.float64, device=image.device) / half
-    powers = offset[:, None] ** torch.arange(degree + 1, device=image.device)
+    powers = offset[:, None] ** torch.arange(degree + 1, dtype=torch.int64, device=image.device)
     height, width = image.shape
     if height <= 2 * first or width <= 2 * first:
         return image.new_zeros(max(0, height - 2 * first), max(0, width - 2 * first), degree + 1, degree + 1)

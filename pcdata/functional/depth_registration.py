@@ -96,7 +96,7 @@ def register_depth(
     views = zip(depth, zip(x, y), halves, color_intrinsics.double(), color_from_depth, lenses)
     results = [_register_view(_View(*view), color_size, max_jump) for view in views]
     if not results:
-        none = torch.empty((0, *color_size), device=depth.device)
+        none = torch.empty((0, *color_size), dtype=torch.float32, device=depth.device)
         return RegisteredDepth(none, none.long(), none.bool(), torch.zeros_like(depth, dtype=torch.bool))
     return RegisteredDepth(*(torch.stack(images) for images in zip(*results, strict=True)))
 

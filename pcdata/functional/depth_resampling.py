@@ -75,8 +75,8 @@ def decimate_depth(
     else:
         total = sum(block.double() for block in blocks)
         reduced = (total / count.clamp(min=1)).float()
-    rows = torch.arange(height, device=depth.device)[:, None] * factor + place // factor
-    columns = torch.arange(width, device=depth.device) * factor + place % factor
+    rows = torch.arange(height, dtype=torch.int64, device=depth.device)[:, None] * factor + place // factor
+    columns = torch.arange(width, dtype=torch.int64, device=depth.device) * factor + place % factor
     return torch.where(count > 0, reduced, 0.0), rows * depth.shape[2] + columns
 
 

@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -113,14 +114,14 @@ def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
     scores = _scores(_blurred(votes.histogram), votes.scale)  # (X, Y, B, G)
     total = scores.sum(3).cpu()
     best = int(total.argmax())
-    across, down, which = (int(place) for place in torch.unravel_index(torch.tensor(best), total.shape))
+    across, down, which = (int(place) for place in np.unravel_index(best, total.shape))
     shift = (
         float(shifts[across]) + _GRID_STEP * _vertex(total[:, down, which], across),
         float(shifts[down]) + _GRID_STEP * _vertex(total[across, :, which], down),
     )
     kept = _not_ruled_out(scores, best, votes.histogram).cpu()  # (X, Y, B)
     possible = shifts[kept.any(2).nonzero()]  # (N, 2)
-    spread = (possible - torch.tensor(shift)).abs().amax(0).clamp_min(_LEAST_SPREAD)
+    spread = (possible - torch.tensor(shift, dtype=torch.float32, device="cpu")).abs().amax(0).clamp_min(_LEAST_SPREAD)
     lengths = possible.norm(dim=1)
     bias = float(biases[which])
     problem: str | None = None
@@ -174,7 +175,7 @@ def _not_ruled_out(scores: Tensor, best: int, histogram: Tensor) -> Tensor:
 
 def _drop_nearby(drop: Tensor, best: int) -> float:
     """Return by how much the score drops within the least spread of the best shift; drops grow with the square."""
-    across, down, which = (int(place) for place in torch.unravel_index(torch.tensor(best), drop.shape))
+    across, down, which = (int(place) for place in np.unravel_index(best, drop.shape))
     nearby = drop[max(across - 1, 0) : across + 2, max(down - 1, 0) : down + 2, which]
     return float(nearby.mean()) * (_LEAST_SPREAD / _GRID_STEP) ** 2
 
@@ -197,15 +198,15 @@ def _grid(scale: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     The cells are those of a table with one row per direction and offset, where every direction has a column of chance
     on either side of its offsets: what lies beyond, where nobody could vote, scores that.
     """
-    shifts = torch.arange(-SHIFT_LIMIT, SHIFT_LIMIT + 0.1, _GRID_STEP)
-    biases = torch.arange(-_BIAS_LIMIT, _BIAS_LIMIT + 0.1, 0.5) * scale
-    angle = torch.arange(_NUM_DIRECTIONS) * (2 * math.pi / _NUM_DIRECTIONS)
+    shifts = torch.arange(-SHIFT_LIMIT, SHIFT_LIMIT + 0.1, _GRID_STEP, dtype=torch.float32, device="cpu")
+    biases = torch.arange(-_BIAS_LIMIT, _BIAS_LIMIT + 0.1, 0.5, dtype=torch.float32, device="cpu") * scale
+    angle = torch.arange(_NUM_DIRECTIONS, dtype=torch.float32, device="cpu") * (2 * math.pi / _NUM_DIRECTIONS)
     offset = shifts[:, None, None, None] * angle.cos() + shifts[:, None, None] * angle.sin() + biases[:, None]
     reach = SHIFT_LIMIT + _BIAS_LIMIT * scale
     place = offset.reshape(-1, _NUM_DIRECTIONS) + (reach + 1)
     below = place.floor()
     width = 2 * reach + 3
-    row = torch.arange(_NUM_DIRECTIONS) * width
+    row = torch.arange(_NUM_DIRECTIONS, dtype=torch.float32, device="cpu") * width
     cells = torch.cat([(one.clamp(0, width - 1) + row).int() for one in (below, below + 1)], dim=1)
     return shifts, biases, cells, torch.cat([1 - (place - below), place - below], dim=1)
 

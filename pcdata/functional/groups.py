@@ -17,8 +17,10 @@ def group_count(group: Tensor, num_groups: int) -> Tensor:
 
 def group_first(group: Tensor, num_groups: int) -> Tensor:
     """Return the (G,) int64 lowest row of each group; N for an empty one."""
-    rows = torch.arange(len(group), device=group.device)
-    return torch.full((num_groups,), len(group), device=group.device).scatter_reduce_(0, group, rows, "amin")
+    rows = torch.arange(len(group), dtype=torch.int64, device=group.device)
+    return torch.full((num_groups,), len(group), dtype=torch.int64, device=group.device).scatter_reduce_(
+        0, group, rows, "amin"
+    )
 
 
 def group_sum(values: Tensor, group: Tensor, num_groups: int) -> Tensor:

@@ -132,7 +132,7 @@ def _invert(target: Tensor, coefficients: _Coefficients, fold: float) -> Tensor:
     """Undistort (P, 2) coordinates of one view; those that have converged drop out of each further step."""
     target_x, target_y = target.unbind(-1)
     x, y = target_x.clone(), target_y.clone()
-    open_ = torch.arange(len(x), device=x.device)
+    open_ = torch.arange(len(x), dtype=torch.int64, device=x.device)
     for _ in range(_MAX_STEPS):
         px, py = x[open_], y[open_]
         bent_x, bent_y = _bend(px, py, coefficients)

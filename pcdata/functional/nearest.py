@@ -60,7 +60,10 @@ def nearest_chunks(
         queries, queries_ptr = points, ptr
         tree = BoxTree.build(points, ptr, spatial_order(points, cloud_of_rows(ptr)), max_copies=k)
         if bool(tree.kept.all()):  # the queries are the leaves themselves
-            leaves, home = tree.leaves, torch.arange(len(tree.leaves), device=ptr.device)[:, None].expand(-1, LEAF_SIZE)
+            leaves, home = (
+                tree.leaves,
+                torch.arange(len(tree.leaves), dtype=torch.int64, device=ptr.device)[:, None].expand(-1, LEAF_SIZE),
+            )
     if leaves is None:
         tree, leaves, home = _build_together(points, ptr, queries.detach(), queries_ptr, max_copies=k)
     yield from _Search(tree, leaves, home, foreign, k, largest_squared(radius, points.device)).run()
@@ -69,7 +72,7 @@ def nearest_chunks(
 def largest_squared(radius: float | None, device: torch.device) -> Tensor:
     """Return the largest float32 d2 that counts as d < radius; a finite maximum when there is no radius."""
     if radius is None:
-        return torch.tensor(torch.finfo(torch.float32).max, device=device)
+        return torch.tensor(torch.finfo(torch.float32).max, dtype=torch.float32, device=device)
     limit = torch.tensor(radius, dtype=torch.float32, device=device)
     return torch.nextafter(limit * limit, torch.zeros_like(limit))
 
@@ -114,7 +117,9 @@ class _Search:
         window = self._window_size()
         per_chunk = max(1, min(_GROUPS_PER_CHUNK, _MAX_PAIRS // (LEAF_SIZE * LEAF_SIZE * window)))
         for begin in range(0, len(self.leaves), per_chunk):
-            groups = torch.arange(begin, min(begin + per_chunk, len(self.leaves)), device=self.home.device)
+            groups = torch.arange(
+                begin, min(begin + per_chunk, len(self.leaves)), dtype=torch.int64, device=self.home.device
+            )
             yield from self._walk(groups, torch.minimum(self._first_bound(groups, window), self.limit))
 
     def _window_size(self) -> int:
@@ -142,7 +147,7 @@ class _Search:
         node = root_ptr[cloud].clamp(max=len(self.tree.levels[-1].low) - 1).expand(points.shape[:2])
         for depth in range(len(self.tree.levels) - 1, 0, -1):
             groups, below = self.tree.levels[depth].groups, self.tree.levels[depth - 1]
-            slot = torch.arange(groups.size, device=node.device)
+            slot = torch.arange(groups.size, dtype=torch.int64, device=node.device)
             children = groups.first[node][..., None] + torch.minimum(slot, groups.count[node][..., None] - 1)
             gap = box_gap(points[:, :, None], points[:, :, None], below.low[children], below.high[children])
             node = children.gather(-1, gap.argmin(-1, keepdim=True)).squeeze(-1)
@@ -153,7 +158,7 @@ class _Search:
         ptr = self.tree.leaf_ptr
         begin, end = ptr[cloud], ptr[cloud + 1]
         first = torch.maximum(torch.minimum(home - window // 2, end - window), begin)
-        around = first[..., None] + torch.arange(window, device=home.device)
+        around = first[..., None] + torch.arange(window, dtype=torch.int64, device=home.device)
         around = torch.where(around < end[..., None], around, len(self.tree.leaves))
         squared = self._squared(points, around)
         if self.k > squared.shape[-1]:
@@ -209,7 +214,7 @@ class _Search:
         for width in _widths(int(counts.max())):
             chosen = ((counts > narrower) & (counts <= width)).nonzero().squeeze(1)
             narrower = width
-            places = torch.arange(width, device=row.device)
+            places = torch.arange(width, dtype=torch.int64, device=row.device)
             per_part = max(1, _MAX_PAIRS // (width * LEAF_SIZE))
             for begin in range(0, len(chosen), per_part):
                 part = chosen[begin : begin + per_part]

@@ -164,7 +164,7 @@ def _separate_eigenvector(matrix: Symmetric, value: Tensor) -> Tensor:
     ]
     products = torch.stack([torch.linalg.cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))], 1)
     longest = products.square().sum(-1).argmax(1)
-    return _unit(products[torch.arange(len(longest), device=longest.device), longest])
+    return _unit(products[torch.arange(len(longest), dtype=torch.int64, device=longest.device), longest])
 
 
 def _smallest_across(matrix: Symmetric, clear: Tensor) -> Tensor:

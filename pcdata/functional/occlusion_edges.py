@@ -57,7 +57,7 @@ def occlusion_edges(
     last = position.new_tensor([depth.shape[1] - 1, depth.shape[0] - 1])
     inside = ((position >= margin) & (position <= last - margin)).all(1).nonzero().squeeze(1)
     if len(inside) > _MAX_EDGES:
-        inside = inside[torch.linspace(0, len(inside) - 1, _MAX_EDGES, device=depth.device).long()]
+        inside = inside[torch.linspace(0, len(inside) - 1, _MAX_EDGES, dtype=torch.float32, device=depth.device).long()]
     return _straight_rims(depth, position[inside], step[inside], middle[inside], scale)
 
 
@@ -86,7 +86,7 @@ def _search_rows(depth: Tensor, scale: int) -> _Jumps:
     kept = same_row & (gap <= span + _WIDEST_HOLE * scale) & (jump.abs() > _JUMP + slope)
     first, jump = first[kept], jump[kept]
     # Of the steps inside the span, the jump is the largest one in its direction; several spans may share it.
-    window = log_depth[first[:, None] + torch.arange(span + 1, device=depth.device)]
+    window = log_depth[first[:, None] + torch.arange(span + 1, dtype=torch.int64, device=depth.device)]
     step = window.diff(dim=1) * jump.sign()[:, None]
     before, group = torch.unique(first + step.argmax(1), return_inverse=True)
     height = torch.zeros_like(before, dtype=depth.dtype).scatter_reduce_(0, group, jump.abs(), "amax")
@@ -104,7 +104,7 @@ def _search_rows(depth: Tensor, scale: int) -> _Jumps:
 def _straight_rims(depth: Tensor, position: Tensor, step: Tensor, middle: Tensor, scale: int) -> OcclusionEdges:
     """Keep the points whose surroundings are cut in two by one rim, and find the rim's normal."""
     radius = _PATCH * scale
-    reach = torch.arange(-radius, radius + 1, scale, device=depth.device)
+    reach = torch.arange(-radius, radius + 1, scale, dtype=torch.int64, device=depth.device)
     offsets = torch.cartesian_prod(reach, reach)
     offsets = offsets[offsets.square().sum(1) <= (radius + 0.5) ** 2]
     height, width = depth.shape

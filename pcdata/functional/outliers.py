@@ -66,7 +66,7 @@ def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
     The mask hangs on the last bit where all means are equal.
     """
     cloud = cloud_of_rows(ptr)
-    run = cloud * 8 + (torch.arange(len(values), device=values.device) - ptr[cloud]) % 8
+    run = cloud * 8 + (torch.arange(len(values), dtype=torch.int64, device=values.device) - ptr[cloud]) % 8
     runs = values.new_zeros(8 * (len(ptr) - 1)).index_add(0, run, values).reshape(-1, 8)
     total = torch.zeros_like(runs[:, 0])
     for part in runs.unbind(1):

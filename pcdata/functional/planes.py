@@ -93,7 +93,7 @@ def search_planes(
     _check_parameters(distance, num_hypotheses, max_tilt, up)
     seeds = _seed_per_cloud(seed, num_clouds)
     ups = _up_per_cloud(up, num_clouds)
-    planes = torch.zeros((num_clouds, 4), dtype=torch.float64)
+    planes = torch.zeros((num_clouds, 4), dtype=torch.float64, device="cpu")
     inlier_masks = []
     bounds = ptr.tolist()
     for cloud, (start, stop) in enumerate(pairwise(bounds)):
@@ -121,7 +121,7 @@ def plane_distance(
     Separate float32 operations: nothing fuses them, so every backend and device gets the same bits.
     """
     x, y, z = points.unbind(-1)
-    nx, ny, nz, d = planes.to(device=points.device, dtype=torch.float32)[..., None].unbind(1)
+    nx, ny, nz, d = planes.to(dtype=torch.float32, device=points.device)[..., None].unbind(1)
     total, product = out or (points.new_empty((len(planes), len(points))), None)
     torch.mul(nx, x, out=total)
     total += torch.mul(ny, y, out=product)
@@ -173,7 +173,9 @@ def _draw_planes(points: Tensor, count: int, seed: int) -> Tensor:
 def _draw_triples(num_points: int, count: int, seed: int) -> Tensor:
     """Draw (count, 3) indices, distinct within a row and uniform: each skips over those before it."""
     generator = seeded(seed)
-    first, second, third = (torch.randint(num_points - taken, (count,), generator=generator) for taken in range(3))
+    first, second, third = (
+        torch.randint(num_points - taken, (count,), generator=generator, device="cpu") for taken in range(3)
+    )
     second += second >= first
     third += third >= torch.minimum(first, second)
     third += third >= torch.maximum(first, second)
@@ -254,7 +256,7 @@ def _face(plane: Tensor, up: Tensor | None) -> Tensor:
 def _tilt_test(up: Tensor | None, max_tilt: float | None) -> Callable[[Tensor], Tensor]:
     """Return the test that (..., 4) planes must pass to compete."""
     if up is None or max_tilt is None:
-        return lambda planes: torch.ones(planes.shape[:-1], dtype=torch.bool)
+        return lambda planes: torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")
 
     def within_tilt(planes: Tensor) -> Tensor:
         angle = angle_between(planes[..., :3], up)
@@ -293,7 +295,7 @@ def _seed_per_cloud(seed: int | Sequence[int] | Tensor, num_clouds: int) -> list
 def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> list[Tensor | None]:
     if up is None:
         return [None] * num_clouds
-    directions = torch.as_tensor(up, dtype=torch.float64).cpu()
+    directions = torch.as_tensor(up, dtype=torch.float64, device="cpu")
     if directions.shape == (3,):
         directions = directions.expand(num_clouds, 3)
     if directions.shape != (num_clouds, 3):

@@ -39,7 +39,7 @@ def average_motions(
             information[rows, source] += sign * pair.information
             information[rows, target] -= sign * pair.information
             right[rows] += sign * (pair.information @ twist_from_motion(pair.motion, pivot))
-    free = torch.tensor([row for row in range(size) if row // 6 != fixed], device=pivot.device)
+    free = torch.tensor([row for row in range(size) if row // 6 != fixed], dtype=torch.int64, device=pivot.device)
     twists = torch.zeros_like(right)
     # The least-norm solution: what nothing determines stays 0.
     twists[free] = torch.linalg.pinv(information[free][:, free], hermitian=True) @ right[free]

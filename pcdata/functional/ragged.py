@@ -29,7 +29,7 @@ def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None 
 def cloud_of_rows(ptr: Tensor) -> Tensor:
     """Return (N,) int64: the cloud that each row belongs to."""
     counts = counts_from_ptr(ptr)
-    return torch.repeat_interleave(torch.arange(len(counts), device=ptr.device), counts)
+    return torch.repeat_interleave(torch.arange(len(counts), dtype=torch.int64, device=ptr.device), counts)
 
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:

@@ -72,10 +72,10 @@ def point_to_plane_residuals(
     device = source.device
     index, distance = knn(
         target,
-        ptr_from_counts(torch.tensor([len(target)], device=device)),
+        ptr_from_counts(torch.tensor([len(target)], dtype=torch.int64, device=device)),
         k=1,
         queries=source,
-        queries_ptr=ptr_from_counts(torch.tensor([len(source)], device=device)),
+        queries_ptr=ptr_from_counts(torch.tensor([len(source)], dtype=torch.int64, device=device)),
     )
     rows = (distance[:, 0] < max_distance).nonzero().squeeze(1)
     partner = index[rows, 0]
@@ -140,7 +140,7 @@ def icp_point_to_plane(
         source_normals = estimate_normals(source, radius=normal_radius)
     pose = torch.eye(4, dtype=torch.float64, device=source.device) if initial is None else initial.double()
     rigid.check_rigid(f"{where}: initial", pose)
-    one_cloud = torch.tensor([0, len(source)], device=source.device)
+    one_cloud = torch.tensor([0, len(source)], dtype=torch.int64, device=source.device)
     options = {"max_normal_angle": max_normal_angle}
 
     def measure(distance: float) -> tuple[Tensor, PlaneResiduals, PlaneSystem, Tensor]:

@@ -140,7 +140,7 @@ def _farthest(points: Tensor, count: int) -> Tensor:
 
 def _draw(num_rows: int, count: int, seed: int, replace: bool) -> Tensor:
     if count == 0:
-        return torch.empty(0, dtype=torch.int64)
+        return torch.empty(0, dtype=torch.int64, device="cpu")
     if replace:
-        return torch.randint(num_rows, (count,), generator=seeded(seed))
-    return torch.randperm(num_rows, generator=seeded(seed))[:count]
+        return torch.randint(num_rows, (count,), generator=seeded(seed), device="cpu")
+    return torch.randperm(num_rows, generator=seeded(seed), device="cpu")[:count]

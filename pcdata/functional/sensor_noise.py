@@ -25,8 +25,10 @@ def draw_sensor_noise(size: tuple[int, int], generators: Sequence[Generator], de
 
     Every effect has draws of its own, so changing the strength of one leaves the pattern of the others as it was.
     """
-    wobble = torch.stack([torch.randn(size, generator=one) for one in generators])
-    chance = torch.stack([torch.rand((4, *size), generator=one) for one in generators], dim=1)
+    wobble = torch.stack([torch.randn(size, generator=one, dtype=torch.float32, device="cpu") for one in generators])
+    chance = torch.stack(
+        [torch.rand((4, *size), generator=one, dtype=torch.float32, device="cpu") for one in generators], dim=1
+    )
     return SensorDraws(wobble.to(device), chance.to(device))
 
 
@@ -106,7 +108,7 @@ def _flatter_side(depth: Tensor, dim: int, reach: int, tolerance: Tensor | float
         other = torch.roll(depth, shift, dims=dim)
         difference = ((other - depth).abs() - tolerance).clamp(min=0.0)
         known = other > 0
-        border = torch.arange(depth.shape[dim], device=depth.device)
+        border = torch.arange(depth.shape[dim], dtype=torch.int64, device=depth.device)
         inside = (border < depth.shape[dim] - reach) if shift < 0 else (border >= reach)
         known &= inside[:, None] if dim == 1 else inside
         differences.append(torch.where(known, difference, torch.inf))

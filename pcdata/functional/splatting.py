@@ -19,7 +19,7 @@ class ZBuffer:
     def __init__(self, size: tuple[int, int], device: torch.device) -> None:
         self.size = size
         # Depths are positive, so their bits are ordered as they are: depth and index compare as one integer.
-        self._nearest = torch.full((size[0] * size[1],), _EMPTY, device=device)
+        self._nearest = torch.full((size[0] * size[1],), _EMPTY, dtype=torch.int64, device=device)
 
     def paint(
         self,
@@ -40,7 +40,7 @@ class ZBuffer:
         top, bottom = (end.ceil().clamp_(0, height).flatten() for end in cells[2:])
         across, down = (right - left).mul_(visible.flatten()), bottom - top
         first = top.long().mul_(width).add_(left.long())
-        index = torch.arange(first_index, first_index + depth.numel(), device=depth.device)
+        index = torch.arange(first_index, first_index + depth.numel(), dtype=torch.int64, device=depth.device)
         keys = depth.flatten().view(torch.int32).long().bitwise_left_shift_(_INDEX_BITS).bitwise_or_(index)
         for row in range(int(down.max())):
             for column in range(int(across.max())):

@@ -132,7 +132,9 @@ class DepthSurface:
         # To the tangent plane where the sample's own ray meets the patch.
         residual = (normal * rays).sum(1) * behind
         near = (residual.abs() < max_distance) & (behind.abs() < 2 * max_distance)
-        near &= (normal * normals[rows]).sum(1) > torch.cos(torch.tensor(max_angle)).item()
+        near &= (normal * normals[rows]).sum(1) > torch.cos(
+            torch.tensor(max_angle, dtype=torch.float32, device="cpu")
+        ).item()
         index = index[near]
         return Matches(
             rows[near],
@@ -163,7 +165,7 @@ class CloudSurface:
         max_neighbors: int = 100,
     ) -> CloudSurface:
         """Average the neighbourhoods of evenly spaced rows; four times as many patches as samples are kept."""
-        rows = evenly(torch.arange(len(points), device=points.device), 4 * max_samples)
+        rows = evenly(torch.arange(len(points), dtype=torch.int64, device=points.device), 4 * max_samples)
         index, _, count = ball_query(points, radius=radius, max_neighbors=max_neighbors, queries=points[rows])
         enough = count >= 8
         rows, index, count = rows[enough], index[enough], count[enough]
@@ -188,7 +190,7 @@ class CloudSurface:
             sigma[flat].clamp(min=_FLOOR_SIGMA),
             (sigma / reach)[flat].clamp(min=_FLOOR_NORMAL_SIGMA),
         )
-        kept = evenly(torch.arange(len(patches.points), device=points.device), max_samples)
+        kept = evenly(torch.arange(len(patches.points), dtype=torch.int64, device=points.device), max_samples)
         picked = (patches.points, patches.normals, patches.sigma, patches.normal_sigma)
         return cls(patches, Samples(*(values[kept] for values in picked)))
 
@@ -203,7 +205,7 @@ class CloudSurface:
         index = index[rows, 0]
         normal = self.patches.normals[index]
         cosine = (normal * normals[rows]).sum(1)
-        alike = cosine.abs() > torch.cos(torch.tensor(max_angle)).item()
+        alike = cosine.abs() > torch.cos(torch.tensor(max_angle, dtype=torch.float32, device="cpu")).item()
         rows, index = rows[alike], index[alike]
         normal = torch.where(cosine[alike, None] < 0, -normal[alike], normal[alike])
         patches = self.patches
@@ -215,7 +217,7 @@ def evenly(rows: Tensor, count: int) -> Tensor:
     """Return at most ``count`` of the rows at equal steps, the first included."""
     if len(rows) <= count:
         return rows
-    return rows[torch.arange(count, device=rows.device) * len(rows) // count]
+    return rows[torch.arange(count, dtype=torch.int64, device=rows.device) * len(rows) // count]
 
 
 def evenly_by_direction(

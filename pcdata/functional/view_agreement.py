@@ -47,7 +47,9 @@ def view_agreement(
     pixel = depth_a.flatten().nonzero().squeeze(1)
     pixel = pixel[:: max(1, len(pixel) // _SAMPLES)]
     points = _deproject(pixel, depth_a, intrinsics_a.double(), distortion_a)
-    moved = rigid.transform_points(points, torch.tensor([0, len(points)], device=points.device), b_from_a[None])
+    moved = rigid.transform_points(
+        points, torch.tensor([0, len(points)], dtype=torch.int64, device=points.device), b_from_a[None]
+    )
     uv, z = project_points(moved, intrinsics=intrinsics_b[None], distortion=_batch(distortion_b))
     height, width = depth_b.shape
     inside = (uv > -0.5).all(1) & (uv[:, 0] < width - 0.5) & (uv[:, 1] < height - 0.5)

@@ -214,7 +214,9 @@ def _measure(
 def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution:
     """Solve for all views but the fixed one, whose rows are 0 in the result."""
     joint = joint_system(fits, num_views)
-    free = torch.tensor([row for row in range(6 * num_views) if row // 6 != fixed], device=joint.gradient.device)
+    free = torch.tensor(
+        [row for row in range(6 * num_views) if row // 6 != fixed], dtype=torch.int64, device=joint.gradient.device
+    )
     part = PlaneSystem(joint.information[free][:, free], joint.gradient[free], joint.feigned[free][:, free])
     solution = solve_observable(part)
     twist = torch.zeros_like(joint.gradient)

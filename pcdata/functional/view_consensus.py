@@ -50,7 +50,7 @@ def find_consensus(
         own, other = blocks[range(num_views), range(num_views)], blocks[reference, reference]
         return own + other - blocks[:, reference] - blocks[reference]
 
-    apart = torch.zeros(num_views, num_views, dtype=torch.float64)
+    apart = torch.zeros(num_views, num_views, dtype=torch.float64, device="cpu")
     for view in range(num_views):
         for other, uncertain in enumerate(relative(view)):
             twist = alignment.twists[view] - alignment.twists[other]

@@ -106,7 +106,7 @@ def search_voxel_sizes(
 
 def count_voxels(points: Tensor, voxel_size: float) -> int:
     """Return how many points :func:`voxel_downsample` leaves of one cloud."""
-    ptr = torch.tensor([0, len(points)], device=points.device)
+    ptr = torch.tensor([0, len(points)], dtype=torch.int64, device=points.device)
     cloud, _, scaled = _scale_to_grid(points, ptr, sizes_per_cloud("count_voxels", voxel_size, ptr))
     return _rank(_voxel_keys(cloud, scaled.floor(), 1))[1]
 
@@ -161,7 +161,9 @@ def voxel_majority(
     voxel, rank = pairs // num_names, pairs % num_names
     # More votes first, then the lower label: both in one number whose maximum wins.
     ballot = votes * num_names + (num_names - 1 - rank)
-    best = torch.full((num_voxels,), -1, device=labels.device).scatter_reduce_(0, voxel, ballot, "amax")
+    best = torch.full((num_voxels,), -1, dtype=torch.int64, device=labels.device).scatter_reduce_(
+        0, voxel, ballot, "amax"
+    )
     winner = num_names - 1 - best.remainder(num_names)
     return torch.where(best < 0, -1, names[winner]) if len(names) else best
 
@@ -268,5 +270,5 @@ def _group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
     group, num_groups = _rank(key)
     first, order = group_first(group, num_groups).sort()
     position = torch.empty_like(order)
-    position[order] = torch.arange(num_groups, device=key.device)
+    position[order] = torch.arange(num_groups, dtype=torch.int64, device=key.device)
     return position[group], first

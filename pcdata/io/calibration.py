@@ -158,7 +158,7 @@ class Calibration:
             if frame not in self.frames:
                 hint = near_matches(frame, self.frames) or f"; known: {', '.join(self.frames) or 'none'}"
                 raise FrameError(f"Calibration: no frame {frame!r}{hint}")
-        reached = {from_: torch.eye(4, dtype=torch.float64)}
+        reached = {from_: torch.eye(4, dtype=torch.float64, device="cpu")}
         waiting = deque([from_])
         while waiting and to not in reached:
             frame = waiting.popleft()

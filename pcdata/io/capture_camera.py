@@ -142,7 +142,7 @@ def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
         if len(values) != 16:
             short = "; the last row 0 0 0 1 is missing" if len(values) == 12 else ""
             raise CaptureError(f"{where}: a pose must be 4x4, sixteen numbers row by row, got {len(values)}{short}")
-        pose = torch.tensor(values, dtype=torch.float64).reshape(4, 4)
+        pose = torch.tensor(values, dtype=torch.float64, device="cpu").reshape(4, 4)
     rigid.check_rigid(where, pose)
     return pose
 

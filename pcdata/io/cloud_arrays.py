@@ -68,7 +68,7 @@ def to_cloud(
         source_index=torch.from_numpy(np.flatnonzero(keep)),
         extra=extra,
         kinds={name: _kind(name, value) for name, value in extra.items()},
-        viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32) * unit,
+        viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32, device="cpu") * unit,
         meta=(dict(meta or {}),),
     )
 

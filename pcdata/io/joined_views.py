@@ -45,7 +45,7 @@ def _join_cameras(cameras: Sequence[Camera]) -> Camera:
     lenses = [camera.distortion for camera in cameras]
     widest = max(0 if lens is None else lens.shape[1] for lens in lenses)
     padded = [
-        torch.zeros(camera.num_views, widest, dtype=torch.float64)
+        torch.zeros(camera.num_views, widest, dtype=torch.float64, device="cpu")
         if lens is None
         else torch.nn.functional.pad(lens, (0, widest - lens.shape[1]))
         for camera, lens in zip(cameras, lenses)

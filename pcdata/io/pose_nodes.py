@@ -112,7 +112,7 @@ def matrix_from_node(document: YamlDocument, node: yaml.Node, what: str) -> Tens
         document.fault(node, f"{what}: a pose has four rows of four numbers, got {len(rows)} rows")
         return None
     read = [numbers(document, row, f"{what}: row {index}", (4,)) for index, row in enumerate(rows)]
-    return None if None in read else torch.tensor(read, dtype=torch.float64)
+    return None if None in read else torch.tensor(read, dtype=torch.float64, device="cpu")
 
 
 def _pose_from_parts(document: YamlDocument, values: Mapping[str, yaml.Node], what: str) -> Tensor | None:
@@ -124,7 +124,7 @@ def _pose_from_parts(document: YamlDocument, values: Mapping[str, yaml.Node], wh
         if math.hypot(*vector) > 2 * math.pi + 1e-6:
             document.fault(values["rotation_vector"], f"{what}: rotation_vector is in radians; is this in degrees?")
             return None
-        rotation = rotation_from_vector(torch.tensor(vector, dtype=torch.float64))
+        rotation = rotation_from_vector(torch.tensor(vector, dtype=torch.float64, device="cpu"))
     else:
         quaternion = numbers(document, values["quaternion_xyzw"], f"{what}: quaternion_xyzw", (4,))
         if translation is None or quaternion is None:
@@ -133,8 +133,8 @@ def _pose_from_parts(document: YamlDocument, values: Mapping[str, yaml.Node], wh
             length = math.hypot(*quaternion)
             document.fault(values["quaternion_xyzw"], f"{what}: quaternion_xyzw must have length 1, has {length:.6g}")
             return None
-        rotation = rigid.rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64))
-    return rigid.from_rotation_translation(rotation, torch.tensor(translation, dtype=torch.float64))
+        rotation = rigid.rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64, device="cpu"))
+    return rigid.from_rotation_translation(rotation, torch.tensor(translation, dtype=torch.float64, device="cpu"))
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:

@@ -128,8 +128,8 @@ def _one_stream(bag: Bag, kind: str) -> _Stream:
     turn = [getattr(pose.rotation, axis) for axis in "xyzw"]
     shift = [getattr(pose.translation, axis) for axis in "xyz"]
     matrix = rigid.from_rotation_translation(
-        rigid.rotation_from_quaternion(torch.tensor(turn, dtype=torch.float64)),
-        torch.tensor(shift, dtype=torch.float64),
+        rigid.rotation_from_quaternion(torch.tensor(turn, dtype=torch.float64, device="cpu")),
+        torch.tensor(shift, dtype=torch.float64, device="cpu"),
     )
     return _Stream(found[0], _camera(kind, bag.message(f"{stream}/info/camera_info")), matrix, bag.times(found[0]))
 

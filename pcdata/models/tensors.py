@@ -56,7 +56,9 @@ def _category(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) 
     numbers = [entry.get("category") for entry in clouds.meta]
     if any(not isinstance(number, int) for number in numbers):
         raise ConfigError(f"{contract.name}: no category; make the preset with category=0 ... {tensor.width - 1}")
-    one_hot = torch.nn.functional.one_hot(torch.tensor(numbers, device=clouds.device), tensor.width).float()
+    one_hot = torch.nn.functional.one_hot(
+        torch.tensor(numbers, dtype=torch.int64, device=clouds.device), tensor.width
+    ).float()
     return one_hot[:, None] if tensor.layout == "B 1 C" else one_hot
 
 
@@ -98,7 +100,7 @@ def _voxel_grid(clouds: PointCloud, contract: ModelContract, tensor: InputTensor
     grid[batch, : values.shape[1], place] = voxel_mean(values, inverse, len(occupied))
     grid[batch, -1, place] = 1.0
     grid = grid.reshape(clouds.num_clouds, tensor.width, GRID_CELLS, GRID_CELLS, GRID_CELLS)
-    steps = torch.arange(GRID_CELLS, device=clouds.device) / GRID_CELLS
+    steps = torch.arange(GRID_CELLS, dtype=torch.float32, device=clouds.device) / GRID_CELLS
     grid[:, 6], grid[:, 7], grid[:, 8] = steps[:, None, None], steps[:, None], steps
     return grid
 

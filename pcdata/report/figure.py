@@ -101,12 +101,12 @@ def _draw_cloud(axis: Any, caption: str, cloud: PointCloud) -> None:
 def _view_axes(frame_id: str) -> torch.Tensor:
     """Return rows right, up, toward the viewer: obliquely from above for z-up frames, from the lens for cameras."""
     if frame_id.startswith("camera"):
-        return torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+        return torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64, device="cpu")
     turn, tilt = np.deg2rad(35.0), np.deg2rad(40.0)
     right = [np.cos(turn), np.sin(turn), 0.0]
     toward = [np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt), np.sin(tilt)]
     up = np.cross(toward, right)
-    return torch.tensor(np.array([right, up, toward]))
+    return torch.tensor(np.array([right, up, toward]), dtype=torch.float64, device="cpu")
 
 
 def _point_colors(cloud: PointCloud) -> np.ndarray:

@@ -41,7 +41,9 @@ def save_overlap_figure(
     from matplotlib.figure import Figure
 
     points, view = _points_of(capture)
-    center = torch.tensor([camera.center for camera in result.cameras], dtype=torch.float64).median(0).values
+    center = (
+        torch.tensor([camera.center for camera in result.cameras], dtype=torch.float64, device="cpu").median(0).values
+    )
     near = ((points - center).abs() < _REACH).all(1)
     points, view = points[near], view[near]
 
@@ -75,7 +77,7 @@ def _points_of(capture: DepthFrame | PointCloud) -> tuple[torch.Tensor, torch.Te
 def _draw(axis: Any, points: torch.Tensor, view: torch.Tensor, plane: tuple[int, int], what: str, names: Any) -> None:
     axis.set_title(what)
     # Interleaved, so that no camera covers the others.
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)).numpy()
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0), device="cpu").numpy()
     colors = np.array(_PALETTE)[view.numpy()[order] % len(_PALETTE)]
     size = float(np.clip(20_000 / max(len(points), 1), 0.3, 4.0))
     axis.scatter(points[order, plane[0]], points[order, plane[1]], c=colors, s=size, linewidths=0, rasterized=True)

@@ -54,8 +54,10 @@ class Camera:
         distortion: Sequence[float] | None = None,
     ) -> Camera:
         """Make one camera from focal lengths and principal point in pixels; ``size`` is (height, width)."""
-        intrinsics = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]], dtype=torch.float64)
-        coefficients = None if distortion is None else torch.tensor([list(distortion)], dtype=torch.float64)
+        intrinsics = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]], dtype=torch.float64, device="cpu")
+        coefficients = (
+            None if distortion is None else torch.tensor([list(distortion)], dtype=torch.float64, device="cpu")
+        )
         return cls(intrinsics=intrinsics, size=size, distortion=coefficients)
 
     @property
@@ -116,9 +118,9 @@ class Camera:
         """Rebuild the camera written by :meth:`to_dict`."""
         distortion = data.get("distortion")
         return cls(
-            intrinsics=torch.tensor(data["intrinsics"], dtype=torch.float64),
+            intrinsics=torch.tensor(data["intrinsics"], dtype=torch.float64, device="cpu"),
             size=(int(data["size"][0]), int(data["size"][1])),
-            distortion=None if distortion is None else torch.tensor(distortion, dtype=torch.float64),
+            distortion=None if distortion is None else torch.tensor(distortion, dtype=torch.float64, device="cpu"),
             is_window=bool(data.get("is_window", False)),
         )
 

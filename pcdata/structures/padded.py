@@ -53,7 +53,8 @@ def padded_clouds(clouds: Sequence[PointCloud], rows: Mapping[str, Tensor], coun
     """Put together fields (B, M, ...) and what the clouds know about themselves."""
     device, width = rows["points"].device, rows["points"].shape[1]
     return PaddedClouds(
-        mask=torch.arange(width, device=device) < torch.tensor(counts, device=device)[:, None],
+        mask=torch.arange(width, dtype=torch.int64, device=device)
+        < torch.tensor(counts, dtype=torch.int64, device=device)[:, None],
         frame_id=clouds[0].frame_id,
         unit=clouds[0].unit,
         source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),

@@ -66,10 +66,14 @@ class PointCloud:
         if given["points"] is None:
             raise DTypeError("PointCloud: points must be a float32 (N, 3) tensor, not None")
         if given["ptr"] is None:
-            fill(self, "ptr", torch.tensor([0, len(self.points)], device=self.points.device))
+            fill(self, "ptr", torch.tensor([0, len(self.points)], dtype=torch.int64, device=self.points.device))
         num_clouds = len(self.ptr) - 1
         if given["source_from_cloud"] is None:
-            fill(self, "source_from_cloud", torch.eye(4, dtype=torch.float64).repeat(num_clouds, 1, 1).to(self.device))
+            fill(
+                self,
+                "source_from_cloud",
+                torch.eye(4, dtype=torch.float64, device="cpu").repeat(num_clouds, 1, 1).to(self.device),
+            )
         fill(self, "source_frame", self.source_frame or self.frame_id)
         fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
         fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
@@ -184,7 +188,7 @@ class PointCloud:
             frame_id: the frame the cloud is in afterwards; None = the frame keeps its name.
             unit: the unit afterwards; None = unchanged.
         """
-        matrix = matrix.to(device=self.device, dtype=torch.float64)
+        matrix = matrix.to(dtype=torch.float64, device=self.device)
         if tuple(matrix.shape) != (self.num_clouds, 4, 4):
             raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
         moved: dict[str, Tensor] = {}
@@ -197,7 +201,7 @@ class PointCloud:
             moved[name] = value
         viewpoint = self.viewpoint
         if viewpoint is not None:
-            per_cloud = torch.arange(self.num_clouds + 1, device=self.device)
+            per_cloud = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=self.device)
             viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
         source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
         result = self._with_rows(
@@ -227,7 +231,7 @@ class PointCloud:
         return self._with_rows(
             rows,
             layout=joined_layout([self.layout], slice(b, b + 1)),
-            ptr=torch.tensor([0, stop - start], device=self.device),
+            ptr=torch.tensor([0, stop - start], dtype=torch.int64, device=self.device),
             viewpoint=None if self.viewpoint is None else self.viewpoint[b : b + 1],
             source_from_cloud=self.source_from_cloud[b : b + 1],
             frames={name: matrix[b : b + 1] for name, matrix in self.frames.items()},

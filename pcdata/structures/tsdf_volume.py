@@ -100,7 +100,7 @@ class TSDFVolume:
             found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
         for view, rows in zip(views, found, strict=True):
             if self.carve == "everywhere":
-                rows = torch.arange(len(self.blocks), device=frame.device)
+                rows = torch.arange(len(self.blocks), dtype=torch.int64, device=frame.device)
             tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
 

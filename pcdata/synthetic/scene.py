@@ -44,25 +44,26 @@ def place_objects(seed: int, num_objects: int) -> tuple[Shape, ...]:
         ConfigError: they do not fit on the table.
     """
     generator = generator_for(seed, 0, "synthetic/objects")
-    first_color = int(torch.randint(len(PALETTE), (), generator=generator))
+    first_color = int(torch.randint(len(PALETTE), (), generator=generator, device="cpu"))
     placed: list[Shape] = []
     circles: list[tuple[float, float, float]] = []  # x, y, radius
     kinds: list[int] = []
     for label in range(1, num_objects + 1):
-        kinds = kinds or torch.randperm(3, generator=generator).tolist()  # each kind once before any comes again
+        # Each kind once before any comes again.
+        kinds = kinds or torch.randperm(3, generator=generator, device="cpu").tolist()
         color = PALETTE[(first_color + label - 1) % len(PALETTE)]
         shape, footprint, rise = _random_shape(kinds.pop(), label, color, generator)
         x, y = _free_spot(circles, footprint, num_objects, generator)
         circles.append((x, y, footprint))
         pose = shape.base_from_object.clone()
-        pose[:3, 3] = torch.tensor([x, y, rise], dtype=torch.float64)
+        pose[:3, 3] = torch.tensor([x, y, rise], dtype=torch.float64, device="cpu")
         placed.append(replace(shape, base_from_object=pose))
     return tuple(placed)
 
 
 def _random_shape(kind: int, label: int, color: Color, generator: Generator) -> tuple[Shape, float, float]:
     """Draw a shape about the origin; also the radius of its footprint and how high its centre rests."""
-    a, b, c, yaw, flip = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
+    a, b, c, yaw, flip = torch.rand(5, generator=generator, dtype=torch.float64, device="cpu").tolist()
     turned = _turned((0.0, 0.0, 1.0), 2.0 * math.pi * yaw)
     if kind == 0:
         size = (0.06 + 0.08 * a, 0.05 + 0.06 * b, 0.04 + 0.10 * c)
@@ -87,7 +88,7 @@ def _free_spot(
     room_x, room_y = TABLE_SIZE[0] / 2 - radius - GAP, TABLE_SIZE[1] / 2 - radius - GAP
     for attempt in range(2000):
         spread = min(1.0, 0.45 + attempt / 200)
-        x, y = ((2.0 * torch.rand(2, generator=generator, dtype=torch.float64) - 1.0) * spread).tolist()
+        x, y = ((2.0 * torch.rand(2, generator=generator, dtype=torch.float64, device="cpu") - 1.0) * spread).tolist()
         x, y = x * room_x, y * room_y
         if all(math.hypot(x - other_x, y - other_y) >= radius + other + GAP for other_x, other_y, other in circles):
             return x, y
@@ -98,10 +99,12 @@ def _free_spot(
 
 
 def _at(x: float, y: float, z: float) -> Tensor:
-    position = torch.tensor([x, y, z], dtype=torch.float64)
-    return rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64), position)
+    position = torch.tensor([x, y, z], dtype=torch.float64, device="cpu")
+    return rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device="cpu"), position)
 
 
 def _turned(axis: tuple[float, float, float], angle: float) -> Tensor:
-    rotation = rigid.rotation_about_axis(torch.tensor(axis), torch.tensor(angle, dtype=torch.float64))
-    return rigid.from_rotation_translation(rotation, torch.zeros(3))
+    rotation = rigid.rotation_about_axis(
+        torch.tensor(axis, dtype=torch.float32, device="cpu"), torch.tensor(angle, dtype=torch.float64, device="cpu")
+    )
+    return rigid.from_rotation_translation(rotation, torch.zeros(3, dtype=torch.float64, device="cpu"))

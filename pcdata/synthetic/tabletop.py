@@ -150,7 +150,8 @@ def _rendered(
     camera: Camera, poses: Tensor, table: Box, floor: Box | None, objects: tuple[Shape, ...]
 ) -> tuple[TabletopTruth, Tensor]:
     shapes = [*objects, table, *([] if floor is None else [floor])]  # objects first: they win where they touch
-    labels_of = torch.tensor([*(shape.label for shape in shapes), -1], device=poses.device)  # index -1: nothing
+    names = [*(shape.label for shape in shapes), -1]  # index -1: nothing
+    labels_of = torch.tensor(names, dtype=torch.int64, device=poses.device)
     views: list[Hits] = []
     colors: list[Tensor] = []
     focals = camera.intrinsics[:, 0, 0].tolist()

@@ -24,12 +24,17 @@ def look_at(eye: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0), *, 
     The image is upright (world z points up in it), turned by ``roll`` radians about the view axis. Straight up or
     down, world y points up instead.
     """
-    position = torch.tensor(eye, dtype=torch.float64)
-    forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - position, dim=0)
-    up = torch.tensor([0.0, 0.0, 1.0] if float(forward[:2].norm()) > 1e-6 else [0.0, 1.0, 0.0], dtype=torch.float64)
+    position = torch.tensor(eye, dtype=torch.float64, device="cpu")
+    forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64, device="cpu") - position, dim=0)
+    up = torch.tensor(
+        [0.0, 0.0, 1.0] if float(forward[:2].norm()) > 1e-6 else [0.0, 1.0, 0.0], dtype=torch.float64, device="cpu"
+    )
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     upright = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-    turn = rigid.rotation_about_axis(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(roll))
+    turn = rigid.rotation_about_axis(
+        torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu"),
+        torch.tensor(roll, dtype=torch.float32, device="cpu"),
+    )
     return rigid.from_rotation_translation(upright @ turn, position)
 
 
@@ -52,7 +57,7 @@ def place_cameras(seed: int, num_views: int, size: tuple[int, int]) -> tuple[Cam
         reach = distance * math.cos(elevation)
         eye = (reach * math.cos(azimuth), reach * math.sin(azimuth), distance * math.sin(elevation))
         poses.append(look_at(eye, (0.02 * draw[6], 0.02 * draw[7], 0.03), roll=math.radians(2.0) * draw[6]))
-    return Camera(intrinsics=torch.tensor(intrinsics, dtype=torch.float64), size=size), torch.stack(poses)
+    return Camera(intrinsics=torch.tensor(intrinsics, dtype=torch.float64, device="cpu"), size=size), torch.stack(poses)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +81,9 @@ class Miscalibration:
         angles = torch.deg2rad(self._per_view("rotation_degrees", num_views))
         shifts = self._per_view("translation", num_views)
         streams = [generator_for(seed, view, "synthetic/miscalibration") for view in range(num_views)]
-        directions = torch.stack([torch.randn(2, 3, generator=one, dtype=torch.float64) for one in streams])
+        directions = torch.stack(
+            [torch.randn(2, 3, generator=one, dtype=torch.float64, device="cpu") for one in streams]
+        )
         axis, shift = torch.nn.functional.normalize(directions, dim=-1).unbind(1)
         error = rigid.from_rotation_translation(rigid.rotation_about_axis(axis, angles), shift * shifts[:, None])
         return world_from_camera @ error.to(world_from_camera.device)
@@ -86,9 +93,9 @@ class Miscalibration:
         amounts = list(value) if isinstance(value, Sequence) else [value] * num_views
         if len(amounts) != num_views:
             raise ConfigError(f"Miscalibration: {name} has {len(amounts)} amounts for {num_views} views; give one each")
-        return torch.tensor(amounts, dtype=torch.float64)
+        return torch.tensor(amounts, dtype=torch.float64, device="cpu")
 
 
 def _uniform(generator: Generator, count: int) -> list[float]:
     """Draw numbers in [-1, 1)."""
-    return (2.0 * torch.rand(count, generator=generator, dtype=torch.float64) - 1.0).tolist()
+    return (2.0 * torch.rand(count, generator=generator, dtype=torch.float64, device="cpu") - 1.0).tolist()

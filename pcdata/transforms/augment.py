@@ -41,9 +41,9 @@ class RandomRotation(SpatialTransform):
             quaternion = streams.normal(4)  # a normalised Gaussian quaternion is uniform over rotations
             rotation = rigid.rotation_from_quaternion(quaternion)
         else:
-            limit = torch.deg2rad(torch.tensor(self.degrees, dtype=torch.float64)).item()
+            limit = torch.deg2rad(torch.tensor(self.degrees, dtype=torch.float64, device="cpu")).item()
             angle = streams.uniform(-limit, limit)
-            axis = torch.nn.functional.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0)
+            axis = torch.nn.functional.normalize(torch.tensor(self.axis, dtype=torch.float64, device="cpu"), dim=0)
             rotation = rigid.rotation_about_axis(axis.expand(len(angle), 3), angle)
         return {"matrix": _about(self.about, data, rotation)}
 
@@ -58,9 +58,9 @@ class RandomTranslation(SpatialTransform):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one offset per cloud."""
-        limit = torch.tensor(self.max_offset, dtype=torch.float64)
+        limit = torch.tensor(self.max_offset, dtype=torch.float64, device="cpu")
         offset = streams.uniform(-1.0, 1.0, 3) * limit
-        return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64), offset)}
+        return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device="cpu"), offset)}
 
 
 class RandomScale(SpatialTransform):
@@ -97,8 +97,8 @@ class RandomFlip(SpatialTransform):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw the signs per cloud."""
-        flipped = streams.uniform(0.0, 1.0, 3) < torch.tensor(self.probability, dtype=torch.float64)
-        signs = torch.where(flipped, -1.0, 1.0).double()
+        flipped = streams.uniform(0.0, 1.0, 3) < torch.tensor(self.probability, dtype=torch.float64, device="cpu")
+        signs = torch.ones_like(flipped, dtype=torch.float64).masked_fill_(flipped, -1.0)
         return {"matrix": _about(self.about, data, torch.diag_embed(signs))}
 
 

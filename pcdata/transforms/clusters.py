@@ -81,7 +81,7 @@ class SplitObjects(Transform):
                 )
             for label in found:
                 rows = rows_of_mask(cloud.labels == label)
-                ptr = torch.tensor([0, len(rows)], device=cloud.device)
+                ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
                 parts.append(cloud.select(rows, ptr).with_meta([{"object": label}]))
         return PointCloud.cat(parts)
 

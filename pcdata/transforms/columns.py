@@ -41,7 +41,7 @@ class ShiftToOrigin(SpatialTransform):
         if self.anchor == "floor":
             origin[:, :2] = (lower + upper)[:, :2] / 2
         return {
-            "matrix": rigid.from_rotation_translation(torch.eye(3, device=data.device), -origin),
+            "matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device=data.device), -origin),
             "extent": upper - lower,
         }
 
@@ -90,7 +90,7 @@ class RandomColumn(Transform):
         generator = seeded(seed)
         fullest = 0
         for _ in range(_TRIALS if len(points) else 0):
-            center = points[int(torch.randint(len(points), (), generator=generator))]
+            center = points[int(torch.randint(len(points), (), generator=generator, device="cpu"))]
             mask = ((points[:, :2] - center[:2]).abs() <= self.size / 2).all(dim=1)
             count = int(mask.sum())
             if count >= self.min_points:

@@ -35,7 +35,9 @@ class CropWorkspace(SelectTransform):
             raise ConfigError(f"CropWorkspace: lower must be below upper on every axis, got {self.lower}, {self.upper}")
         if self.frame_from_box is not None:
             try:
-                rigid.check_rigid("CropWorkspace.frame_from_box", torch.tensor(self.frame_from_box))
+                rigid.check_rigid(
+                    "CropWorkspace.frame_from_box", torch.tensor(self.frame_from_box, dtype=torch.float64, device="cpu")
+                )
             except PcdataError as error:
                 raise ConfigError(str(error)) from error
 

@@ -47,7 +47,9 @@ class MaskDepth(Transform):
         if self.drop_labels:
             if data.labels is None:
                 raise CaptureError(f"MaskDepth: drop_labels is set but the capture {data.sample_id!r} has no labels")
-            unwanted = torch.isin(data.labels, torch.tensor(list(self.drop_labels), device=data.device))
+            unwanted = torch.isin(
+                data.labels, torch.tensor(list(self.drop_labels), dtype=torch.int64, device=data.device)
+            )
             mask = ~unwanted if mask is None else mask & ~unwanted
         if self.min_confidence is not None:
             if data.confidence is None:
@@ -112,7 +114,7 @@ class Deproject(Transform):
             extra=extra,
             kinds=dict.fromkeys(extra, Kind.MINIMUM),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
-            viewpoint=torch.zeros(data.num_views, 3, device=data.device),
+            viewpoint=torch.zeros(data.num_views, 3, dtype=torch.float32, device=data.device),
             frames=frames,
             meta=[_view_meta(data, view) for view in range(data.num_views)],
             history=(history,) * data.num_views,

@@ -55,8 +55,8 @@ class VoxelDownsample(Transform):
         """Reduce every field voxel by voxel."""
         means, ptr, inverse = voxel_downsample(data.points, data.ptr, voxel_size=params["voxel_size"])
         count = len(means)
-        first = torch.full((count,), data.num_points, device=data.device)
-        first.scatter_reduce_(0, inverse, torch.arange(data.num_points, device=data.device), "amin")
+        first = torch.full((count,), data.num_points, dtype=torch.int64, device=data.device)
+        first.scatter_reduce_(0, inverse, torch.arange(data.num_points, dtype=torch.int64, device=data.device), "amin")
         rows = {name: _reduce(value, data.kind(name), inverse, count) for name, value in data.fields().items()}
         rows["points"] = means
         if data.source_index is not None:
@@ -110,7 +110,7 @@ class _Sample(SelectTransform, abstract=True):
             return torch.cat([rows, rows.new_full((missing,), -1)])
         if self.if_short == "repeat" and self.is_random:
             # Another stream than the one that drew the sample itself.
-            duplicates = torch.randint(len(rows), (missing,), generator=seeded(seed ^ 1))
+            duplicates = torch.randint(len(rows), (missing,), generator=seeded(seed ^ 1), device="cpu")
             return torch.cat([rows, rows[duplicates.to(rows.device)]])
         return rows.repeat(-(-wanted // len(rows)))[:wanted]
 
@@ -123,7 +123,7 @@ class FarthestPointSample(_Sample):
 
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
         """Sample all clouds in one call."""
-        asked = torch.tensor(counts, device=cloud.device)
+        asked = torch.tensor(counts, dtype=torch.int64, device=cloud.device)
         index, ptr = farthest_point_sample(cloud.points, cloud.ptr, num_samples=asked)
         return list(torch.tensor_split(index, ptr[1:-1].cpu()))
 
@@ -155,9 +155,9 @@ class RandomSample(_Sample):
         rows = []
         for start, have, count, seed in zip(cloud.ptr.tolist(), cloud.counts.tolist(), counts, seeds, strict=False):
             if self.with_replacement and have != count:  # all that a short cloud has, once
-                drawn = torch.randint(have, (count,), generator=seeded(seed))
+                drawn = torch.randint(have, (count,), generator=seeded(seed), device="cpu")
             else:
-                drawn = torch.randperm(have, generator=seeded(seed))[:count]
+                drawn = torch.randperm(have, generator=seeded(seed), device="cpu")[:count]
             rows.append(start + drawn.to(cloud.device))
         return rows
 

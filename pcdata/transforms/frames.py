@@ -38,7 +38,7 @@ class ToFrame(SpatialTransform):
             raise ConfigError("ToFrame: give matrix and the frame it starts from (start) together, or neither")
         if self.matrix is not None:
             try:
-                rigid.check_rigid("ToFrame.matrix", torch.tensor(self.matrix, dtype=torch.float64))
+                rigid.check_rigid("ToFrame.matrix", torch.tensor(self.matrix, dtype=torch.float64, device="cpu"))
             except PcdataError as error:
                 raise ConfigError(str(error)) from error
 
@@ -53,9 +53,11 @@ class ToFrame(SpatialTransform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Find the matrix from the cloud's frame to the wanted one."""
         if self.matrix is not None:
-            return {"matrix": torch.tensor(self.matrix, dtype=torch.float64).repeat(data.num_clouds, 1, 1)}
+            return {
+                "matrix": torch.tensor(self.matrix, dtype=torch.float64, device="cpu").repeat(data.num_clouds, 1, 1)
+            }
         if self.frame == data.frame_id:
-            return {"matrix": torch.eye(4, dtype=torch.float64).repeat(data.num_clouds, 1, 1)}
+            return {"matrix": torch.eye(4, dtype=torch.float64, device="cpu").repeat(data.num_clouds, 1, 1)}
         for name in (self.frame, data.frame_id):
             if name not in data.frames:
                 raise FrameError(
@@ -96,7 +98,7 @@ class MergeViews(Transform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""
         starts = [b for b in range(data.num_clouds) if b == 0 or not _same_capture(data.meta[b - 1], data.meta[b])]
-        return {"group_ptr": torch.tensor([*starts, data.num_clouds])}
+        return {"group_ptr": torch.tensor([*starts, data.num_clouds], dtype=torch.int64, device="cpu")}
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Drop the boundaries between the views of a capture."""
@@ -112,7 +114,7 @@ class MergeViews(Transform):
             if any(entry.get(found) for entry in data.meta):
                 raise FrameError(f"MergeViews: {found} were found view by view; put {step} after MergeViews")
         device = data.device
-        view_of_cloud = torch.cat([torch.arange(int(size), device=device) for size in views])
+        view_of_cloud = torch.cat([torch.arange(int(size), dtype=torch.int64, device=device) for size in views])
         seen_from = data.viewpoint_per_point()
         merged = data.with_extra("view", view_of_cloud[cloud_of_rows(data.ptr)], Kind.INVARIANT)
         if seen_from is not None:

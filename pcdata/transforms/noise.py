@@ -29,9 +29,9 @@ class RandomJitter(Transform):
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Add the noise that belongs to the seeds."""
-        noise = torch.empty((data.num_points, 3), dtype=torch.float32)
+        noise = torch.empty((data.num_points, 3), dtype=torch.float32, device="cpu")
         for rows, seed in zip(noise.split(data.counts.tolist()), params["seed"].tolist(), strict=True):
-            torch.randn(rows.shape, generator=seeded(seed), out=rows)
+            torch.randn(rows.shape, generator=seeded(seed), out=rows, dtype=torch.float32, device="cpu")
         noise *= self.sigma
         if self.clip is not None:
             noise.clamp_(-self.clip, self.clip)
@@ -55,11 +55,11 @@ class RandomPointDropout(SelectTransform):
         """Draw the fraction, then which points."""
         assert streams is not None
         fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
-        keep = torch.zeros(cloud.num_points, dtype=torch.bool)
+        keep = torch.zeros(cloud.num_points, dtype=torch.bool, device="cpu")
         counts = cloud.counts.tolist()
         for rows, fraction, seed in zip(keep.split(counts), fractions, seeds, strict=True):
             num_kept = max(len(rows) - round(len(rows) * fraction), min(len(rows), 1))
-            rows.index_fill_(0, torch.randperm(len(rows), generator=seeded(seed))[:num_kept], True)
+            rows.index_fill_(0, torch.randperm(len(rows), generator=seeded(seed), device="cpu")[:num_kept], True)
         keep = keep.to(cloud.device)
         return keep, ptr_after_mask(keep, cloud.ptr)
 
@@ -85,8 +85,10 @@ class RandomColorJitter(Transform):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw four numbers per cloud."""
-        limits = torch.tensor([self.brightness, self.contrast, self.saturation, self.hue], dtype=torch.float64)
-        middle = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64)
+        limits = torch.tensor(
+            [self.brightness, self.contrast, self.saturation, self.hue], dtype=torch.float64, device="cpu"
+        )
+        middle = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64, device="cpu")
         return {"factors": middle + streams.uniform(-1.0, 1.0, 4) * limits}
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:

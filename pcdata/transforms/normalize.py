@@ -32,7 +32,7 @@ class NormalizeUnitSphere(SpatialTransform):
                     f"points, and has {int(data.counts[b])})"
                 )
         factors = (1.0 / radius)[:, None].expand(-1, 3)
-        shift = rigid.from_rotation_translation(torch.eye(3, device=data.device), -center)
+        shift = rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device=data.device), -center)
         return {"matrix": rigid.scaling(factors) @ shift}
 
 
@@ -63,7 +63,9 @@ class NormalizeWorkspace(SpatialTransform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """The same matrix for every cloud."""
         lower, upper = torch.tensor([self.lower, self.upper], dtype=torch.float64, device=data.device)
-        shift = rigid.from_rotation_translation(torch.eye(3, device=data.device), -(lower + upper) / 2)
+        shift = rigid.from_rotation_translation(
+            torch.eye(3, dtype=torch.float64, device=data.device), -(lower + upper) / 2
+        )
         matrix = rigid.scaling(2.0 / (upper - lower)) @ shift
         return {"matrix": matrix.repeat(data.num_clouds, 1, 1)}
 
@@ -78,4 +80,6 @@ class Center(SpatialTransform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Measure the mean of every cloud."""
         center = segment_mean(data.points, data.ptr)
-        return {"matrix": rigid.from_rotation_translation(torch.eye(3, device=data.device), -center)}
+        return {
+            "matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device=data.device), -center)
+        }

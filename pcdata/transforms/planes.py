@@ -83,7 +83,7 @@ class RemovePlane(SelectTransform):
                 "num_inliers": int(params["num_inliers"][b]),
             }
             if self.up is not None:
-                up = torch.tensor(self.up, dtype=torch.float64)
+                up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
                 found["tilt"] = float(rigid.angle_between(params["planes"][b, :3].cpu(), up))
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
         return super().apply(data, params).with_meta(entries)
@@ -95,7 +95,7 @@ def planes_in_cloud(cloud: PointCloud, b: int = 0) -> Tensor:
     A point p is on the plane where ``normal @ p + offset == 0``.
     """
     stored = [[*plane["normal"], plane["offset"]] for plane in cloud.meta[b].get("planes", [])]
-    planes = torch.tensor(stored, dtype=torch.float64).reshape(-1, 4)
+    planes = torch.tensor(stored, dtype=torch.float64, device="cpu").reshape(-1, 4)
     matrix = cloud.source_from_cloud[b].cpu()
     return _map_planes(planes, matrix.expand(len(planes), 4, 4))
 

@@ -30,7 +30,7 @@ class VoxelSample(SelectTransform):
         voxel = _numbered(torch.cat([owner[:, None], voxel_cells(cloud.points, self.voxel_size)], dim=1))
         rank = self.ranks(cloud, streams)
         count = int(voxel.max()) + 1 if len(voxel) else 0
-        best = torch.full((count,), cloud.num_points, device=cloud.device)
+        best = torch.full((count,), cloud.num_points, dtype=torch.int64, device=cloud.device)
         best.scatter_reduce_(0, voxel, rank, "amin")
         mask = rank == best[voxel]
         counts = torch.bincount(owner[mask], minlength=cloud.num_clouds)
@@ -38,7 +38,7 @@ class VoxelSample(SelectTransform):
 
     def ranks(self, cloud: PointCloud, streams: Streams | None) -> Tensor:
         """(N,) int64: of the points in one voxel the lowest stays; distinct within a cloud."""
-        return torch.arange(cloud.num_points, device=cloud.device)
+        return torch.arange(cloud.num_points, dtype=torch.int64, device=cloud.device)
 
 
 class RandomVoxelSample(VoxelSample):
@@ -51,7 +51,8 @@ class RandomVoxelSample(VoxelSample):
         assert streams is not None
         counts = cloud.counts.tolist()
         orders = [
-            torch.randperm(count, generator=seeded(seed)) for count, seed in zip(counts, streams.seeds().tolist())
+            torch.randperm(count, generator=seeded(seed), device="cpu")
+            for count, seed in zip(counts, streams.seeds().tolist())
         ]
         return torch.cat(orders).to(cloud.device)
 

@@ -28,7 +28,9 @@ def cloud_checks(cloud: PointCloud, limits: Limits) -> list[Check]:
         depth = cloud.points[:, 2]
         checks.append(_behind(float((depth < 0).float().mean()) if len(depth) else 0.0))
         return checks + reading_checks(depth.abs(), limits)
-    viewpoint = torch.zeros(3, device=cloud.device) if cloud.viewpoint is None else cloud.viewpoint[0]
+    viewpoint = (
+        torch.zeros(3, dtype=torch.float32, device=cloud.device) if cloud.viewpoint is None else cloud.viewpoint[0]
+    )
     return checks + reading_checks((cloud.points - viewpoint).norm(dim=1), limits)
 
 

@@ -91,7 +91,7 @@ def _far_off(view: int, joint: OverlapResult, rest: OverlapResult) -> OverlapRes
         shift=math.inf,
         shift_vector=(math.inf,) * 3,
         rotation_degrees=math.inf,
-        correction=torch.eye(4).tolist(),
+        correction=torch.eye(4, dtype=torch.float64, device="cpu").tolist(),
         unmeasurable=(),
         verdict="fail",
     )

@@ -16,7 +16,7 @@ Reading = Callable[[Tensor], Tensor]  # (4, 4) pose as given -> (4, 4) world_fro
 
 LEAST_COMPARED = 200  # readings that views must share before they can be said to agree or not
 AGREE = 0.5  # of the readings compared: under a wrong pose few agree, and those by chance
-_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
 _LEAST_GAIN = 0.1  # by which another convention must agree better
 _LEAST_MOTION = (0.02, 0.035)  # metres, radians: closer cameras agree under every convention
 

@@ -17,7 +17,7 @@ from pcdata.rng import seeded
 from pcdata.structures import METRE, NORMALIZED, DepthFrame, PointCloud
 from pcdata.transforms.base import field_names
 from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
-from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, tree
+from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, torch_defaults, tree
 from tests.transforms.examples import ALL, EXAMPLES, NAMES, Example
 
 COUNTS = (120, 90, 150)
@@ -420,6 +420,46 @@ def test_it_runs_in_inference_mode(example):
     with torch.inference_mode():
         assert not differences(expected, tree(run(example, data)))
         assert not differences(expected, tree(run(example, example.make(COUNTS))))
+
+
+@each_example
+@pytest.mark.parametrize("defaults", [{"dtype": torch.float64}, {"dtype": torch.float16}, {"device": "meta"}], ids=str)
+def test_torchs_defaults_change_no_bit(example, defaults):
+    data = example.make(COUNTS)
+    expected = tree(run(example, data, 3))
+    with torch_defaults(**defaults):
+        again = dataclasses.replace(example, transform=copy.copy(example.transform))
+        if not list(example.transform.children()):
+            again = dataclasses.replace(example, transform=type(example.transform)(**example.transform.config_fields()))
+        found = tree(run(again, data, 3))
+    assert not differences(expected, found)
+
+
+def strided(value: torch.Tensor) -> torch.Tensor:
+    """The same values column by column, as (K^-1 @ pixels).T and Fortran arrays are."""
+    return value.transpose(-1, -2).contiguous().transpose(-1, -2) if value.ndim > 1 else value.repeat(2, 1).T[:, 0]
+
+
+@each_example
+def test_the_order_of_the_memory_changes_no_bit(example):
+    data = example.make(COUNTS)
+    if isinstance(data, PointCloud):
+        same = data.with_fields(**{name: strided(value) for name, value in data.fields().items()})
+        same = dataclasses.replace(same, layout=data.layout)
+        assert not same.points.is_contiguous()
+    else:
+        same = dataclasses.replace(
+            data, depth=strided(data.depth), labels=strided(data.labels) if data.labels is not None else None
+        )
+    assert not differences(tree(run(example, data, 3)), tree(run(example, same, 3)))
+
+
+@each_on_clouds
+def test_points_that_require_a_gradient_come_to_the_same_result(example):
+    data = example.make(COUNTS)
+    leaf = data.points.clone().requires_grad_()
+    asked = dataclasses.replace(data.with_fields(points=leaf), layout=data.layout)
+    assert not differences(tree(run(example, data, 3)), tree(run(example, asked, 3)), tolerance=2e-6)
 
 
 @each_example

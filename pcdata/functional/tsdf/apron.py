@@ -33,7 +33,9 @@ class Neighbourhood:
     def of(blocks: VoxelBlocks, keys: Tensor) -> Neighbourhood:
         """Look up the neighbours of the blocks with these keys."""
         block = unpack_keys(keys)
-        steps = torch.tensor([(x, y, z) for z, y, x in itertools.product((-1, 0, 1), repeat=3)], device=keys.device)
+        steps = torch.tensor(
+            [(x, y, z) for z, y, x in itertools.product((-1, 0, 1), repeat=3)], dtype=torch.int64, device=keys.device
+        )
         around = (block[:, None] + steps).reshape(-1, 3)
         exists = (around.abs() < BLOCKS_PER_SIDE).all(1)
         rows = blocks.find(pack_keys(torch.where(exists[:, None], around, 0)))
@@ -54,5 +56,5 @@ class Neighbourhood:
 
 def own_places(device: torch.device) -> Tensor:
     """Return (512,) int64: the places of a block's own voxels in a flattened plane with its margin."""
-    z, y, x = torch.meshgrid(*[torch.arange(EDGE, device=device) + BEFORE] * 3, indexing="ij")
+    z, y, x = torch.meshgrid(*[torch.arange(EDGE, dtype=torch.int64, device=device) + BEFORE] * 3, indexing="ij")
     return ((z * SIDE + y) * SIDE + x).flatten()

@@ -146,7 +146,9 @@ class VoxelBlocks:
         known = len(known_keys)
         if known < self._count:
             keys, order = self.keys[known:].sort()
-            places = torch.searchsorted(known_keys, keys) + torch.arange(len(keys), device=self.device)
+            places = torch.searchsorted(known_keys, keys) + torch.arange(
+                len(keys), dtype=torch.int64, device=self.device
+            )
             is_known = torch.ones(self._count, dtype=torch.bool, device=self.device)
             is_known[places] = False
             merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)

@@ -72,5 +72,5 @@ def unpack_keys(keys: Tensor) -> Tensor:
 
 def voxel_offsets(device: torch.device | str = "cpu") -> Tensor:
     """Return (512, 3) int64: x, y, z of every voxel within its block."""
-    number = torch.arange(VOXELS, device=device)
+    number = torch.arange(VOXELS, dtype=torch.int64, device=device)
     return torch.stack([number % EDGE, number // EDGE % EDGE, number // EDGE**2], dim=-1)

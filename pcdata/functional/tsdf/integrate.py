@@ -59,7 +59,7 @@ def camera_in_blocks(view: FusionView, grid: VoxelGrid) -> tuple[Tensor, Tensor,
 
 def band(grid: VoxelGrid) -> Tensor:
     """Return the offsets along z at which blocks are looked up, float32 metres."""
-    return torch.tensor(grid.band, dtype=torch.float32)
+    return torch.tensor(grid.band, dtype=torch.float32, device="cpu")
 
 
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
@@ -77,7 +77,7 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
 
 def _update(chunk: Chunk, rows: Tensor, keys: Tensor, view: FusionView, grid: VoxelGrid, carve: bool) -> None:
     pixel, distance = _distances(block_corners(keys, view, grid), view, grid)
-    scaled = distance * torch.tensor(TSDF_SCALE / grid.truncation, dtype=torch.float32)
+    scaled = distance * torch.tensor(TSDF_SCALE / grid.truncation, dtype=torch.float32, device="cpu")
     near = scaled.abs() <= TSDF_SCALE
     weight = chunk.weight[rows]
     seen = near | ((scaled > TSDF_SCALE) & (weight > 0)) if carve else near
@@ -136,9 +136,9 @@ def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tens
     ahead = z > 0
     if view.distortion is not None:
         radius = u * u + v * v
-        ahead &= radius < torch.tensor(view.fold, dtype=torch.float32)
+        ahead &= radius < torch.tensor(view.fold, dtype=torch.float32, device="cpu")
         x, y = bend(u, v, radius, view.distortion.float())
-        fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32).unbind()
+        fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32, device="cpu").unbind()
         u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
     inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     pixel = torch.where(inside, v, 0.0).long() * width + torch.where(inside, u, 0.0).long()

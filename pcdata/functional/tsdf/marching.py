@@ -92,10 +92,12 @@ def find_triangles(
 def tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return first triangle of each case (257,), and per corner of a triangle (K, 3) its edge's start and axis."""
     table = triangle_table()
-    counts = torch.tensor([0, *(len(triangles) for triangles in table)]).cumsum(0)
+    counts = torch.tensor([0, *(len(triangles) for triangles in table)], dtype=torch.int64, device="cpu").cumsum(0)
     flat = [triangle for triangles in table for triangle in triangles]
-    start = torch.tensor([[a for a, _ in triangle] for triangle in flat])
-    axis = torch.tensor([[(b - a).bit_length() - 1 for a, b in triangle] for triangle in flat])
+    start = torch.tensor([[a for a, _ in triangle] for triangle in flat], dtype=torch.int64, device="cpu")
+    axis = torch.tensor(
+        [[(b - a).bit_length() - 1 for a, b in triangle] for triangle in flat], dtype=torch.int64, device="cpu"
+    )
     return counts.to(device), start.to(device), axis.to(device)
 
 
@@ -117,7 +119,7 @@ def _triangles_of(
     block, voxel = per_cube.nonzero(as_tuple=True)
     repeat = per_cube[block, voxel]
     first = torch.repeat_interleave(counts[case[block, voxel]] - (repeat.cumsum(0) - repeat), repeat)
-    row = first + torch.arange(len(first), device=first.device)
+    row = first + torch.arange(len(first), dtype=torch.int64, device=first.device)
     block, voxel = torch.repeat_interleave(block, repeat), torch.repeat_interleave(voxel, repeat)
     return _edge_numbers(some, keys, block, voxel, starts[row], axes[row])
 
@@ -131,6 +133,6 @@ def _edge_numbers(
     around = 13 + step[0] + 3 * step[1] + 9 * step[2]
     row = some.rows[block[:, None], around]
     place_of_row = torch.empty(len(keys), dtype=torch.int64, device=keys.device)
-    place_of_row[some.blocks.sorted_rows] = torch.arange(len(keys), device=keys.device)
+    place_of_row[some.blocks.sorted_rows] = torch.arange(len(keys), dtype=torch.int64, device=keys.device)
     inner = (at[0] % EDGE) + EDGE * (at[1] % EDGE) + EDGE * EDGE * (at[2] % EDGE)
     return 3 * (VOXELS * place_of_row[row] + inner) + axis

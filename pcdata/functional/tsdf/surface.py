@@ -77,7 +77,7 @@ def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid, min_weight: 
     crosses = ((here < 0) != (there < 0)) & ((here - there).abs() <= MAX_STEP)  # false with a NaN
     block, voxel, axis = crosses.nonzero(as_tuple=True)
     start = own[voxel]
-    end = start + torch.tensor(_STRIDE, device=tsdf.device)[axis]
+    end = start + torch.tensor(_STRIDE, dtype=torch.int64, device=tsdf.device)[axis]
     least = torch.minimum(weight[block, start], weight[block, end])
     kept = least >= min_weight
     block, voxel, axis, start, end, least = (column[kept] for column in (block, voxel, axis, start, end, least))
@@ -85,7 +85,7 @@ def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid, min_weight: 
     fraction = before / (before - after)
     offset = torch.stack([voxel % EDGE, voxel // EDGE % EDGE, voxel // EDGE**2], dim=-1)
     place = (some.corner[block] + offset).double()
-    place[torch.arange(len(axis)), axis] += fraction.double()
+    place[torch.arange(len(axis), dtype=torch.int64, device="cpu"), axis] += fraction.double()
     nearer = torch.where(fraction <= 0.5, start, end)
     return Crossings(
         edge=3 * (VOXELS * (first + block) + voxel) + axis if edges else axis[:0],
@@ -153,7 +153,7 @@ def _unit(gradient: Tensor, axis: Tensor, step: Tensor) -> Tensor:
         (gradient[:, 0] * gradient[:, 0] + gradient[:, 1] * gradient[:, 1]) + gradient[:, 2] * gradient[:, 2]
     ).sqrt()
     along = torch.zeros_like(gradient)
-    along[torch.arange(len(axis)), axis] = step.sign()
+    along[torch.arange(len(axis), dtype=torch.int64, device="cpu"), axis] = step.sign()
     return torch.where((length > 0)[:, None], gradient / length[:, None], along)
 
 
@@ -173,7 +173,7 @@ def _colors(some: Neighbourhood, block: Tensor, start: Tensor, end: Tensor, frac
 
 
 def _none(blocks: VoxelBlocks) -> Crossings:
-    empty = torch.empty(0, device=blocks.device)
+    empty = torch.empty(0, dtype=torch.float32, device=blocks.device)
     return Crossings(
         edge=empty.long(),
         points=empty.reshape(0, 3),
