@@ -17,7 +17,7 @@ ROOT = Path(pcdata.__file__).parent
 LAYERS = [
     {"errors"},
     {"checks", "lengths", "rng", "extras"},
-    {"dispatch"},
+    {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
@@ -38,6 +38,7 @@ ALLOWED_SIBLINGS = {("cli", "demo"), ("__main__", "cli")}
 OUTSIDE = {
     "errors": set(),
     "extras": set(),
+    "files": {"numpy"},
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},
     "lengths": {"numpy"},

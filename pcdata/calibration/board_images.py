@@ -12,7 +12,7 @@ import numpy as np
 from pcdata.calibration.boards import GreyImage
 from pcdata.errors import CaptureError
 from pcdata.extras import require
-from pcdata.io.files import read_bytes
+from pcdata.files import read_bytes
 from pcdata.io.source import absolute, visible_files
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

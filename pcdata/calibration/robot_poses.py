@@ -16,9 +16,9 @@ import yaml
 from torch import Tensor
 
 from pcdata.errors import CalibrationError, ShapeError, near_matches
+from pcdata.files import read_text
 from pcdata.functional import rigid
 from pcdata.io.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
-from pcdata.io.files import read_text
 from pcdata.io.pose_nodes import POSE_KEYS, known_entries, matrix_from_node, pose_from_entries
 from pcdata.yaml_nodes import YamlDocument
 

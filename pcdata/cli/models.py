@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from pcdata.io.files import replacing
+    from pcdata.files import replacing
     from pcdata.io.manifest import FILE_NAME
     from pcdata.report.validation import validation_text
     from pcdata.validation import Verdict

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.io.files import existing_file
+from pcdata.files import existing_file
 
 ARRAYS = ("samples", "state", "action")
 _MAX_BYTES = 1 << 32

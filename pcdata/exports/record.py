@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CacheError
-from pcdata.io.files import replacing
+from pcdata.files import replacing
 from pcdata.io.record import parse_info
 
 FILE_NAME = "pcdata_export.json"

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CalibrationError, FrameError, PoseError, near_matches
+from pcdata.files import read_text, replacing
 from pcdata.functional import rigid
-from pcdata.io.files import read_text, replacing
 from pcdata.structures import Camera
 
 # An inverse by transposition is off by as much as the rotation is from orthonormal: 0.1 mm at 1 m.

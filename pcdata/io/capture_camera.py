@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, PoseError, near_matches
+from pcdata.files import map_npy, read_text, replacing
 from pcdata.functional import rigid
-from pcdata.io.files import map_npy, read_text, replacing
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera
 

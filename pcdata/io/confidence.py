@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError
-from pcdata.io.files import replacing
+from pcdata.files import replacing
 from pcdata.io.images import read_labels
 from pcdata.structures import Confidence
 

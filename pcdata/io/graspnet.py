@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
+from pcdata.files import existing_file
 from pcdata.functional import rigid
-from pcdata.io.files import existing_file
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
 from pcdata.io.source import Source, absolute, sequence_positions

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.checks import check_tensors
 from pcdata.errors import CaptureError, DTypeError
-from pcdata.io.files import replacing
+from pcdata.files import replacing
 from pcdata.io.images import check_suffix, metres_of_value
 from pcdata.lengths import check_metres_per_unit
 

@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.errors import CaptureError, NoReadingError, UnitError
-from pcdata.io.files import existing_file, map_npy
+from pcdata.files import existing_file, map_npy
 from pcdata.lengths import check_metres_per_unit
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError, add_note, near_matches
+from pcdata.files import read_bytes, replacing
 from pcdata.io import lzf
 from pcdata.io.cloud_arrays import CloudArrays, from_cloud, narrowest_int, to_cloud
-from pcdata.io.files import read_bytes, replacing
 from pcdata.io.numbers_as_text import format_rows, parse_words
 from pcdata.io.pcd_header import ENCODINGS, PADDING, Field, PcdHeader, parse_header
 from pcdata.structures import PointCloud

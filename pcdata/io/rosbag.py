@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError, PcdataError, add_note
 from pcdata.extras import require
-from pcdata.io.files import existing_file
+from pcdata.files import existing_file
 from pcdata.io.images import MAX_PIXELS
 
 MAGIC = b"#ROSBAG V2.0\n"

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pcdata.errors import CacheError, DTypeError, PcdataError, near_matches
+from pcdata.files import map_npy
 from pcdata.io.claimed_sizes import checked_dataset, checked_members, read_npy
-from pcdata.io.files import map_npy
 from pcdata.io.zarr_arrays import zarr_arrays
 
 _MAX_FILE_BYTES = 1 << 44  # what is read of a file is bounded by what it claims, see _check_packing

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pcdata.errors import CaptureError
-from pcdata.io.files import read_text
+from pcdata.files import read_text
 from pcdata.io.source import check_partners
 
 _LONGEST = 1e12  # seconds, 30,000 years: more are microseconds or nanoseconds
