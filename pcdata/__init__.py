@@ -78,6 +78,7 @@ _HOMES = {
         "open_source",
         "read_pcd",
         "read_ply",
+        "refused_captures",
         "write_pcd",
         "write_ply",
     ],

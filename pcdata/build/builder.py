@@ -20,7 +20,7 @@ from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add
 from pcdata.io.manifest import FILE_NAME, Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
 from pcdata.io.record import record_from_cloud
-from pcdata.io.source import CaptureSource, checked_ids
+from pcdata.io.source import REFUSALS, CaptureSource, checked_ids, reason_of, skipped_of
 from pcdata.io.stores import STORES
 from pcdata.io.whole_folders import complete_or_nothing
 from pcdata.structures import DepthFrame, PointCloud
@@ -47,6 +47,7 @@ class BuildReport:
 
     folder: Path
     samples: list[BuiltSample] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
 
 
 def build_dataset(
@@ -55,6 +56,7 @@ def build_dataset(
     folder: str | Path,
     *,
     overwrite: bool = False,
+    skip_refused: bool | None = None,
     progress: Progress | None = None,
 ) -> BuildReport:
     """Store every capture of a source as the pipeline's deterministic steps leave it.
@@ -67,6 +69,8 @@ def build_dataset(
         source: the captures; see :func:`pcdata.open_source`.
         folder: where the dataset goes.
         overwrite: replace a dataset that is there already; anything else is never replaced.
+        skip_refused: leave out captures that cannot be read or that a step refuses, and go on; the report and the
+            manifest tell which and why. None = as the configuration says, where the default is to stop at the first.
         progress: called after every capture.
 
     Raises:
@@ -78,15 +82,17 @@ def build_dataset(
     # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
     folder = Path(os.path.realpath(Path(folder).expanduser()))
     _check_target(folder, overwrite)
-    report = BuildReport(folder)
+    report = BuildReport(folder, skipped=skipped_of(source))
+    skip_refused = config.source.skip_refused if skip_refused is None else skip_refused
     with complete_or_nothing(folder) as partial:
-        samples = _write_samples(config, source, partial, report, progress)
+        samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
             compression=config.output.compression,
             fingerprint=config.pipeline.fingerprint(),
             pipeline=config.pipeline.to_config(),
             samples=samples,
+            skipped=report.skipped,
             versions={
                 "pcdata": pcdata.__version__,
                 "torch": str(torch.__version__),
@@ -104,7 +110,12 @@ def build_dataset(
 
 
 def _write_samples(
-    config: BuildConfig, source: CaptureSource, partial: Path, report: BuildReport, progress: Progress | None
+    config: BuildConfig,
+    source: CaptureSource,
+    partial: Path,
+    report: BuildReport,
+    skip_refused: bool,
+    progress: Progress | None,
 ) -> list[Sample]:
     store = STORES[config.output.format](partial, config.output.compression)
     prefix = config.pipeline.deterministic_prefix()
@@ -114,8 +125,15 @@ def _write_samples(
         for position, sample_id in enumerate(ids):
             started = time.perf_counter()
             try:
-                capture = source.load(sample_id)
-                cloud = _with_sample_id(_checked_cloud(prefix(capture)), sample_id)
+                try:
+                    capture = source.load(sample_id)
+                    made = prefix(capture)
+                except REFUSALS as error:
+                    if not skip_refused:
+                        raise
+                    report.skipped[sample_id] = reason_of(error)
+                    continue
+                cloud = _with_sample_id(_checked_cloud(made), sample_id)
                 record = record_from_cloud(cloud)
                 key = key_of(sample_id)
                 store.write(key, record)
@@ -130,6 +148,11 @@ def _write_samples(
                 progress(position + 1, len(ids), sample_id)
     finally:
         store.close()
+    if not written:
+        first, reason = next(iter(report.skipped.items()))
+        raise CaptureError(
+            f"build_dataset: all {len(ids)} captures were refused, so there is nothing to store; {first!r}: {reason}"
+        )
     return written
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,6 +10,7 @@ import yaml
 from annotated_types import Ge
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from pcdata.build.source_section import SourceSettings, source_settings
 from pcdata.errors import near_matches
 from pcdata.io.stores import COMPRESSIONS, Compression, Format
 from pcdata.transforms.config import read_config
@@ -48,13 +49,17 @@ class BuildConfig:
     pipeline: Pipeline
     output: Output
     loader: Loader
+    source: SourceSettings = field(default_factory=SourceSettings)
 
 
 _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
 def load_config(path: str | Path) -> BuildConfig:
-    """Read a YAML file with the sections sensor, depth, cloud, augment, output and loader, each optional.
+    """Read a YAML file with the sections source, sensor, depth, cloud, augment, output and loader, each optional.
+
+    ``source`` says where the captures are, how they are read and which are left out; paths in it start from the folder
+    of the file.
 
     ``sensor`` is a name that ``pcdata profiles`` lists, or ``{name: ..., depth: metres}``: what the steps' values
     ``sensor`` are computed from.
@@ -62,14 +67,14 @@ def load_config(path: str | Path) -> BuildConfig:
     Raises:
         ConfigError: every fault, as ``file:line:column: what``.
     """
-    return config_from_yaml(read_config(path), name=str(path))
+    return config_from_yaml(read_config(path), name=str(path), folder=Path(path).parent)
 
 
-def config_from_yaml(text: str, *, name: str = "<yaml>") -> BuildConfig:
-    """Parse the text of a configuration; see :func:`load_config`."""
+def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = None) -> BuildConfig:
+    """Parse the text of a configuration; see :func:`load_config`. Relative paths in it start from ``folder``."""
     document = YamlDocument(text, name)
     entries = document.mapping(document.root, "a configuration")
-    known = [SENSOR, *SECTIONS, *_SETTINGS]
+    known = ["source", SENSOR, *SECTIONS, *_SETTINGS]
     for section, (key, _) in entries.items():
         if section not in known:
             document.fault(key, f"unknown section {section!r}{near_matches(section, known) or f'; known: {known}'}")
@@ -84,8 +89,9 @@ def config_from_yaml(text: str, *, name: str = "<yaml>") -> BuildConfig:
             node_at(entries["output"][1], ["compression"]),
             f"output.compression: format {output.format} knows {known_here}, not {output.compression}",
         )
+    source = source_settings(document, entries["source"][1] if "source" in entries else None, folder)
     pipeline = pipeline_from_document(document, entries)
-    return BuildConfig(pipeline, settings["output"], settings["loader"])
+    return BuildConfig(pipeline, settings["output"], settings["loader"], source)
 
 
 def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | None) -> Any:

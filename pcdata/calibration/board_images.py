@@ -13,7 +13,7 @@ from pcdata.calibration.boards import GreyImage
 from pcdata.errors import CaptureError
 from pcdata.extras import require
 from pcdata.files import read_bytes
-from pcdata.io.source import absolute, visible_files
+from pcdata.io.listing import absolute, visible_files
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _MAX_BYTES = 1 << 28
@@ -56,4 +56,4 @@ def read_grey(path: Path) -> GreyImage:
 def _image_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    return [file for file in visible_files(path) if file.suffix.lower() in _SUFFIXES]
+    return visible_files(path, lambda name: Path(name).suffix.lower() in _SUFFIXES)

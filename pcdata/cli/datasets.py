@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, skip_list
 from pcdata.cli.progress import Progress
 
 
@@ -20,9 +20,8 @@ def add_to(commands: Any) -> None:
     build.add_argument("config", metavar="CONFIG", help="YAML file; see configs/ for examples")
     build.add_argument(
         "--source",
-        required=True,
         metavar="PATH",
-        help="folder of captures, or of several cameras' folders, or one cloud file",
+        help="folder of captures, or of several cameras' folders, or one cloud file (default: that of CONFIG)",
     )
     build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
     add_capture_options(build)
@@ -55,16 +54,29 @@ def _build(arguments: argparse.Namespace) -> None:
     from pcdata.build import build_dataset, load_config
 
     config = load_config(arguments.config)
-    source = open_captures(arguments.source, arguments, limit=arguments.limit)
+    source = config.source.open(
+        arguments.source,
+        kind=arguments.kind,
+        limit=arguments.limit,
+        skip=skip_list(arguments),
+        **given_options(arguments),
+    )
     with Progress("build") as progress:
-        report = build_dataset(config, source, arguments.out, overwrite=arguments.overwrite, progress=progress)
+        report = build_dataset(
+            config,
+            source,
+            arguments.out,
+            overwrite=arguments.overwrite,
+            skip_refused=arguments.skip_refused,
+            progress=progress,
+        )
     print(_build_table(report))
     print(f"\ndataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
 
 
 def _inspect(arguments: argparse.Namespace) -> None:
+    from pcdata.io.listing import absolute
     from pcdata.io.manifest import FILE_NAME
-    from pcdata.io.source import absolute
     from pcdata.report.inspection import capture_text, dataset_text
 
     if (absolute(arguments.path) / FILE_NAME).is_file():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pcdata.cli.options import add_capture_options, name_and_value, open_captures, positive
+from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
 from pcdata.cli.progress import Progress
 
 
@@ -49,8 +49,8 @@ def _export(arguments: argparse.Namespace) -> None:
     source = arguments.path
     if not is_built(source):
         source = open_captures(source, arguments, limit=arguments.limit)
-    elif given := [name for name in _CAPTURE_OPTIONS if getattr(arguments, name) is not None]:
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+    elif given := given_flags(arguments, "--limit"):
+        flags = ", ".join(given)
         raise ConfigError(f"export: {source} is a built dataset, which {flags} cannot change; leave that out")
     with Progress("export") as progress:
         report = export_dataset(
@@ -66,6 +66,3 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"export  {report.folder}  ({report.target}: {report.written} samples written{kept})")
     for note in report.notes:
         print(f"note    {note}")
-
-
-_CAPTURE_OPTIONS = ("kind", "metres_per_unit", "calibration", "camera", "frame", "limit")

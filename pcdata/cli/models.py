@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import Any
 
-from pcdata.cli.options import name_and_value, positive
+from pcdata.cli.options import name_and_value, positive, value_of
 
 
 def add_to(commands: Any) -> None:
@@ -66,18 +66,8 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any]:
     for name, value in arguments.set:
         if name in choices:
             raise ConfigError(f"check: {name} is given twice; give it once")
-        choices[name] = _parsed(value)
+        choices[name] = value_of(value)
     return choices
-
-
-def _parsed(value: str) -> Any:
-    """Read numbers, boxes and lists as Python writes them; anything else is a text."""
-    import ast
-
-    try:
-        return ast.literal_eval(value)
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
-        return value
 
 
 def _check_cache(arguments: argparse.Namespace) -> Any:

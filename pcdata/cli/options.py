@@ -3,32 +3,160 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
+# Here, not taken from the layouts: reading those loads torch, which a help text need not wait for. A test holds the
+# tables to the layouts.
+KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
+_FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class: its flag
+    "metres_per_unit": (
+        "--metres-per-unit",
+        {"type": float, "metavar": "M", "help": "length of one stored depth unit"},
+    ),
+    "invalid_values": (
+        "--invalid-values",
+        {
+            "type": lambda text: [int(number) for number in text.split(",")],
+            "metavar": "N,...",
+            "help": "stored depths besides 0 that mean no reading, such as 65535",
+        },
+    ),
+    "background_label": ("--background-label", {"type": int, "metavar": "ID", "help": "label that means no object"}),
+    "calibration": (
+        "--calibration",
+        {"metavar": "FILE", "help": "calibration file: its intrinsics, and with --frame its poses, are used"},
+    ),
+    "camera": (
+        "--camera",
+        {"metavar": "NAME", "help": "which camera of the calibration (default: the only one)"},
+    ),
+    "frame_id": ("--frame", {"metavar": "NAME", "help": "frame that the poses lead to, such as base"}),
+    "folders": (
+        "--folder",
+        {
+            "action": "append",
+            "type": lambda text: name_and_value(text),
+            "metavar": "ROLE=NAME",
+            "help": "name of the folder of a role (depth, color, labels, mask, confidence, pose); ROLE= leaves it out",
+        },
+    ),
+    "intrinsics": (
+        "--intrinsics",
+        {"type": float, "nargs": 4, "metavar": ("FX", "FY", "CX", "CY"), "help": "pixels, of seven_scenes"},
+    ),
+    "registered": (
+        "--registered",
+        {"action": "store_const", "const": True, "help": "depth as the colour camera sees it, of realsense_bag"},
+    ),
+    "max_time_apart": (
+        "--max-time-apart",
+        {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
+    ),
+}
+RIG_OPTIONS = ("metres_per_unit", "invalid_values", "background_label", "folders")
 
-def add_capture_options(command: argparse.ArgumentParser) -> None:
-    """Add what says how captures are to be read."""
-    command.add_argument("--kind", metavar="LAYOUT", help="capture layout, where it cannot be told from the files")
-    command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
+
+def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:
+    """Add what says how captures are to be read, and which are left out."""
     command.add_argument(
-        "--calibration", metavar="FILE", help="calibration file: its intrinsics, and with --frame its poses, are used"
+        "--kind",
+        metavar="LAYOUT",
+        help=f"capture layout, where it cannot be told from the files: {', '.join(KINDS)}",
     )
-    command.add_argument("--camera", metavar="NAME", help="which camera of the calibration (default: the only one)")
-    command.add_argument("--frame", metavar="NAME", help="frame that the poses lead to, such as base")
+    add_layout_options(command, tuple(_FLAGS))
+    command.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        type=name_and_value,
+        metavar="NAME=VALUE",
+        help="any option of the layout by its name in Python; repeatable",
+    )
+    add_skip_options(command, can_skip_refused=can_skip_refused)
+
+
+def add_layout_options(command: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
+    """Add the flags of some options of the layouts."""
+    for name in names:
+        flag, settings = _FLAGS[name]
+        command.add_argument(flag, **settings)
+
+
+def add_skip_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:
+    """Add what leaves captures out."""
+    command.add_argument("--skip", action="append", metavar="ID", help="leave this capture out; repeatable")
+    command.add_argument("--skip-file", metavar="FILE", help="leave out the captures listed in FILE, one id on a line")
+    if can_skip_refused:
+        command.add_argument(
+            "--skip-refused",
+            action="store_const",
+            const=True,
+            help="leave out captures that cannot be read or processed, and say which and why (default: stop at one)",
+        )
+
+
+def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of a layout that the command line states, by their names in Python.
+
+    Raises:
+        ConfigError: one is stated twice.
+    """
+    from pcdata.errors import ConfigError
+
+    given: dict[str, Any] = {}
+    for name, (flag, _) in _FLAGS.items():
+        value = getattr(arguments, attribute_of(flag), None)
+        if value is not None:
+            given[name] = value
+    if "folders" in given:
+        given["folders"] = {role: folder or None for role, folder in given["folders"]}
+    for name, text in getattr(arguments, "option", []):
+        if name in given:
+            raise ConfigError(f"--option {name}: this option is given twice; give it once")
+        given[name] = value_of(text)
+    return given
+
+
+def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
+    """Return the flags about captures, and those of ``others``, that the command line states."""
+    flags = ["--kind", *(flag for flag, _ in _FLAGS.values()), "--option", "--skip", "--skip-file", "--skip-refused"]
+    return [flag for flag in (*flags, *others) if getattr(arguments, attribute_of(flag), None)]
+
+
+def skip_list(arguments: argparse.Namespace) -> list[str]:
+    """Return the ids that the command line leaves out."""
+    from pcdata.io.selection import read_skip_file
+
+    listed = list(arguments.skip or [])
+    return listed + (read_skip_file(arguments.skip_file) if arguments.skip_file else [])
 
 
 def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:
-    """Open the captures at a path as the options say."""
-    from pcdata.io import open_source
+    """Open the captures at a path as the options say; captures that are left out are told on stderr."""
+    from pcdata.io.selection import open_selected
 
-    given = {
-        "metres_per_unit": arguments.metres_per_unit,
-        "calibration": arguments.calibration,
-        "camera": arguments.camera,
-        "frame_id": arguments.frame,
-    }
-    options = {name: value for name, value in given.items() if value is not None}
-    return open_source(path, kind=arguments.kind, limit=limit, **options)
+    source = open_selected(
+        path,
+        kind=arguments.kind,
+        limit=limit,
+        skip=skip_list(arguments),
+        skip_refused=bool(getattr(arguments, "skip_refused", False)),
+        **given_options(arguments),
+    )
+    tell_skipped(source.skipped)
+    return source
+
+
+def tell_skipped(skipped: dict[str, str]) -> None:
+    """Say on stderr which captures were left out, and why."""
+    for sample_id, reason in skipped.items():
+        print(f"left out {sample_id}: {reason}", file=sys.stderr)
+
+
+def attribute_of(flag: str) -> str:
+    """Return the attribute that argparse keeps a flag in."""
+    return flag.removeprefix("--").replace("-", "_")
 
 
 def name_and_value(text: str) -> tuple[str, str]:
@@ -37,6 +165,17 @@ def name_and_value(text: str) -> tuple[str, str]:
     if not sign or not name:
         raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
     return name, value
+
+
+def value_of(text: str) -> Any:
+    """Read numbers, boxes and lists as Python writes them, true and false; anything else is a text."""
+    import ast
+
+    words = {"true": True, "false": False, "null": None}
+    try:
+        return words[text.lower()] if text.lower() in words else ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return text
 
 
 def positive(text: str) -> int:

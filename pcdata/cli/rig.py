@@ -5,9 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
-from pcdata.cli.options import positive
+from pcdata.cli.options import (
+    RIG_OPTIONS,
+    add_layout_options,
+    add_skip_options,
+    given_options,
+    positive,
+    skip_list,
+    tell_skipped,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from pcdata.calibration import Calibration
@@ -44,7 +52,8 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
     command.add_argument(
         "--frame", metavar="NAME", help="frame they meet in (default: base with a calibration, else the captures' own)"
     )
-    command.add_argument("--metres-per-unit", type=float, metavar="M", help="length of one stored depth unit")
+    add_layout_options(command, RIG_OPTIONS)
+    add_skip_options(command)
     command.add_argument("--limit", type=positive, default=5, metavar="N", help="only the first N captures (default 5)")
 
 
@@ -86,9 +95,18 @@ def _refine(arguments: argparse.Namespace) -> None:
 
 
 def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> RigSource:
-    from pcdata.io.rig import RigSource
+    from pcdata.io.selection import open_selected
 
-    frame = arguments.frame or (None if calibration is None else "base")
-    return RigSource(
-        arguments.source, calibration=calibration, frame_id=frame, metres_per_unit=arguments.metres_per_unit
+    options = given_options(arguments)
+    options["frame_id"] = arguments.frame or (None if calibration is None else "base")
+    options["calibration"] = calibration
+    source = open_selected(
+        arguments.source,
+        kind="rig",
+        limit=arguments.limit,
+        skip=skip_list(arguments),
+        skip_refused=bool(arguments.skip_refused),
+        **options,
     )
+    tell_skipped(source.skipped)
+    return cast("RigSource", source)

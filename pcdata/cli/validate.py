@@ -19,7 +19,7 @@ def add_to(commands: Any) -> None:
     validate.add_argument(
         "path", metavar="PATH", help="folder of captures, or of several cameras' folders, or one cloud file"
     )
-    add_capture_options(validate)
+    add_capture_options(validate, can_skip_refused=False)
     validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     depths = validate.add_mutually_exclusive_group()
     depths.add_argument("--sensor", metavar="NAME", help="depths of interest: the range of a sensor (pcdata profiles)")
@@ -41,9 +41,10 @@ def _validate(arguments: argparse.Namespace) -> int:
         limits = Limits(workspace=tuple(arguments.workspace))
     summary = Summary()
     total = 0
+    unread: list[str] = []
     try:
         source = open_captures(arguments.path, arguments, limit=arguments.limit)
-        reports, total = validate_source(source, limits=limits), len(source)
+        reports, total, unread = validate_source(source, limits=limits), len(source), source.unread()
     except (CaptureError, PoseError, UnitError) as error:  # what no capture can be read with
         if not Path(arguments.path).exists():
             raise
@@ -58,8 +59,10 @@ def _validate(arguments: argparse.Namespace) -> int:
             if report.sample_id != WHOLE:
                 progress(done, total, report.sample_id)
         if writer is not None:
-            writer.close(summary.to_json())
+            writer.close(summary.to_json(), unread)
     print(validation_text(summary))
+    for line in unread:
+        print(f"not read: {line}")
     return int(summary.verdict is Verdict.FAIL)
 
 
@@ -77,7 +80,8 @@ class _Writer:
         self._file.write(("\n  " if self._first else ",\n  ") + json.dumps(report, allow_nan=False))
         self._first = False
 
-    def close(self, summary: dict[str, Any]) -> None:
+    def close(self, summary: dict[str, Any], unread: list[str]) -> None:
         """Write the end."""
-        self._file.write('\n ],\n "summary": ' + json.dumps(summary, allow_nan=False) + "\n}\n")
+        end = f'"not_read": {json.dumps(unread)},\n "summary": {json.dumps(summary, allow_nan=False)}'
+        self._file.write(f"\n ],\n {end}\n}}\n")
         self._file.close()

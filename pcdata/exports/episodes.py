@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.files import existing_file
+from pcdata.io.listing import visible_files
+from pcdata.io.sample_names import check_names, in_order
 
 ARRAYS = ("samples", "state", "action")
 _MAX_BYTES = 1 << 32
@@ -30,10 +32,11 @@ class Episode:
 
 
 def episode_names(where: str, given: Given | None) -> list[str]:
-    """Return the names of the episodes, sorted.
+    """Return the names of the episodes, in the order of the numbers in them.
 
     Raises:
         ConfigError: there are none.
+        CaptureError: the order of two is not certain, or a link leads to nothing.
     """
     if given is None:
         raise ConfigError(
@@ -42,13 +45,14 @@ def episode_names(where: str, given: Given | None) -> list[str]:
             "mapping from name to such arrays"
         )
     if isinstance(given, Mapping):
-        names = sorted(given)
+        names = in_order(given)
     elif given.is_dir():
-        names = sorted(path.name for path in given.glob("*.npz") if not path.name.startswith("."))
+        names = [path.name for path in visible_files(given, lambda name: name.endswith(".npz"))]
     else:
         raise ConfigError(f"{where}: episodes must be a folder of .npz files, but {given} is none")
     if not names:
         raise ConfigError(f"{where}: {given if isinstance(given, Path) else 'the mapping'} has no episode")
+    check_names(where, names)
     return names
 
 

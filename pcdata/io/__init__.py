@@ -16,7 +16,8 @@ from pcdata.io.image_writing import write_color, write_depth, write_labels, writ
 from pcdata.io.images import read_color, read_depth, read_labels, read_mask
 from pcdata.io.pcd import read_pcd, write_pcd
 from pcdata.io.ply import read_ply, write_ply
-from pcdata.io.source import Source
+from pcdata.io.selection import open_selected
+from pcdata.io.source import Source, refused_captures
 from pcdata.io.temporal import TemporalFilterDepth, TemporallyFilteredSource
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "Source",
     "TemporalFilterDepth",
     "TemporallyFilteredSource",
+    "open_selected",
     "open_source",
     "read_capture_camera",
     "read_color",
@@ -39,6 +41,7 @@ __all__ = [
     "read_pcd",
     "read_ply",
     "read_pose",
+    "refused_captures",
     "write_capture_camera",
     "write_color",
     "write_confidence",

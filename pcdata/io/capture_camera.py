@@ -13,14 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, PoseError, near_matches
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, near_matches
 from pcdata.files import map_npy, read_text, replacing
 from pcdata.functional import rigid
+from pcdata.io.option_checks import check_invalid_values
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera
 
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("distortion", "metres_per_unit", "frame_id", "background_label")
+_OPTIONAL = ("distortion", "metres_per_unit", "frame_id", "background_label", "invalid_values")
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
 _DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
@@ -41,6 +42,7 @@ class CaptureCamera:
     metres_per_unit: float | None = None  # length of one stored depth unit; None = the file does not say
     frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
     background_label: int | None = None  # what means "no object" in the label images; None = the file does not say
+    invalid_values: tuple[int, ...] | None = None  # stored depth besides 0 that is no reading; None = not said
 
 
 def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
@@ -51,9 +53,10 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
 
-    The last three are optional, as is ``background_label``, the id that means "no object"; ``notes``, ``sensor``,
-    ``serial``, ``registered_to`` and ``date`` are free remarks. Any other key is an error, because a misspelt
-    ``distortion`` that is ignored bends every cloud.
+    The last three are optional, as are ``background_label``, the id that means "no object", and ``invalid_values``, a
+    list of stored depths besides 0 that mean "no reading"; ``notes``, ``sensor``, ``serial``, ``registered_to`` and
+    ``date`` are free remarks. Any other key is an error, because a misspelt ``distortion`` that is ignored bends every
+    cloud.
 
     Raises:
         CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
@@ -71,6 +74,12 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     background = data.get("background_label")
     if background is not None and not (type(background) is int and 0 <= background <= 65535):
         raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r}")
+    invalid = data.get("invalid_values")
+    if invalid is not None:
+        try:
+            invalid = check_invalid_values(where, invalid)
+        except ConfigError as error:
+            raise CaptureError(str(error)) from error
     camera = _camera(
         where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
     )
@@ -79,6 +88,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         metres_per_unit=None if unit is None else check_metres_per_unit(where, unit),
         frame_id=frame_id,
         background_label=background,
+        invalid_values=invalid,
     )
 
 

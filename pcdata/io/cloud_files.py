@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from pcdata.errors import CaptureError
+from pcdata.io.listing import absolute, entries, is_folder, unread_entries, visible_files
 from pcdata.io.pcd import read_pcd
 from pcdata.io.ply import read_ply
-from pcdata.io.source import Source, absolute, visible_files
+from pcdata.io.source import Source
 from pcdata.structures import CAMERA_FRAME, PointCloud
 
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
@@ -33,7 +34,7 @@ class CloudFilesSource(Source):
         path = absolute(path)
         self.frame_id, self.metres_per_unit = frame_id, metres_per_unit
         self._files: dict[str, Path] = {}
-        for file in _cloud_files(path):
+        for file in visible_files(path, _is_cloud) if is_folder(path) else [path]:
             if file.stem in self._files:
                 raise CaptureError(f"{path}: {self._files[file.stem].name} and {file.name} are both {file.stem!r}")
             self._files[file.stem] = file
@@ -43,13 +44,17 @@ class CloudFilesSource(Source):
     def recognises(cls, path: Path) -> bool:
         """A cloud file, or a folder that holds one."""
         try:
-            return bool(_cloud_files(path))
+            return any(_is_cloud(entry.name) for entry in (entries(path) if is_folder(path) else [path]))
         except CaptureError:
             return False
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the file of one sample."""
         return {"cloud": self._files[sample_id]}
+
+    def unread(self) -> list[str]:
+        """Name what is in the folder besides the clouds."""
+        return unread_entries(self.path, set(self._files.values())) if is_folder(self.path) else []
 
     def _load(self, sample_id: str) -> PointCloud:
         file = self._files[sample_id]
@@ -59,6 +64,5 @@ class CloudFilesSource(Source):
         return cloud.with_meta([{"sample_id": sample_id, "provenance": facts}])
 
 
-def _cloud_files(path: Path) -> list[Path]:
-    candidates = [path] if path.is_file() else visible_files(path)
-    return [file for file in candidates if file.suffix.lower() in _READERS]
+def _is_cloud(name: str) -> bool:
+    return Path(name).suffix.lower() in _READERS

@@ -11,8 +11,10 @@ from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.cloud_files import CloudFilesSource
 from pcdata.io.folder import FolderSource
 from pcdata.io.graspnet import GraspNetSource
+from pcdata.io.listing import check_links, entries, is_folder
 from pcdata.io.realsense_bag import RealSenseBagSource
 from pcdata.io.rig import RigSource
+from pcdata.io.sample_names import name_some
 from pcdata.io.seven_scenes import SevenScenesSource
 from pcdata.io.source import Source
 
@@ -42,6 +44,7 @@ def open_source(
         ConfigError: the kind, the limit or an option is not known.
     """
     given = Path(path).expanduser()
+    check_links([given])
     if not given.exists():
         raise CaptureError(f"open_source: {given}: no such file or folder; check the path (relative to {Path.cwd()})")
     if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
@@ -66,23 +69,35 @@ def _named(kind: str) -> type[Source]:
 
 def _detect(path: Path) -> type[Source]:
     fitting = [layout for layout in LAYOUTS.values() if layout.recognises(path)]
+    if len(fitting) > 1 and is_folder(path):  # a recording that lies beside a capture is not the capture
+        fitting = [layout for layout in fitting if layout is not RealSenseBagSource]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
         kinds = " and ".join(layout.kind for layout in fitting)
-        raise CaptureError(f"open_source: {path}: looks like {kinds}; say which with kind=")
+        raise CaptureError(f"open_source: {path}: looks like {kinds}; say which with kind= (--kind)")
     known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
     raise CaptureError(
-        f"open_source: {path}: no known layout; found {_contents(path)}. The layouts and what each needs:\n{known}"
+        f"open_source: {path}: no known layout; found {_contents(path)}.{_captures_inside(path)} The layouts and what "
+        f"each needs:\n{known}"
     )
+
+
+def _captures_inside(path: Path) -> str:
+    """Say which entries of a folder are captures themselves, such as the folder that an archive was packed with."""
+    try:
+        inside = entries(path) if is_folder(path) else []
+    except CaptureError:
+        return ""
+    found = [entry.name for entry in inside[:100] if any(layout.recognises(entry) for layout in LAYOUTS.values())]
+    return f" A capture by itself: {name_some(found)}; give its path." if found else ""
 
 
 def _contents(path: Path) -> str:
     if path.is_file():
         return f"a {path.suffix or 'nameless'} file"
     try:
-        names = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in path.iterdir())
-    except OSError as error:
+        found = entries(path)
+    except CaptureError as error:
         return f"a folder that cannot be listed ({error})"
-    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return (", ".join(names[:8]) or "an empty folder") + more
+    return name_some(entry.name + "/" * is_folder(entry) for entry in found) or "an empty folder"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -13,22 +13,19 @@ from torch import Tensor
 from pcdata.errors import CaptureError, ConfigError, UnitError
 from pcdata.io.calibration import Calibration
 from pcdata.io.capture_camera import read_capture_camera
+from pcdata.io.folder_roles import ROLES, role_folders
 from pcdata.io.frame_files import make_frame
-from pcdata.io.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_depth
-from pcdata.io.source import Source, absolute, by_stem, check_partners, sequence_positions
+from pcdata.io.images import read_depth
+from pcdata.io.listing import absolute, by_stem, check_links, entries, has_file, unread_entries
+from pcdata.io.option_checks import check_invalid_values, check_label, check_name
+from pcdata.io.sample_names import positions
+from pcdata.io.source import Source, check_partners
 from pcdata.io.timestamps import read_timestamps
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
 _TIMESTAMPS = "timestamps.json"
-_PARTNERS = {  # role: folder, suffixes
-    "color": ("color", COLOR_SUFFIXES),
-    "labels": ("labels", (".png",)),
-    "mask": ("masks", (".png",)),
-    "confidence": ("confidence", (".png",)),
-    "pose": ("poses", (".txt", ".npy")),
-}
 
 
 class FolderSource(Source):
@@ -51,43 +48,52 @@ class FolderSource(Source):
         frame_id: str | None = None,
         calibration: Calibration | str | os.PathLike[str] | None = None,
         camera: str | None = None,
+        folders: Mapping[str, str | None] | None = None,
     ) -> None:
         """Read the calibration and the file names.
 
         Args:
             path: the folder.
             metres_per_unit: length of one stored depth unit, where ``intrinsics.json`` does not state it.
-            invalid_values: stored depth values besides 0 that mean "no reading".
+            invalid_values: stored depth values besides 0 that mean "no reading", where ``intrinsics.json`` does not
+                state them.
             background_label: the label in the files that means "no object" and becomes -1, where ``intrinsics.json``
                 does not state it; None = keep all.
             frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
             calibration: a :class:`Calibration` or its file, whose camera replaces that of ``intrinsics.json``. Where it
                 has transforms, the capture has no ``poses`` and a ``frame_id`` is stated, it also gives the pose.
             camera: its name in the calibration; None = the only one.
+            folders: the names of folders that are called otherwise, by role, such as ``{"pose": "pose"}``; None leaves
+                a role out. The roles: depth, color, labels, mask, confidence, pose.
 
         Raises:
-            CaptureError: the calibration is missing, wrong or of another image size, or a sample lacks a file that
-                others have.
+            CaptureError: the calibration is missing, wrong or of another image size, a sample lacks a file that
+                others have, a link leads to nothing, or a folder looks like a part of the capture but is not read.
             CalibrationError, FrameError: the calibration cannot be read, or lacks the camera or the frame.
-            ConfigError: a camera is named without a calibration.
+            ConfigError: a camera is named without a calibration, or folders names no role.
             UnitError: the unit is not stated, or stated twice and differently.
         """
         path = absolute(path)
-        present = [path / name for name in _CALIBRATIONS if (path / name).is_file()]
+        present = [path / name for name in _CALIBRATIONS if has_file(path / name)]
         if len(present) != 1:
             found = "both" if present else "neither"
             raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
         stated = read_capture_camera(present[0])
         self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
+        check_name(str(path), "frame_id", frame_id)
+        check_name(str(path), "camera", camera)
         if frame_id and stated.frame_id not in (None, frame_id):
             raise CaptureError(f"{present[0]}: says frame_id {stated.frame_id!r}, the argument {frame_id!r}; drop one")
+        roles = role_folders(path, folders)
+        if "depth" not in roles:
+            raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
         self.frame_id = frame_id or stated.frame_id or "world"
         self.frame_is_stated = bool(frame_id or stated.frame_id)
         self.camera = stated.camera
         self.world_from_camera: Tensor | None = None  # of a camera that stands still
         self._calibrated: dict[str, str] = {}
         if calibration is not None:
-            frame = None if (path / "poses").is_dir() else frame_id or stated.frame_id
+            frame = None if "pose" in roles else frame_id or stated.frame_id
             self.camera, self.world_from_camera, self._calibrated = _override(
                 present[0], stated.camera, calibration, camera, frame
             )
@@ -95,35 +101,47 @@ class FolderSource(Source):
             raise ConfigError(
                 f"folder source {path}: camera={camera!r} names one of a calibration; give calibration too"
             )
-        self.invalid_values = tuple(invalid_values)
+        self.invalid_values = check_invalid_values(str(path), invalid_values)
+        if stated.invalid_values is not None:
+            if self.invalid_values and set(self.invalid_values) != set(stated.invalid_values):
+                raise CaptureError(
+                    f"{present[0]}: says invalid_values {list(stated.invalid_values)}, the argument "
+                    f"{list(self.invalid_values)}; drop one"
+                )
+            self.invalid_values = stated.invalid_values
+        background_label = check_label(str(path), background_label)
         if stated.background_label is not None and background_label not in (None, stated.background_label):
             raise CaptureError(
                 f"{present[0]}: says background_label {stated.background_label}, the argument {background_label}; drop "
                 "one"
             )
         self.background_label = stated.background_label if background_label is None else background_label
-        if not (path / "depth").is_dir():
-            raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
-        self._files = {"depth": by_stem(path / "depth", DEPTH_SUFFIXES)}
-        for role, (folder, suffixes) in _PARTNERS.items():
-            if (path / folder).is_dir():
-                self._files[role] = by_stem(path / folder, suffixes)
+        check_links(entry for folder in roles.values() for entry in entries(folder))  # all of them in one message
+        self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
+        self._used = {present[0], *roles.values()}
         super().__init__(path, self._files["depth"])
         check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
-        self._positions = sequence_positions(self._ids)
+        self._positions = positions(self._ids)
         times = path / _TIMESTAMPS
-        self.timestamps = read_timestamps(times, self._ids) if times.is_file() else {}  # seconds by id
+        self.timestamps: dict[str, float] = {}  # seconds by id
+        if has_file(times):
+            self.timestamps = read_timestamps(times, self._ids)
+            self._used.add(times)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A calibration file and a folder of depth."""
-        return (path / "depth").is_dir() and any((path / name).is_file() for name in _CALIBRATIONS)
+        return os.path.lexists(path / "depth") and any(os.path.lexists(path / name) for name in _CALIBRATIONS)
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role."""
         return {role: found[sample_id] for role, found in self._files.items()}
+
+    def unread(self) -> list[str]:
+        """Name the folders and files beside those that are read."""
+        return unread_entries(self.path, self._used)
 
     def load(self, sample_id: str) -> DepthFrame:
         """Read one sample, always a depth frame.

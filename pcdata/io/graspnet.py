@@ -5,6 +5,7 @@ Source: graspnet-baseline, ``doc/example_data`` and ``dataset/graspnet_dataset.p
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from pcdata.files import existing_file
 from pcdata.functional import rigid
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
-from pcdata.io.source import Source, absolute, sequence_positions
+from pcdata.io.listing import absolute, check_links, entries, has_file, is_folder, unread_entries
+from pcdata.io.sample_names import positions
+from pcdata.io.source import Source, check_partners
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame
 
@@ -39,22 +42,43 @@ class GraspNetSource(Source):
     )
 
     def __init__(self, path: Path) -> None:
+        """List the frames.
+
+        Args:
+            path: the folder of a frame, or of such folders.
+
+        Raises:
+            CaptureError: there is none, or one lacks a file that it needs or that others have.
+        """
         path = absolute(path)
-        folders = [path] if _is_frame(path) else _frame_folders(path)
-        self._folders = {folder.name: folder for folder in folders}
-        super().__init__(path, self._folders)
-        self._positions = sequence_positions(self._ids)
+        if not is_folder(path):
+            raise CaptureError(f"{self.kind} source {path}: is no folder; this layout needs {self.needs}")
+        self._folders = {folder.name: folder for folder in _frame_folders(path)}
+        found = {name: _known_files(folder) for name, folder in self._folders.items()}
+        super().__init__(path, found)
+        roles = {role for files in found.values() for role in files} | {*_REQUIRED}
+        having = {role: [name for name, files in found.items() if role in files] for role in roles}
+        check_partners(str(self), self._ids, having)
+        self._positions = positions(self._ids)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """All three files in the folder, or in a folder of it."""
-        return _is_frame(path) or bool(_frame_folders(path))
+        return any(map(_is_frame, [path, *(_entries(path))]))
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role."""
-        folder = self._folders[sample_id]
-        optional = {role: folder / name for role, name in _OPTIONAL.items() if (folder / name).is_file()}
-        return {role: folder / name for role, name in _REQUIRED.items()} | optional
+        return _known_files(self._folders[sample_id])
+
+    def unread(self) -> list[str]:
+        """Name what is in the folders besides the files that are read."""
+        inside = [
+            entry if folder == self.path else f"{name}/{entry}"
+            for name, folder in self._folders.items()
+            for entry in unread_entries(folder, set(_known_files(folder).values()))
+        ]
+        beside = [] if self.path in self._folders.values() else unread_entries(self.path, {*self._folders.values()})
+        return beside + inside
 
     def _load(self, sample_id: str) -> DepthFrame:
         files = self.files(sample_id)
@@ -74,14 +98,28 @@ class GraspNetSource(Source):
 
 
 def _is_frame(folder: Path) -> bool:
-    return all((folder / name).is_file() for name in _REQUIRED.values())
+    return all(os.path.lexists(folder / name) for name in _REQUIRED.values())
 
 
-def _frame_folders(folder: Path) -> list[Path]:
+def _entries(folder: Path) -> list[Path]:
     try:
-        return sorted(entry for entry in folder.iterdir() if _is_frame(entry))
-    except OSError:
+        return entries(folder)
+    except CaptureError:
         return []
+
+
+def _frame_folders(path: Path) -> list[Path]:
+    """Return the folder itself, or those in it that have any file of a frame; what they lack is an error later."""
+    if any(os.path.lexists(path / name) for name in _REQUIRED.values()):
+        return [path]
+    inside = entries(path)
+    check_links(inside)
+    return [folder for folder in inside if any(os.path.lexists(folder / name) for name in _REQUIRED.values())]
+
+
+def _known_files(folder: Path) -> dict[str, Path]:
+    """Return the files of a frame that are there, by role; a link to nothing is an error."""
+    return {role: folder / name for role, name in (_REQUIRED | _OPTIONAL).items() if has_file(folder / name)}
 
 
 def _read_meta(path: Path) -> dict[str, Any]:

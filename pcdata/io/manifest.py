@@ -42,6 +42,7 @@ class Manifest:
     pipeline: Mapping[str, Any]  # section -> list of {transform: fields}
     samples: Sequence[Sample]
     versions: Mapping[str, str] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     schema: str = SCHEMA
 
     def write(self, folder: Path) -> None:
@@ -83,7 +84,7 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r:.100}")
     if manifest.compression not in COMPRESSIONS[manifest.format]:
         raise CacheError(f"compression {manifest.compression!r:.100} does not exist for format {manifest.format}")
-    for name, kind in (("fingerprint", str), ("pipeline", dict), ("versions", dict)):
+    for name, kind in (("fingerprint", str), ("pipeline", dict), ("versions", dict), ("skipped", dict)):
         if not isinstance(getattr(manifest, name), kind):
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
     if not manifest.samples:

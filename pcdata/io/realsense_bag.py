@@ -16,14 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
+from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.functional import rigid
 from pcdata.io.images import check_plausible, metres_of_value
+from pcdata.io.listing import absolute, check_links, entries, is_file, is_folder
+from pcdata.io.option_checks import check_seconds, check_switch
 from pcdata.io.rosbag import MAGIC, Bag, depth_units, opened_bag, rgb_pixels
-from pcdata.io.source import Source, absolute
+from pcdata.io.sample_names import name_some
+from pcdata.io.source import Source
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame, register_to_color
 
+_DATA = re.compile(r".*/(?P<kind>[^/]+?)(_\d+)?/(image|imu|points|pose|transform)/data")
 _IMAGES = re.compile(r"(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>Depth|Color)_\d+/image/data")
 
 
@@ -43,35 +47,39 @@ class RealSenseBagSource(Source):
     """
 
     kind = "realsense_bag"
-    needs = "a ROS 1 .bag that a RealSense recorded; reading it needs rosbags"
+    needs = "a ROS 1 .bag that a RealSense recorded, or a folder with one; reading it needs rosbags"
 
     def __init__(self, path: Path, *, registered: bool = False, max_time_apart: float = 0.034) -> None:
         """Read the index, the calibration and the depth unit.
 
         Args:
-            path: the file.
+            path: the file, or a folder that holds one such file.
             registered: register each depth image to the colour image nearest in time; those without one within
                 ``max_time_apart`` are left out.
             max_time_apart: seconds; the default is one frame at 30 Hz.
 
         Raises:
-            CaptureError: no bag, damaged, not of one depth camera, or no depth has a colour image near enough.
+            CaptureError: no bag or several, damaged, not of one depth camera, or no depth has a colour image near
+                enough.
             UnitError: the recording states no depth unit.
             IntrinsicsError: a camera's numbers are impossible, or its lens model is not one of OpenCV's.
             MissingExtraError: rosbags is not installed.
         """
         path = absolute(path)
         where = f"{self.kind} source {path}"
-        if not max_time_apart > 0:
-            raise ConfigError(f"{where}: max_time_apart must be positive seconds, got {max_time_apart!r}")
+        check_switch(where, "registered", registered)
+        check_seconds(where, "max_time_apart", max_time_apart)
         if not self.recognises(path):
             raise CaptureError(f"{where}: is no ROS 1 bag; this layout needs {self.needs}")
+        if is_folder(path):
+            path = _only_bag(where, path)
         with opened_bag(where, path) as bag:
             self._depth = _one_stream(bag, "Depth")
             self._color = _one_stream(bag, "Color") if registered else None
             sensor = self._depth.topic.rsplit("/", 3)[0]
             self.metres_per_unit = _unit(where, bag, sensor)
             self.sensor = _device(bag, sensor.rsplit("/", 1)[0])
+            self._unread = _unread(bag, {stream.topic for stream in (self._depth, self._color) if stream})
         self._partner: dict[int, int] = {}
         if self._color is not None:
             self._partner = _partners(where, self._depth.times, self._color.times, max_time_apart)
@@ -80,16 +88,19 @@ class RealSenseBagSource(Source):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """A file that begins as ROS 1 bags do."""
+        """A file that begins as ROS 1 bags do, or a folder with one."""
         try:
-            with path.open("rb") as stream:
-                return stream.read(len(MAGIC)) == MAGIC
-        except OSError:
+            return any(map(_is_bag, entries(path) if is_folder(path) else [path]))
+        except CaptureError:
             return False
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the recording, which holds every sample."""
         return {"bag": self.path}
+
+    def unread(self) -> list[str]:
+        """Name the streams of the recording that are not read, the colour stream among them unless ``registered``."""
+        return list(self._unread)
 
     def _load(self, sample_id: str) -> DepthFrame:
         number = int(sample_id)
@@ -116,6 +127,38 @@ class RealSenseBagSource(Source):
         seen = register_to_color(frame, torch.from_numpy(colors)[None], self._color.camera, color_from_depth)
         apart = (self._color.times[self._partner[number]] - self._depth.times[number]) / 1e9
         return replace(seen, provenance={**seen.provenance, "color_seconds_later": apart})
+
+
+def _is_bag(path: Path) -> bool:
+    try:
+        if not is_file(path):  # opening a pipe would wait for ever
+            return False
+        with path.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def _only_bag(where: str, folder: Path) -> Path:
+    check_links(entry for entry in entries(folder) if entry.suffix.lower() == ".bag")
+    bags = [entry for entry in entries(folder) if _is_bag(entry)]
+    if len(bags) != 1:
+        raise CaptureError(
+            f"{where}: holds {len(bags)} recordings, {name_some(bag.name for bag in bags)}; give the path of one"
+        )
+    return bags[0]
+
+
+def _unread(bag: Bag, read: set[str]) -> list[str]:
+    """Say which streams a recording has besides those that are read; settings and infos of streams are not told."""
+    told = []
+    for topic in bag.topics:
+        match = _DATA.fullmatch(topic)
+        if match and topic not in read:
+            use = "; registered=True (--registered) reads it" if match["kind"] == "Color" else ""
+            name = {"Color": "colour"}.get(match["kind"], match["kind"])
+            told.append(f"{name} stream {topic} ({len(bag.times(topic))} messages){use}")
+    return told
 
 
 def _one_stream(bag: Bag, kind: str) -> _Stream:

@@ -11,7 +11,9 @@ from pcdata.errors import CaptureError, FrameError
 from pcdata.io.calibration import Calibration
 from pcdata.io.folder import FolderSource, opened_calibration
 from pcdata.io.joined_views import join_views
-from pcdata.io.source import Source, absolute, name_some, sequence_positions
+from pcdata.io.listing import absolute, check_links, entries, is_folder, unread_entries
+from pcdata.io.sample_names import check_names, in_order_of_last_number, name_some
+from pcdata.io.source import Source
 from pcdata.structures import DepthFrame
 
 
@@ -41,6 +43,7 @@ class RigSource(Source):
         background_label: int | None = None,
         frame_id: str | None = None,
         calibration: Calibration | str | os.PathLike[str] | None = None,
+        folders: Mapping[str, str | None] | None = None,
     ) -> None:
         """Read the calibrations and the file names.
 
@@ -52,6 +55,7 @@ class RigSource(Source):
             frame_id: where the poses lead to, where the cameras' ``intrinsics.json`` do not state it.
             calibration: a :class:`Calibration` or its file, with exactly the cameras that have a folder. Its
                 intrinsics replace theirs; where it has transforms, it gives the poses of cameras without ``poses/``.
+            folders: as for the layout ``folder``, of every camera.
 
         Raises:
             CaptureError: a folder is missing, is no camera's or is incomplete; a camera lacks what others have, has no
@@ -72,6 +76,7 @@ class RigSource(Source):
                 frame_id=frame_id,
                 calibration=known,
                 camera=None if known is None else name,
+                folders=folders,
             )
             for name in self.names
         }
@@ -85,10 +90,10 @@ class RigSource(Source):
     def recognises(cls, path: Path) -> bool:
         """Two or more folders, each of the layout ``folder``."""
         try:
-            folders = _folders(path)
-            return len(folders) > 1 and all(map(FolderSource.recognises, folders))
-        except OSError:
+            folders = [entry for entry in entries(path) if is_folder(entry)]
+        except CaptureError:
             return False
+        return len(folders) > 1 and all(map(FolderSource.recognises, folders))
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by camera and role, such as ``left/depth``."""
@@ -101,6 +106,12 @@ class RigSource(Source):
     def depth_files(self, sample_id: str) -> list[Path]:
         """Return the depth image of every camera."""
         return [file for camera in self.cameras.values() for file in camera.depth_files(sample_id)]
+
+    def unread(self) -> list[str]:
+        """Name the files beside the cameras' folders, and what each camera's folder has beside what is read."""
+        cameras = {camera.path for camera in self.cameras.values()}
+        ours = [f"{name}/{entry}" for name, camera in self.cameras.items() for entry in camera.unread()]
+        return unread_entries(self.path, cameras) + ours
 
     def load(self, sample_id: str) -> DepthFrame:
         """Read one sample, all views of it.
@@ -123,30 +134,27 @@ class RigSource(Source):
         return join_views([camera.load(sample_id) for camera in self.cameras.values()], provenance)
 
 
-def _folders(path: Path) -> list[Path]:
-    return [entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
-
-
 def _camera_names(path: Path, calibration: Calibration | None) -> list[str]:
     """Return the names of the folders in the order of the views; they must be those of the calibration."""
     where = f"rig source {path}"
-    try:
-        names = [folder.name for folder in _folders(path)]
-    except OSError as error:
-        raise CaptureError(f"{where}: cannot be listed: {error}; this layout needs {RigSource.needs}") from error
+    if not is_folder(path):
+        raise CaptureError(f"{where}: is no folder; this layout needs {RigSource.needs}")
+    found = entries(path)
+    check_links(found)
+    names = [folder.name for folder in found if is_folder(folder)]
     if calibration is not None and set(names) != set(calibration.cameras):
-        missing = ", ".join(sorted(set(calibration.cameras) - set(names))) or "none"
-        unknown = ", ".join(sorted(set(names) - set(calibration.cameras))) or "none"
+        missing = name_some(set(calibration.cameras) - set(names)) or "none"
+        unknown = name_some(set(names) - set(calibration.cameras)) or "none"
         raise CaptureError(
             f"{where}: needs one folder for each camera of the calibration and no other; missing: {missing}; "
             f"not in the calibration: {unknown}. Rename or move folders, or give a calibration of these cameras"
         )
     others = [name for name in names if not FolderSource.recognises(path / name)]
     if len(names) < 2 or others:
-        found = f"{name_some(others)} is of another layout" if others else f"found {name_some(names) or 'no folder'}"
-        raise CaptureError(f"{where}: needs {RigSource.needs}; {found}")
-    positions = sequence_positions(names)
-    return sorted(names, key=lambda name: (positions[name], name))
+        told = f"{name_some(others)} is of another layout" if others else f"found {name_some(names) or 'no folder'}"
+        raise CaptureError(f"{where}: needs {RigSource.needs}; {told}")
+    check_names(where, names)
+    return in_order_of_last_number(names)
 
 
 def _check_ids(path: Path, cameras: Mapping[str, FolderSource]) -> None:

@@ -14,12 +14,15 @@ from pcdata.errors import CaptureError
 from pcdata.io.capture_camera import read_intrinsics
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
-from pcdata.io.source import Source, absolute, check_partners, visible_files
+from pcdata.io.listing import absolute, entries, has_file, unread_entries, visible_files
+from pcdata.io.option_checks import check_invalid_values, check_name, check_pinhole
+from pcdata.io.sample_names import positions
+from pcdata.io.source import Source, check_partners
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame
 
-_FILE = re.compile(r"(?P<id>frame-(?P<number>[0-9]{1,18}))\.(?P<role>depth\.png|color\.png|color\.jpg|pose\.txt)")
-_ROLES = {"depth.png": "depth", "color.png": "color", "color.jpg": "color", "pose.txt": "pose"}
+_FILE = re.compile(r"(?P<id>frame-[0-9]+)\.(?P<role>depth|color|pose)\.(?P<suffix>\w+)")
+_SUFFIXES = {"depth": ("png",), "color": ("png", "jpg", "jpeg"), "pose": ("txt",)}
 _INTRINSICS = "camera-intrinsics.txt"
 
 
@@ -59,19 +62,23 @@ class SevenScenesSource(Source):
         """
         path = absolute(path)
         self.metres_per_unit = check_metres_per_unit(f"seven_scenes source {path}", metres_per_unit)
-        self.invalid_values = tuple(invalid_values)
-        self.frame_id = frame_id
-        self.intrinsics = intrinsics
-        has_file = (path / _INTRINSICS).is_file()
-        if has_file == (intrinsics is not None):
+        self.invalid_values = check_invalid_values(str(path), invalid_values)
+        self.frame_id = check_name(str(path), "frame_id", frame_id) or "world"
+        self.intrinsics = None if intrinsics is None else check_pinhole(str(path), intrinsics)
+        has_intrinsics = has_file(path / _INTRINSICS)
+        if has_intrinsics == (intrinsics is not None):
+            neither = "neither is there; the data set documents (585, 585, 320, 240)"
             raise CaptureError(
-                f"seven_scenes source {path}: needs {_INTRINSICS} or the option intrinsics=(fx, fy, cx, cy), but "
-                f"{'both are given' if has_file else 'neither is there; the data set documents (585, 585, 320, 240)'}"
+                f"seven_scenes source {path}: needs {_INTRINSICS} or the option intrinsics=(fx, fy, cx, cy) "
+                f"(--intrinsics FX FY CX CY), but {'both are given' if has_intrinsics else neither}"
             )
         self._files: dict[str, dict[str, Path]] = {"depth": {}}
-        for file in visible_files(path):
+        for file in visible_files(path, lambda name: _FILE.fullmatch(name) is not None):
             if match := _FILE.fullmatch(file.name):
-                found = self._files.setdefault(_ROLES[match["role"]], {})
+                if match["suffix"].lower() not in _SUFFIXES[match["role"]]:
+                    known = ", ".join(_SUFFIXES[match["role"]])
+                    raise CaptureError(f"{path}: {file.name}: a {match['role']} file must be {known}; move it out")
+                found = self._files.setdefault(match["role"], {})
                 if match["id"] in found:
                     raise CaptureError(
                         f"{path}: {found[match['id']].name} and {file.name} are of one frame; remove one"
@@ -79,18 +86,25 @@ class SevenScenesSource(Source):
                 found[match["id"]] = file
         super().__init__(path, self._files["depth"])
         check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
+        self._positions = positions(self._ids)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A depth image named as the data set names them."""
         try:
-            return any(entry.name.endswith(".depth.png") and _FILE.fullmatch(entry.name) for entry in path.iterdir())
-        except OSError:
+            found = [_FILE.fullmatch(entry.name) for entry in entries(path)]
+        except CaptureError:
             return False
+        return any(match and match["role"] == "depth" and match["suffix"].lower() == "png" for match in found)
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role."""
         return {role: found[sample_id] for role, found in self._files.items()}
+
+    def unread(self) -> list[str]:
+        """Name what is in the folder besides the frames and their intrinsics."""
+        read = {file for found in self._files.values() for file in found.values()}
+        return unread_entries(self.path, {*read, self.path / _INTRINSICS})
 
     def _load(self, sample_id: str) -> DepthFrame:
         files = self.files(sample_id)
@@ -101,7 +115,7 @@ class SevenScenesSource(Source):
             camera=self._camera((depth.shape[0], depth.shape[1])),
             sample_id=sample_id,
             frame_id=self.frame_id,
-            capture_index=int(sample_id.removeprefix("frame-")),
+            capture_index=self._positions[sample_id],
             provenance={**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit},
         )
 

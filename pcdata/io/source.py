@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import copy
-import os
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from pcdata.errors import CaptureError, DTypeError, PcdataError, add_note, near_matches
+from pcdata.errors import (
+    CaptureError,
+    DTypeError,
+    NonFiniteError,
+    NoPlaneError,
+    PcdataError,
+    PoseError,
+    TooFewPointsError,
+    UnitError,
+    add_note,
+    near_matches,
+)  # fmt: skip
+from pcdata.io.listing import absolute
+from pcdata.io.sample_names import check_names, check_utf8, in_order, name_some, same_but_for_writing
 from pcdata.structures import DepthFrame, PointCloud
 
-_LITTER = ("thumbs.db", "desktop.ini")
-_SHOWN = 5  # ids or files named in a message before "and n more"
+# What is wrong with one capture, not with what is asked of all of them.
+REFUSALS = (CaptureError, PoseError, UnitError, NonFiniteError, TooFewPointsError, NoPlaneError)
 
 
 class CaptureSource(Protocol):
@@ -33,7 +44,7 @@ def checked_ids(where: str, source: Any) -> list[str]:
 
     Raises:
         DTypeError: it is no source.
-        CaptureError: it has no samples, or two with one id.
+        CaptureError: it has no samples, two with one id, or an id that no file can hold.
     """
     if not hasattr(source, "ids") or not hasattr(source, "load"):
         raise DTypeError(
@@ -46,11 +57,12 @@ def checked_ids(where: str, source: Any) -> list[str]:
     if len(set(ids)) != len(ids):
         twice = next(name for name in ids if ids.count(name) > 1)
         raise CaptureError(f"{where}: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    check_utf8(where, ids)
     return ids
 
 
 class Source(ABC):
-    """The samples of one capture: sorted unique ids, and a loader.
+    """The samples of one capture: unique ids in the order that a person counts in, and a loader.
 
     A source holds paths and numbers only, no open file, so it can be pickled, sent to workers and used by many at once.
     Building one reads names and calibration, never an image.
@@ -61,10 +73,12 @@ class Source(ABC):
 
     def __init__(self, path: Path, ids: Iterable[str]) -> None:
         self.path = absolute(path)
-        self._ids = sorted(ids)
+        self._ids = in_order(ids)
         self._known = frozenset(self._ids)
+        self.skipped: dict[str, str] = {}  # id -> why it was left out; see without
         if not self._ids:
             raise CaptureError(f"{self}: no sample found; this layout needs {self.needs}")
+        check_names(str(self), self._ids)
 
     @classmethod
     @abstractmethod
@@ -84,6 +98,10 @@ class Source(ABC):
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         """Load one known sample."""
 
+    def unread(self) -> list[str]:
+        """Say in words what lies in the capture but is not read, one line for each; nothing of it is an error."""
+        return []
+
     @property
     def name(self) -> str:
         """The name of the folder or file."""
@@ -91,7 +109,7 @@ class Source(ABC):
 
     @property
     def ids(self) -> list[str]:
-        """The sample ids, sorted and unique."""
+        """The sample ids, unique, in the order of the numbers in them."""
         return list(self._ids)
 
     def load(self, sample_id: str) -> DepthFrame | PointCloud:
@@ -109,13 +127,38 @@ class Source(ABC):
             raise
 
     def subset(self, ids: Sequence[str]) -> Source:
-        """Return the same source with some of its samples only."""
-        unknown = sorted(set(ids) - self._known)
+        """Return the same source with some of its samples only, in the order that they have here."""
+        unknown = set(ids) - self._known
         if unknown or not ids:
             raise CaptureError(f"{self}: subset needs ids of this source, got {name_some(unknown) or 'none'}")
         smaller = copy.copy(self)
-        smaller._ids = sorted(set(ids))
-        smaller._known = frozenset(smaller._ids)
+        smaller._known = frozenset(ids)
+        smaller._ids = [sample_id for sample_id in self._ids if sample_id in smaller._known]
+        return smaller
+
+    def without(self, ids: Iterable[str] | Mapping[str, str]) -> Source:
+        """Return the same source without some of its samples; ``skipped`` tells which, and why.
+
+        Args:
+            ids: the samples to leave out, as from a list of bad frames, or with the reason of each, as
+                :func:`refused_captures` returns them.
+
+        Raises:
+            CaptureError: one is no sample of this source, or none is left.
+        """
+        if isinstance(ids, (str, bytes)):
+            raise DTypeError(f"{self}: without takes a list of ids, got the text {ids!r:.100}; put it into a list")
+        reasons = {**ids} if isinstance(ids, Mapping) else dict.fromkeys(ids, "listed")
+        unknown = [str(sample_id) for sample_id in reasons if sample_id not in self._known]
+        if unknown:
+            hint = near_matches(unknown[0], self._ids)
+            raise CaptureError(f"{self}: cannot leave out {name_some(unknown)}, which it does not have{hint}")
+        left = [sample_id for sample_id in self._ids if sample_id not in reasons]
+        if not left:
+            reason = next(iter(reasons.values()))
+            raise CaptureError(f"{self}: nothing is left when {len(reasons)} samples are left out ({reason})")
+        smaller = self.subset(left)
+        smaller.skipped = {**self.skipped, **reasons}
         return smaller
 
     def provenance(self, sample_id: str) -> dict[str, Any]:
@@ -134,41 +177,32 @@ class Source(ABC):
         return f"{self.kind} source {self.path}"
 
 
-def absolute(path: str | os.PathLike[str]) -> Path:
-    """Return the path so that it survives a change of the working folder, e.g. in a worker; no ``..`` is left in it."""
-    return Path(os.path.abspath(Path(path).expanduser()))
+def refused_captures(source: CaptureSource) -> dict[str, str]:
+    """Load every capture once and return those that are refused, with the reason of each.
 
-
-def name_some(names: Iterable[str]) -> str:
-    """Return the first few names and how many more there are."""
-    listed = sorted(names)
-    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
-    return ", ".join(listed[:_SHOWN]) + more
-
-
-def visible_files(folder: Path) -> list[Path]:
-    """Return the files of a folder by name, without hidden ones and those that desktops leave behind."""
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError as error:
-        raise CaptureError(f"{folder}: cannot be listed: {error}") from error
-    return [e for e in entries if not e.name.startswith(".") and e.name.lower() not in _LITTER and e.is_file()]
-
-
-def by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """Return the files of a folder by name without suffix.
-
-    Raises:
-        CaptureError: a file has another suffix, or two differ in the suffix alone.
+    ``source.without(refused_captures(source))`` is the source that loads throughout.
     """
-    found: dict[str, Path] = {}
-    for file in visible_files(folder):
-        if file.suffix.lower() not in suffixes:
-            raise CaptureError(f"{folder}: may hold {', '.join(suffixes)} only, but there is {file.name}; move it out")
-        if file.stem in found:
-            raise CaptureError(f"{folder}: {found[file.stem].name} and {file.name} are both {file.stem!r}; remove one")
-        found[file.stem] = file
-    return found
+    refused = {}
+    for sample_id in checked_ids("refused_captures", source):
+        try:
+            source.load(sample_id)
+        except REFUSALS as error:
+            refused[sample_id] = reason_of(error)
+    return refused
+
+
+def skipped_of(source: Any) -> dict[str, str]:
+    """Return what was left out of a source, or of the one that it is made around: id -> why."""
+    skipped: dict[str, str] = {}
+    while source is not None:
+        skipped |= getattr(source, "skipped", {})
+        source = getattr(source, "source", None)
+    return skipped
+
+
+def reason_of(error: PcdataError) -> str:
+    """Return why a capture was refused, in one line."""
+    return f"{type(error).__name__}: {str(error).splitlines()[0]}"
 
 
 def check_partners(where: str, ids: Iterable[str], partners: Mapping[str, Iterable[str]]) -> None:
@@ -181,13 +215,7 @@ def check_partners(where: str, ids: Iterable[str], partners: Mapping[str, Iterab
             faults.append(f"{role} is missing for {name_some(missing)}")
         if spare:
             faults.append(f"there is {role} but no depth for {name_some(spare)}")
+        if missing and spare:
+            faults[-1] += same_but_for_writing(missing, spare)
     if faults:
         raise CaptureError(f"{where}: every sample needs the same files: {'; '.join(faults)}")
-
-
-def sequence_positions(ids: Sequence[str]) -> dict[str, int]:
-    """Return the position of every id: the number it ends in if all do, else its place in sorted order."""
-    numbers = [re.search(r"([0-9]{1,18})$", name) for name in ids]
-    if all(numbers):
-        return {name: int(match[1]) for name, match in zip(ids, numbers, strict=True) if match}
-    return {name: place for place, name in enumerate(sorted(ids))}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 
@@ -28,7 +30,15 @@ def build_text(report: BuildReport) -> str:
     head = f"{len(report.samples)} samples in {seconds:.1f} s"
     if as_clouds:
         head += f"; {as_clouds} captures were clouds already and entered at the section 'cloud'"
-    return f"{head}\n\n{text_table(['points after', 'fewest', 'median', 'most'], rows)}"
+    table = f"{head}\n\n{text_table(['points after', 'fewest', 'median', 'most'], rows)}"
+    return f"{table}\n\n{skipped_text(report.skipped)}" if report.skipped else table
+
+
+def skipped_text(skipped: Mapping[str, str]) -> str:
+    """Tell which captures were left out: how many for each kind of reason, and every one with its own."""
+    kinds = Counter(reason.partition(":")[0] for reason in skipped.values())
+    head = f"{len(skipped)} captures left out: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    return "\n".join([head, *(f"  {sample_id}: {reason}" for sample_id, reason in skipped.items())])
 
 
 def dataset_text(folder: str | Path) -> str:
@@ -39,6 +49,7 @@ def dataset_text(folder: str | Path) -> str:
     cloud = dataset[0]
     facts: list[list[object]] = [
         ["samples", len(dataset)],
+        *([["left out", len(manifest.skipped)]] if manifest.skipped else []),
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
         ["format", f"{manifest.format}, compression {manifest.compression}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
@@ -49,7 +60,8 @@ def dataset_text(folder: str | Path) -> str:
     stored = dataset.pipeline.deterministic_prefix()
     steps = [["stored", repr(step)] for step in [*stored.depth, *stored.cloud, *stored.augment]]
     steps += [["on the fly", repr(step)] for step in dataset.pipeline.random_suffix().steps]
-    return f"{text_table(['dataset', str(folder)], facts)}\n\n{text_table(['when', 'step'], steps)}"
+    tables = f"{text_table(['dataset', str(folder)], facts)}\n\n{text_table(['when', 'step'], steps)}"
+    return f"{tables}\n\n{skipped_text(manifest.skipped)}" if manifest.skipped else tables
 
 
 def capture_text(source: Source) -> str:
@@ -58,6 +70,7 @@ def capture_text(source: Source) -> str:
     names = ", ".join(source.ids[:3]) + (", ..." if len(source) > 3 else "")
     facts = [["layout", source.kind], ["captures", f"{len(source)}: {names}"], ["first", repr(first)]]
     facts += _frame_facts(first) if isinstance(first, DepthFrame) else _cloud_facts(first)
+    facts += [["not read" * (not number), line] for number, line in enumerate(source.unread())]
     return text_table(["capture", str(source.name)], facts)
 
 

@@ -246,3 +246,22 @@ def test_the_real_recording_has_the_documented_facts(test_data):
     pose = torch.tensor(seen.provenance["registered"]["color_from_depth"])[0].double()
     rigid.check_rigid("the recorded transform", pose)
     assert float(pose[:3, 3].norm()) == pytest.approx(0.0143, abs=1e-3)
+
+
+def test_a_folder_with_one_recording_is_that_recording(tmp_path):
+    (tmp_path / "take").mkdir()
+    written(tmp_path / "take" / "a.bag", recording())
+    for kind in (None, "realsense_bag"):
+        source = open_source(tmp_path / "take", kind=kind)
+        assert source.ids == ["000000", "000001", "000002"]
+        assert source.load("000001").provenance["files"] == {"bag": "a.bag"}
+    written(tmp_path / "take" / "b.bag", recording())
+    with pytest.raises(CaptureError, match=r"holds 2 recordings, a\.bag, b\.bag; give the path of one"):
+        open_source(tmp_path / "take")
+
+
+def test_the_colour_stream_that_is_not_read_is_told_with_the_way_to_read_it(tmp_path):
+    path = written(tmp_path / "a.bag", recording())
+    (line,) = open_source(path).unread()
+    assert line == f"colour stream {COLOR}/image/data (2 messages); registered=True (--registered) reads it"
+    assert open_source(path, registered=True).unread() == []

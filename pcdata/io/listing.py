@@ -1,0 +1,137 @@
+"""What lies in a folder: nothing that looks like a part of the capture is passed over without a word."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from pcdata.errors import CaptureError
+from pcdata.io.sample_names import check_utf8, in_order, name_some
+
+# What desktops, servers and archivers leave behind, in lower case; hidden entries are litter too.
+_LITTER = {"thumbs.db", "ehthumbs.db", "desktop.ini", "icon\r", "__macosx", "@eadir", "lost+found", "$recycle.bin"}
+
+
+def absolute(path: str | os.PathLike[str]) -> Path:
+    """Return the path so that it survives a change of the working folder, e.g. in a worker; no ``..`` is left in it."""
+    return Path(os.path.abspath(Path(path).expanduser()))
+
+
+def is_file(path: Path) -> bool:
+    """Say whether a regular file can be seen there; never raises."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Say whether a folder can be seen there; never raises."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what is in a folder in the order of the names, without hidden entries and litter.
+
+    Raises:
+        CaptureError: the folder cannot be listed.
+    """
+    try:
+        names = os.listdir(folder)
+    except OSError as error:
+        raise CaptureError(f"{folder}: cannot be listed: {error.strerror or error}") from error
+    return [folder / name for name in in_order(names) if not name.startswith(".") and name.lower() not in _LITTER]
+
+
+def visible_files(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Path]:
+    """Return the wanted files of a folder in the order of their names, links followed.
+
+    Args:
+        folder: the folder.
+        wanted: tells by its name which entry is meant to be read; what is not wanted does not matter.
+
+    Raises:
+        CaptureError: the folder cannot be listed, or a wanted entry is no file: a link to nothing, a folder, a device.
+    """
+    chosen = [entry for entry in entries(folder) if wanted(entry.name)]
+    check_links(chosen)
+    others = [entry.name for entry in chosen if not is_file(entry)]
+    if others:
+        raise CaptureError(f"{folder}: {name_some(others)} cannot be read as files; move them out")
+    check_utf8(str(folder), [entry.name for entry in chosen])
+    return chosen
+
+
+def check_links(paths: Iterable[Path]) -> None:
+    """Require that links lead to something.
+
+    Raises:
+        CaptureError: some do not; names them all, up to a few.
+    """
+    broken = {f"{path} -> {os.readlink(path)}" for path in paths if is_dangling(path)}
+    if broken:
+        raise CaptureError(
+            f"{len(broken)} link{'s' * (len(broken) > 1)} to nothing: {name_some(broken)}; fetch what they stand for "
+            "('datalad get', 'git annex get', 'dvc pull'), or remove them with all files of the same sample"
+        )
+
+
+def is_dangling(path: Path) -> bool:
+    """Say whether a path is a link whose target is not there; a circle of links has none."""
+    try:
+        return path.is_symlink() and not path.exists()
+    except (OSError, RuntimeError, ValueError):
+        return True
+
+
+def has_file(path: Path) -> bool:
+    """Say whether there is a file of this name.
+
+    Raises:
+        CaptureError: there is something else: a link to nothing, a folder, a device.
+    """
+    return _there(path, is_file, "file")
+
+
+def has_folder(path: Path) -> bool:
+    """Say whether there is a folder of this name.
+
+    Raises:
+        CaptureError: there is something else: a link to nothing, a file.
+    """
+    return _there(path, is_folder, "folder")
+
+
+def by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """Return the files of a folder by name without suffix.
+
+    Raises:
+        CaptureError: an entry has another suffix or is no file, or two differ in the suffix alone.
+    """
+    found: dict[str, Path] = {}
+    for file in visible_files(folder):
+        if file.suffix.lower() not in suffixes:
+            raise CaptureError(f"{folder}: may hold {', '.join(suffixes)} only, but there is {file.name}; move it out")
+        if file.stem in found:
+            raise CaptureError(f"{folder}: {found[file.stem].name} and {file.name} are both {file.stem!r}; remove one")
+        found[file.stem] = file
+    return found
+
+
+def unread_entries(path: Path, read: set[Path]) -> list[str]:
+    """Return the names of what lies in a folder and belongs to nothing that is read."""
+    used = {entry.relative_to(path).parts[0] for entry in read}
+    return [entry.name + "/" * is_folder(entry) for entry in entries(path) if entry.name not in used]
+
+
+def _there(path: Path, fits: Callable[[Path], bool], kind: str) -> bool:
+    if fits(path):
+        return True
+    check_links([path])
+    if os.path.lexists(path):
+        raise CaptureError(f"{path}: must be a {kind}, but it is something else or cannot be examined; move it out")
+    return False

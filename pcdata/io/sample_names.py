@@ -1,0 +1,176 @@
+"""The order of sample names, and which of them can be told apart: one answer for every layout and every list."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from decimal import Decimal
+
+from pcdata.errors import CaptureError
+
+_SHOWN = 5  # names in a message before "and n more"
+# A minus belongs to a number at the start of a name and after one of "_ =": "t_-5"; elsewhere a dash divides, as in
+# "frame-000840" and "2024-01-02". A point is a decimal one only where the number is the whole name, "1305031102.175",
+# and no two names are one number then: "1.1" and "1.10" are counted, as in scene 1, frames 1 and 10.
+_DECIMAL = re.compile(r"-?[0-9]+\.[0-9]+")
+_PART = re.compile(r"((?:(?<![^_ =])-)?[0-9]+)")
+_LAST = re.compile(r"[0-9]+\Z")
+_HEX = re.compile(r"[0-9a-f]+|[0-9A-F]+")
+_MAX_POSITION = 10**18  # what fits into 64 bits
+
+_Key = tuple[tuple[int, Decimal, str], ...]  # numbers before texts
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Sort names as a person counts: 2 before 10, ``frame_2_left`` before ``frame_10_left``; ties by the text.
+
+    Numbers are compared by value, whatever their length and leading zeros, one after another where a name has several.
+    Names that count in hexadecimal digits (``9, a, 10``, or all of one length) stand in that order.
+    """
+    names = list(names)
+    keys = _keys(names)
+    return sorted(names, key=lambda name: (keys[name], name))
+
+
+def positions(names: Sequence[str]) -> dict[str, int]:
+    """Return the position of every name in the sequence.
+
+    That is the number the names end in where they are alike before it, else the place in order.
+    """
+    keys = _keys(names)
+    alike = len({key[:-1] for key in keys.values()}) == 1 and _hex_prefix(names) is None
+    if alike and all(key and _is_position(key[-1]) for key in keys.values()):
+        return {name: int(keys[name][-1][1]) for name in names}
+    return {name: place for place, name in enumerate(in_order(names))}
+
+
+def in_order_of_last_number(names: Iterable[str]) -> list[str]:
+    """Sort names by the number that they end in if all do, those of one number as :func:`in_order`; else as that."""
+    ordered = in_order(names)
+    ends = {name: match for name in ordered if (match := _LAST.search(name))}
+    return sorted(ordered, key=lambda name: Decimal(ends[name][0])) if len(ends) == len(ordered) else ordered
+
+
+def check_names(where: str, names: Iterable[str]) -> None:
+    """Require names that can be stored, shown and told apart.
+
+    Raises:
+        CaptureError: a name is no UTF-8, or two differ only in leading zeros or in how Unicode writes a letter.
+    """
+    names = list(names)
+    check_utf8(where, names)
+    seen: dict[_Key, str] = {}
+    for name, key in _keys(names).items():
+        if key in seen:
+            raise CaptureError(
+                f"{where}: {seen[key]!r} and {name!r} are one name written in two ways ({_difference(seen[key], name)})"
+                ", so their order is not certain; rename or remove one"
+            )
+        seen[key] = name
+
+
+def check_utf8(where: str, names: Iterable[str]) -> None:
+    """Require texts of UTF-8, which every file that lists names is written in.
+
+    Raises:
+        CaptureError: a file or folder has a name of other bytes, which Python holds as lone surrogates.
+    """
+    broken = [name for name in names if not _is_utf8(name)]
+    if broken:
+        shown = ", ".join(str(os.fsencode(name)) if _from_bytes(name) else ascii(name) for name in broken[:_SHOWN])
+        raise CaptureError(
+            f"{where}: names must be UTF-8 text, but {shown}{_more(broken)} {'is' if len(broken) == 1 else 'are'} not: "
+            "what is built from them could not be read back; rename, such as with convmv or in a file manager"
+        )
+
+
+def name_some(names: Iterable[str]) -> str:
+    """Return the first few names in order and how many more there are."""
+    listed = in_order(names)
+    return ", ".join(listed[:_SHOWN]) + _more(listed)
+
+
+def same_but_for_writing(missing: Iterable[str], spare: Iterable[str]) -> str:
+    """Say in words that names without a partner have one that is written in another way; "" if not."""
+    spare, missing = list(spare), list(missing)
+    keys = _keys([*spare, *missing])
+    partner = {keys[name]: name for name in spare}
+    for name in missing:
+        other = partner.get(keys[name], name)
+        if other != name:
+            return f"; {name!r} and {other!r} are written in two ways ({_difference(name, other)}): rename one of them"
+    return ""
+
+
+def _keys(names: Sequence[str]) -> dict[str, _Key]:
+    """Return what names are sorted by; two with equal keys are one name in two ways of writing."""
+    prefix = _hex_prefix(names)
+    if prefix is not None:
+        return {name: (_text(prefix), _number(int(name[len(prefix) :], 16))) for name in names}
+    decimals = {Decimal(name) for name in {*names} if _DECIMAL.fullmatch(name)}
+    with_point = len(decimals) == sum(_DECIMAL.fullmatch(name) is not None for name in {*names})
+    return {name: (_number(name),) if with_point and _DECIMAL.fullmatch(name) else _parts(name) for name in names}
+
+
+def _parts(name: str) -> _Key:
+    parts = _PART.split(unicodedata.normalize("NFC", name))
+    return tuple(_number(part) if place % 2 else _text(part) for place, part in enumerate(parts) if part)
+
+
+def _number(digits: str | int) -> tuple[int, Decimal, str]:
+    return 0, Decimal(digits), ""  # exact for any number of digits
+
+
+def _text(text: str) -> tuple[int, Decimal, str]:
+    return 1, Decimal(0), text
+
+
+def _hex_prefix(names: Sequence[str]) -> str | None:
+    """Return what stands before the hexadecimal numbers that all names end in; None if they do not count so."""
+    first, last = min(names, default=""), max(names, default="")
+    alike = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(first, last))
+    prefix = "".join(letter for letter, _ in alike).rstrip("0123456789abcdefABCDEF")
+    return prefix if _count_in_hex([name[len(prefix) :] for name in names]) else None
+
+
+def _count_in_hex(ends: Sequence[str]) -> bool:
+    """Say whether these are hexadecimal numbers: of one length, or counted on from digits to letters."""
+    text = "".join(ends)
+    if not ends or not _HEX.fullmatch(text) or not all(ends) or text.isdecimal() or text.isalpha():
+        return False
+    return len(set(map(len, ends))) == 1 or (
+        any(end.isdecimal() for end in ends) and any(end[0].isalpha() for end in ends)
+    )
+
+
+def _is_position(token: tuple[int, Decimal, str]) -> bool:
+    kind, number, _ = token
+    return kind == 0 and 0 <= number < _MAX_POSITION and number == int(number)
+
+
+def _difference(first: str, second: str) -> str:
+    alike = unicodedata.normalize("NFC", first) == unicodedata.normalize("NFC", second)
+    return f"Unicode: {first!a} and {second!a}" if alike else "zeros that do not count"
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _from_bytes(name: str) -> bool:
+    try:
+        os.fsencode(name)
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _more(names: Sequence[str]) -> str:
+    return f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
