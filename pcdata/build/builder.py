@@ -140,7 +140,9 @@ def _write_samples(
                 if config.output.keep_raw:
                     _keep_raw(capture, partial / "raw" / key)
             except Exception as error:
-                add_note(error, f"sample {sample_id!r} of {source!r}")
+                way_out = isinstance(error, REFUSALS) and not skip_refused
+                hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
+                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}")
                 raise
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
             report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))

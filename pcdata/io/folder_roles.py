@@ -42,6 +42,8 @@ def role_folders(path: Path, folders: Mapping[str, str | None] | None) -> dict[s
         CaptureError: a named folder is missing, or one looks like a role that is neither read nor left out.
     """
     where = f"folder source {path}"
+    if not isinstance(folders, Mapping | None):
+        raise ConfigError(f"{where}: folders must map roles to names, such as {{'pose': 'pose'}}, got {folders!r:.200}")
     named = dict(folders or {})
     _check_named(where, named)
     found = {}

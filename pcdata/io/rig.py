@@ -11,7 +11,7 @@ from pcdata.errors import CaptureError, FrameError
 from pcdata.io.calibration import Calibration
 from pcdata.io.folder import FolderSource, opened_calibration
 from pcdata.io.joined_views import join_views
-from pcdata.io.listing import absolute, check_links, entries, is_folder, unread_entries
+from pcdata.io.listing import absolute, check_links, entries, is_dangling, is_folder, unread_entries
 from pcdata.io.sample_names import check_names, in_order_of_last_number, name_some
 from pcdata.io.source import Source
 from pcdata.structures import DepthFrame
@@ -88,12 +88,15 @@ class RigSource(Source):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Two or more folders, each of the layout ``folder``."""
+        """Two or more folders, each of the layout ``folder``; a link to nothing may stand for one."""
         try:
-            folders = [entry for entry in entries(path) if is_folder(entry)]
+            found = entries(path)
         except CaptureError:
             return False
-        return len(folders) > 1 and all(map(FolderSource.recognises, folders))
+        # A link to nothing counts as the camera that it may stand for, so that opening names it.
+        folders = [entry for entry in found if is_folder(entry)]
+        lost = [entry for entry in found if is_dangling(entry)]
+        return len(folders) > 0 and len(folders + lost) > 1 and all(map(FolderSource.recognises, folders))
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by camera and role, such as ``left/depth``."""

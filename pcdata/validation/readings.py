@@ -117,7 +117,10 @@ def _saturation(readings: Tensor, limits: Limits, metres_per_unit: float | None,
         advice = "clipped at the end of the sensor's range: store 0 there instead"
         if code is not None:
             found += f", stored as {stored}, {code}"
-            advice = f"{stored} marks 'no reading' in some formats: open the source with invalid_values=({stored},)"
+            advice = f"{stored} marks 'no reading' in some formats: say so: --invalid-values {stored}, or "
+            advice += (
+                f'"invalid_values": [{stored}] in intrinsics.json, in Python open_source(invalid_values=[{stored}])'
+            )
     return graded(
         "saturation",
         0.0 if pile is None else pile.fraction,

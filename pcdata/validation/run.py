@@ -94,7 +94,8 @@ def check_of_error(error: PcdataError) -> Check:
         name=next(names, READABLE),
         verdict=Verdict.FAIL,
         found=str(error),
-        advice="see the message; this capture is refused wherever it is read",
+        advice="see the message; refused wherever it is read: leave it out of a build with --skip ID, or all such ones "
+        "with --skip-refused",
     )
 
 

@@ -142,7 +142,7 @@ def test_a_file_whose_name_is_no_utf8_is_refused(tmp_path: Path) -> None:
 
 LINKS = [
     (lambda root: folder(root, ["1", "2"]), place)
-    for place in ("depth/2.png", "color/2.png", "poses", "color", "depth", "intrinsics.json", "timestamps.json", "pose")
+    for place in ("depth/2.png", "color/2.png", "poses", "color", "depth", "intrinsics.json", "timestamps.json")
 ]
 LINKS += [(rig, "right"), (rig, "third"), (rig, "left/depth/1.png"), (rig, "left/intrinsics.json")]
 LINKS += [(scenes, f"frame-10.{end}") for end in ("depth.png", "color.png", "pose.txt")]
@@ -158,6 +158,24 @@ def test_a_link_to_nothing_is_an_error_that_names_it(layout, place: str, tmp_pat
     with pytest.raises(CaptureError, match="link to nothing") as caught:
         open_source(root)
     assert f"{root / place} -> /nowhere/at/all" in str(caught.value)
+
+
+def test_a_lost_folder_of_another_name_is_told(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    shutil.rmtree(root / "poses")
+    lose(root / "pose")
+    with pytest.raises(CaptureError, match="link to nothing"):
+        open_source(root)
+
+
+def test_links_of_all_roles_are_named_in_one_message(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1", "2"])
+    lose(root / "color" / "1.png")
+    lose(root / "depth" / "2.png")
+    with pytest.raises(CaptureError, match="2 links to nothing") as caught:
+        open_source(root)
+    assert str(root / "color" / "1.png") in str(caught.value)
+    assert str(root / "depth" / "2.png") in str(caught.value)
 
 
 def test_a_lost_capture_and_a_circle_of_links_are_told(tmp_path: Path) -> None:

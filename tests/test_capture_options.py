@@ -1,0 +1,152 @@
+"""Every option of every capture layout can be given on the command line, and is checked wherever it comes from."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pcdata import open_source
+from pcdata.cli.main import main
+from pcdata.cli.options import _FLAGS, KINDS, add_capture_options, attribute_of, given_options
+from pcdata.errors import CaptureError, ConfigError, PcdataError, UnitError
+from pcdata.io import LAYOUTS, CaptureCamera, read_capture_camera, write_capture_camera
+
+SIZE = (6, 8)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    root = tmp_path / "capture"
+    (root / "depth").mkdir(parents=True)
+    depth = np.full(SIZE, 800, np.uint16)
+    depth[0] = 65535
+    Image.fromarray(depth).save(root / "depth" / "1.png")
+    state(root)
+    return root
+
+
+def state(root: Path, **changes: object) -> None:
+    stated = {"width": 8, "height": 6, "fx": 10.0, "fy": 10.0, "cx": 3.5, "cy": 2.5, "metres_per_unit": 0.001}
+    (root / "intrinsics.json").write_text(json.dumps(stated | changes))
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_capture_options(parser)
+    return parser.parse_args(words)
+
+
+def test_flags_and_kinds_are_those_of_the_layouts() -> None:
+    options = {name for layout in LAYOUTS.values() for name in inspect.signature(layout).parameters} - {"path"}
+    assert set(_FLAGS) <= options
+    assert options - set(_FLAGS) == set(), "give the new option a flag, so that --help tells of it"
+    assert tuple(LAYOUTS) == KINDS
+
+
+def test_every_flag_becomes_the_option_of_python() -> None:
+    words = {
+        "metres_per_unit": (["0.001"], 0.001),
+        "invalid_values": (["65535,4095"], [65535, 4095]),
+        "background_label": (["0"], 0),
+        "calibration": (["c.yaml"], "c.yaml"),
+        "camera": (["left"], "left"),
+        "frame_id": (["base"], "base"),
+        "folders": (["color=rgb"], {"color": "rgb"}),
+        "intrinsics": (["585", "585", "320", "240"], [585, 585, 320, 240]),
+        "registered": ([], True),
+        "max_time_apart": (["0.05"], 0.05),
+    }
+    for name, (flag, _) in _FLAGS.items():
+        text, value = words[name]
+        assert given_options(parsed(flag, *text)) == {name: value}
+        assert getattr(parsed(), attribute_of(flag)) is None
+    assert given_options(parsed("--folder", "color=rgb", "--folder", "pose=")) == {
+        "folders": {"color": "rgb", "pose": None}
+    }
+
+
+def test_any_option_can_be_given_by_its_name(capture: Path) -> None:
+    options = given_options(parsed("--option", "invalid_values=[65535]", "--option", "frame_id=base"))
+    assert options == {"invalid_values": [65535], "frame_id": "base"}
+    with pytest.raises(ConfigError, match="given twice"):
+        given_options(parsed("--invalid-values", "1", "--option", "invalid_values=[2]"))
+    assert main(["inspect", str(capture), "--option", "invalid_value=[1]"]) == 2
+
+
+@pytest.mark.parametrize("command", ["inspect", "validate", "build", "export", "calib check"])
+def test_every_command_on_captures_takes_them_and_lists_the_kinds(command: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for flag in (*(flag for flag, _ in _FLAGS.values()), "--option", "--skip", "--skip-file", *KINDS):
+        assert flag in text
+
+
+def test_a_value_that_means_no_reading_is_sayable_at_every_door(capture: Path, capsys) -> None:
+    assert main(["inspect", str(capture), "--invalid-values", "65535"]) == 0
+    assert "40 of 48 pixels valid" in capsys.readouterr().out
+    assert open_source(capture, invalid_values=[65535]).load("1").depth.max() < 1
+    state(capture, invalid_values=[65535])
+    assert open_source(capture).load("1").depth.max() < 1
+    assert open_source(capture, invalid_values=[65535]).ids == ["1"]
+    with pytest.raises(CaptureError, match="drop one"):
+        open_source(capture, invalid_values=[4095])
+
+
+def test_the_calibration_file_keeps_values_that_mean_no_reading(capture: Path, tmp_path: Path) -> None:
+    state(capture, invalid_values=[65535, 4095])
+    read = read_capture_camera(capture / "intrinsics.json")
+    assert isinstance(read, CaptureCamera)
+    assert read.invalid_values == (65535, 4095)
+    write_capture_camera(tmp_path / "again.json", read)
+    assert read_capture_camera(tmp_path / "again.json").invalid_values == (65535, 4095)
+
+
+@pytest.mark.parametrize("values", ["65535", 65535, [-1], [65536], [1.5], [True], ["1"], None])
+def test_wrong_values_that_mean_no_reading_are_refused(values: object, capture: Path) -> None:
+    with pytest.raises(ConfigError, match="invalid_values must list whole numbers"):
+        open_source(capture, invalid_values=values)
+    if values is not None:
+        state(capture, invalid_values=values)
+        with pytest.raises(CaptureError, match="invalid_values must list whole numbers"):
+            open_source(capture)
+
+
+@pytest.mark.parametrize("unit", ["0.001", -0.001, 0, True, [0.001], 1e400, 1000])
+def test_a_wrong_unit_is_refused_at_every_door(unit: object, capture: Path) -> None:
+    state(capture, metres_per_unit=unit)
+    with pytest.raises((UnitError, CaptureError)):
+        open_source(capture)
+    state(capture, metres_per_unit=None)
+    with pytest.raises(UnitError):
+        open_source(capture, metres_per_unit=unit)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"background_label": "0"},
+        {"background_label": -1},
+        {"background_label": 1.5},
+        {"frame_id": 3},
+        {"frame_id": " "},
+        {"camera": 3},
+        {"folders": [1]},
+    ],
+)
+def test_wrong_options_are_typed_errors(options: dict[str, object], capture: Path) -> None:
+    with pytest.raises(PcdataError):
+        open_source(capture, **options)
+
+
+@pytest.mark.parametrize("intrinsics", [(585, 585), "abcd", (1, 2, 3, "4"), (1, 2, 3, float("nan")), 5])
+def test_wrong_intrinsics_are_typed_errors(intrinsics: object, tmp_path: Path) -> None:
+    Image.fromarray(np.full(SIZE, 800, np.uint16)).save(tmp_path / "frame-1.depth.png")
+    with pytest.raises(ConfigError, match="four numbers"):
+        open_source(tmp_path, intrinsics=intrinsics)
