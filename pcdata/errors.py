@@ -92,12 +92,14 @@ class MissingExtraError(PcdataError, ImportError):
 def add_note(error: BaseException, note: str) -> None:
     """Attach context to an exception in flight, keeping its type and traceback.
 
-    Python 3.10 has no ``add_note``: there the note joins the message.
+    Python 3.10 has no ``add_note``: there the note joins the message, or is kept where 3.11 keeps it.
     """
     if hasattr(error, "add_note"):
         error.add_note(note)
     elif error.args and isinstance(error.args[0], str):
         error.args = (f"{error.args[0]}\n{note}", *error.args[1:])
+    else:
+        error.__notes__ = [*getattr(error, "__notes__", []), note]  # type: ignore[attr-defined]
 
 
 def near_matches(word: str, known: Iterable[str]) -> str:

@@ -15,6 +15,7 @@ from pcdata import CachedCloudDataset, PointCloud, open_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PcdataError
 from pcdata.io.manifest import Manifest, key_of
+from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "pt"]
 
@@ -156,14 +157,14 @@ def test_a_failure_in_the_middle_leaves_nothing(tmp_path, configure, form, fault
         build_dataset(configure(f"output: {{format: {form}}}"), Clouds(samples), tmp_path / "deep" / "er" / "out")
     assert not list(tmp_path.iterdir())
     if isinstance(fault, Exception):
-        assert any("'bad one' of Clouds()" in note for note in caught.value.__notes__)
+        assert "'bad one' of Clouds()" in told(caught.value)
 
 
 def test_a_step_that_fails_leaves_nothing_and_names_step_and_sample(tmp_path, configure):
     short = Clouds({"ok": cloud(), "empty": cloud(0)})
     with pytest.raises(PcdataError) as caught:
         build_dataset(configure(), short, tmp_path / "out")
-    notes = "\n".join(caught.value.__notes__)
+    notes = told(caught.value)
     assert "FarthestPointSample" in notes
     assert "'empty'" in notes
     assert not list(tmp_path.iterdir())
@@ -181,7 +182,7 @@ def test_a_step_that_fails_leaves_nothing_and_names_step_and_sample(tmp_path, co
 def test_a_cloud_that_cannot_be_stored_is_a_cache_error_that_names_it(tmp_path, configure, bad):
     with pytest.raises(CacheError) as caught:
         build_dataset(configure(), Clouds({"a": cloud(), "odd": bad}), tmp_path / "out")
-    assert any("'odd'" in note for note in caught.value.__notes__)
+    assert "'odd'" in told(caught.value)
     assert not list(tmp_path.iterdir())
 
 

@@ -14,6 +14,7 @@ from torch.utils.data import Subset
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataError
 from pcdata.transforms import MaskDepth, Pipeline, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
+from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "pt"]
 
@@ -272,7 +273,7 @@ def test_an_error_keeps_its_type_and_names_the_sample(source):
     assert dataset[0].num_points == 5
     with pytest.raises(Mine, match="unreadable") as caught:
         dataset[1]
-    assert any("'bad one'" in note for note in caught.value.__notes__)
+    assert "'bad one'" in told(caught.value)
 
 
 def test_a_step_that_fails_names_step_sample_and_cloud():
@@ -283,7 +284,7 @@ def test_a_step_that_fails_names_step_sample_and_cloud():
     dataset = CloudDataset(FixedSource({"s1": normalized}), Pipeline(cloud=[step]))
     with pytest.raises(PcdataError, match="metres") as caught:
         dataset[0]
-    notes = "\n".join(caught.value.__notes__)
+    notes = told(caught.value)
     assert "RemoveRadiusOutliers" in notes
     assert "'s1'" in notes
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pcdata.errors import CaptureError, NonFiniteError, PcdataError, ShapeError, UnitError
 from pcdata.io import lzf, read_pcd, write_pcd
 from pcdata.structures import Kind, PointCloud
+from tests.messages import told
 
 ENCODINGS = ["ascii", "binary", "binary_compressed"]
 
@@ -194,7 +195,7 @@ def test_a_header_that_contradicts_itself_or_the_data_is_refused(
     path = write(tmp_path / "c.pcd", pcd(XYZ, COORDINATES.T, encoding, **changes))
     with pytest.raises(CaptureError, match=message) as caught:
         read_pcd(path)
-    assert "c.pcd" in str(caught.value) or any("c.pcd" in note for note in caught.value.__notes__)
+    assert "c.pcd" in told(caught.value)
 
 
 def test_compressed_lengths_are_checked_before_anything_is_allocated(tmp_path: Path) -> None:
@@ -368,9 +369,9 @@ def test_what_open3d_writes_is_read_here(tmp_path: Path, ascii_: bool, compresse
 @pytest.mark.open3d
 def test_real_clouds_equal_what_open3d_reads(test_data: Path) -> None:
     o3d = pytest.importorskip("open3d")
-    files = sorted([*(test_data / "osd").glob("*.pcd"), *(test_data / "pcd").glob("*.pcd")])
-    assert len(files) == 14
-    for file in files:
+    learning_scenes = [f"osd/learn{number}.pcd" for number in (0, 8, 16, 17, 24, 25, 32, 33, 44)]
+    for name in (*learning_scenes, "pcd/milk_cartoon_all_small_clorox.pcd", "pcd/table_scene_mug_stereo_textured.pcd"):
+        file = test_data / name
         expected = o3d.io.read_point_cloud(str(file), remove_nan_points=True, remove_infinite_points=True)
         found = read_pcd(file)
         assert np.array_equal(found.points.numpy(), np.asarray(expected.points)), file

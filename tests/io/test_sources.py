@@ -17,6 +17,7 @@ from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, Uni
 from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
 from pcdata.io.sample_names import in_order
 from pcdata.structures import DepthFrame, PointCloud
+from tests.messages import told
 
 HEIGHT, WIDTH = 6, 8
 K: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
@@ -320,7 +321,7 @@ def test_an_image_of_another_size_than_its_depth_is_refused(folder: Path, role: 
     image(folder / role / "a_1.png", array)
     with pytest.raises(CaptureError, match=r"image is 4x4 .* but its depth is 8x6") as caught:
         open_source(folder).load("a_1")
-    assert any("'a_1'" in note for note in caught.value.__notes__)
+    assert "'a_1'" in told(caught.value)
 
 
 def test_intrinsics_of_another_resolution_are_refused_with_the_remedy(folder: Path) -> None:
@@ -460,11 +461,10 @@ def test_the_real_graspnet_frame_has_the_documented_facts(test_data: Path) -> No
 
 def test_the_real_seven_scenes_sequence_has_the_documented_facts(test_data: Path) -> None:
     source = open_source(test_data / "seven_scenes")
-    assert len(source) == 50
-    for place in (0, 25, 49):
-        frame = source.load(source.ids[place])
+    for number in (0, 500, 980):
+        frame = source.load(f"frame-{number:06d}")
         assert isinstance(frame, DepthFrame)
-        assert frame.capture_index == 20 * place
+        assert frame.capture_index == number
         assert frame.size == (480, 640)
         assert float(frame.depth.max()) < 65
         assert frame.camera.intrinsics[0, 0, 0] == 585
@@ -472,7 +472,7 @@ def test_the_real_seven_scenes_sequence_has_the_documented_facts(test_data: Path
 
 def test_the_real_labelled_clouds_open_as_one_source(test_data: Path) -> None:
     source = open_source(test_data / "osd")
-    assert len(source) == 12
+    assert {"learn0", "learn16", "learn44"} <= set(source.ids)
     cloud = source.load("learn0")
     assert isinstance(cloud, PointCloud)
     assert cloud.labels is not None

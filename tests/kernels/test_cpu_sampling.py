@@ -162,16 +162,16 @@ def test_ctrl_c_stops_farthest_point_sampling_within_a_second():
         raise KeyboardInterrupt
 
     points = random(400_000, 3)
-    before = signal.signal(signal.SIGALRM, interrupt)
+    before = signal.signal(signal.SIGPROF, interrupt)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.2)
-        started = time.perf_counter()
+        started = time.process_time()  # like the timer, it does not run while other processes have the cores
+        signal.setitimer(signal.ITIMER_PROF, 0.2)
         with pytest.raises(KeyboardInterrupt):
             farthest_point_sample(points, num_samples=400_000, backend="cpu")
-        assert time.perf_counter() - started < 1.2
+        assert time.process_time() - started < 1.2
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 @pytest.mark.parametrize("cells_per_extent", [0.5, 7.0, 300.0, 1e7, 1e17])

@@ -12,6 +12,7 @@ from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
 from pcdata.rng import seeded
 from pcdata.structures import DepthFrame, PointCloud
 from tests.factories import assert_same, cloud_in_base, cloud_in_camera, differences, frame_with_counts, tree
+from tests.messages import told
 
 BOX = {"frame": "base", "lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
 
@@ -156,7 +157,7 @@ def test_an_error_tells_step_and_cloud():
             cloud_in_base((7,))
         )
     error = caught.value
-    notes = "\n".join(getattr(error, "__notes__", [str(error)]))
+    notes = told(error)
     assert "in CropWorkspace(frame='base', lower=(8.0, 8.0, 8.0)" in notes
     assert "PointCloud(7 points in 'base'" in notes
 

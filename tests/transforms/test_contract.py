@@ -18,6 +18,7 @@ from pcdata.structures import METRE, NORMALIZED, DepthFrame, PointCloud
 from pcdata.transforms.base import field_names
 from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
 from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, torch_defaults, tree
+from tests.messages import told
 from tests.transforms.examples import ALL, EXAMPLES, NAMES, Example
 
 COUNTS = (120, 90, 150)
@@ -466,8 +467,7 @@ def test_points_that_require_a_gradient_come_to_the_same_result(example):
 def test_an_error_says_in_which_step_it_happened(example):
     with pytest.raises(DTypeError) as caught:
         run(example, torch.zeros(2, 3))
-    notes = "\n".join(getattr(caught.value, "__notes__", [])) or str(caught.value)
-    assert "in " in notes
+    assert "in " in told(caught.value)
 
 
 @each_example

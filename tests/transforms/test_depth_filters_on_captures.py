@@ -31,7 +31,7 @@ def recording(test_data: Path) -> list[DepthFrame]:
 def stream(test_data: Path) -> list[DepthFrame]:
     """A tabletop on which something moves: four frames, nearly without holes."""
     camera = Camera.pinhole(fx=927.17, fy=927.37, cx=651.32, cy=349.62, size=(720, 1280))
-    files = sorted((test_data / "tabletop_stream").glob("depth_*.npy"))[:4]
+    files = [test_data / "tabletop_stream" / f"depth_{number:03d}.npy" for number in range(4)]
     depths = [torch.from_numpy(np.load(file).astype(np.float32))[None] / 1000 for file in files]
     return [DepthFrame(depth=depth, camera=camera) for depth in depths]
 
