@@ -99,7 +99,7 @@ def add_note(error: BaseException, note: str) -> None:
     elif error.args and isinstance(error.args[0], str):
         error.args = (f"{error.args[0]}\n{note}", *error.args[1:])
     else:
-        error.__notes__ = [*getattr(error, "__notes__", []), note]  # type: ignore[attr-defined]
+        error.__notes__ = [*getattr(error, "__notes__", []), note]
 
 
 def near_matches(word: str, known: Iterable[str]) -> str:
