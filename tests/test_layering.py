@@ -16,7 +16,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "extras"},
+    {"checks", "lengths", "rng", "extras", "array_files"},
     {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -38,6 +38,7 @@ ALLOWED_SIBLINGS = {("cli", "demo"), ("__main__", "cli")}
 OUTSIDE = {
     "errors": set(),
     "extras": set(),
+    "array_files": {"numpy"},
     "files": {"numpy"},
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},

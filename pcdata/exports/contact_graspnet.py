@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdata.array_files.npz import write_npz
 from pcdata.exports.checks import object_ids, one_view
 from pcdata.exports.contracts import require_depth
 from pcdata.exports.target import Item, Note, Samples, Target
@@ -64,7 +65,8 @@ class ContactGraspNet(Target):
                 arrays["rgb"] = np.ascontiguousarray(frame.colors[0].numpy()[..., ::-1])
             if not ((depth > near) & (depth < far)).any():
                 note(f"some captures have no depth within {near}..{far} m, which inference.py crops to; use --z_range")
-            np.savez(folder / item.paths[0], allow_pickle=False, **arrays)
+            with open(folder / item.paths[0], "xb") as file:
+                write_npz(file, arrays)
 
 
 def _z_range() -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import ConfigError, near_matches
-from pcdata.files import existing_file
+from pcdata.array_files.npz import array_names, read_array
+from pcdata.array_files.packing import check_packing
+from pcdata.array_files.zip_archive import ZipArchive
+from pcdata.errors import CacheError, ConfigError, near_matches
+from pcdata.files import open_input
 from pcdata.io.listing import visible_files
 from pcdata.io.sample_names import check_names, in_order
 
@@ -101,11 +105,13 @@ def _numbers(place: str, key: str, value: Any, count: int) -> NDArray[np.float32
 
 
 def _read_npz(place: str, path: Path) -> dict[str, NDArray[Any]]:
-    existing_file(place, path, max_bytes=_MAX_BYTES)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except Exception as error:  # zipfile and numpy raise many types on damaged bytes
-        raise ConfigError(
-            f"{place}: {path} cannot be read: {error}; save it with np.savez, texts as np.array"
-        ) from error
+    with open_input(place, path, max_bytes=_MAX_BYTES, error=ConfigError) as file:
+        try:
+            archive = ZipArchive(file, os.fstat(file.fileno()).st_size)
+            arrays = array_names(archive)
+            check_packing("it", sum(member.size for member in arrays.values()), archive.size)
+            return {name: read_array(archive, member) for name, member in arrays.items()}
+        except (CacheError, OSError, MemoryError) as error:
+            raise ConfigError(
+                f"{place}: {path} cannot be read: {error}; save it with np.savez, texts as np.array"
+            ) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,12 +13,14 @@ from typing import Any
 from urllib.parse import quote
 
 from pcdata.errors import CacheError
+from pcdata.files import read_bytes
 from pcdata.io.record import parse_info
 from pcdata.io.stores import COMPRESSIONS, STORES, Compression, Format
 
 SCHEMA = "pcdata.dataset/1"
 FILE_NAME = "dataset.json"
 
+_CHECKSUM = "checksum"
 _MAX_BYTES = 256 * 2**20  # about a million samples
 _MAX_KEY = 200  # file names end at 255 bytes
 
@@ -46,9 +49,10 @@ class Manifest:
     schema: str = SCHEMA
 
     def write(self, folder: Path) -> None:
-        """Write the file and force it to disk."""
+        """Write the file, with a checksum of its own contents, and force it to disk."""
+        content = asdict(self)
         with open(folder / FILE_NAME, "x", encoding="utf-8") as file:
-            json.dump(asdict(self), file, indent=1, allow_nan=False)
+            json.dump({**content, _CHECKSUM: checksum_of(content)}, file, indent=1, allow_nan=False)
             file.write("\n")
             file.flush()
             os.fsync(file.fileno())
@@ -63,20 +67,37 @@ class Manifest:
         path = Path(folder) / FILE_NAME
         if not path.is_file():
             raise CacheError(f"{folder}: not a pcdata dataset: it has no {FILE_NAME}; make one with 'pcdata build'")
+        text = read_bytes("dataset", path, max_bytes=_MAX_BYTES, error=CacheError)
         try:
-            if path.stat().st_size > _MAX_BYTES:
-                raise CacheError(f"{path.stat().st_size} bytes are too many for a manifest")
-            content = parse_info(path.read_bytes())
+            content = parse_info(text)
             if content.get("schema") != SCHEMA:
-                raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r}; rebuild the dataset")
+                raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}; rebuild the dataset")
+            found = content.pop(_CHECKSUM, None)
             manifest = cls(**{**content, "samples": [Sample(**sample) for sample in content["samples"]]})
             _check(manifest)
+            if found is not None and found != checksum_of(content):
+                raise CacheError(
+                    "was changed after it was written: its checksum does not fit its contents; copy it again from "
+                    "where the dataset was built, or rebuild the dataset"
+                )
         except CacheError as error:
             raise CacheError(f"{path}: {error}") from error
-        except (TypeError, ValueError, KeyError, OSError) as error:
+        except (TypeError, ValueError, KeyError, OverflowError, RecursionError, MemoryError) as error:
             kind = type(error).__name__
-            raise CacheError(f"{path}: cannot be read ({kind}: {error}); rebuild the dataset") from error
+            raise CacheError(f"{path}: cannot be read ({kind}: {error!s:.500}); rebuild the dataset") from error
+        if found is None:
+            warnings.warn(
+                f"{path}: has no checksum, so it was written by an earlier version or by hand, and later edits cannot "
+                "be told; rebuild the dataset to have one",
+                stacklevel=2,
+            )
         return manifest
+
+
+def checksum_of(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a manifest's contents as canonical JSON, without the checksum itself."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _check(manifest: Manifest) -> None:

@@ -41,8 +41,15 @@ class Record:
         return json.dumps(self.info, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
     def digest(self) -> str:
-        """SHA-256 over names, dtypes, shapes and bytes of all arrays and over the facts."""
-        total = hashlib.sha256(self.info_text().encode())
+        """SHA-256 over names, dtypes, shapes and bytes of all arrays and over the facts.
+
+        Raises:
+            CacheError: the facts hold a number that JSON does not have.
+        """
+        try:
+            total = hashlib.sha256(self.info_text().encode())
+        except (ValueError, RecursionError) as error:
+            raise CacheError(f"the JSON part cannot be written again: {error}") from error
         for name in sorted(self.arrays):
             array = np.ascontiguousarray(self.arrays[name])
             total.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
@@ -123,11 +130,15 @@ def cloud_from_record(record: Record) -> PointCloud:
 
 
 def parse_info(text: str | bytes) -> dict[str, Any]:
-    """Parse the facts of a record or manifest.
+    """Parse the facts of a record or manifest; it takes at most about 30 times the memory of the text.
 
     Raises:
-        CacheError: not a JSON object.
+        CacheError: not a JSON object; or more lists and objects than numbers and names in them could fill.
     """
+    brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    # An empty one takes 60 bytes of memory for 3 of text; facts have a name or several numbers in each.
+    if brackets > 10_000 + len(text) // 6:
+        raise CacheError(f"the JSON part has {brackets} lists and objects in {len(text)} bytes: damaged or hostile")
     try:
         info = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import zipfile
+import os
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pcdata.array_files.npz import array_names, read_array
+from pcdata.array_files.packing import check_packing
+from pcdata.array_files.zip_archive import ZipArchive
 from pcdata.errors import CacheError, DTypeError, PcdataError, near_matches
-from pcdata.files import map_npy
-from pcdata.io.claimed_sizes import checked_dataset, checked_members, read_npy
-from pcdata.io.zarr_arrays import zarr_arrays
+from pcdata.files import MAX_STREAMED_BYTES, existing_file, map_npy, open_input
+from pcdata.io.hdf5_arrays import checked_dataset, hard_linked, open_hdf5
+from pcdata.io.zarr_arrays import zarr_array, zarr_names
 
-_MAX_FILE_BYTES = 1 << 44  # what is read of a file is bounded by what it claims, see _check_packing
-
-# Measured numbers do not pack tightly; zeros do, and a few kilobytes of them unpack to all the memory there is.
-_MAX_PACKING = 100
-_ALWAYS = 1 << 28  # bytes that may be unpacked however small the file is: a cloud that is all padding
+_MAX_NAMES = 1000  # arrays that are looked at to say what there is
+_SHOWN = 20  # of them in a message
 
 
 class StoredArray:
@@ -62,31 +63,25 @@ def stored_arrays(path: str | Path, names: Collection[str]) -> Iterator[dict[str
         DTypeError: an array of texts or objects.
     """
     path = Path(path)
-    if not path.exists():
-        raise CacheError(f"{path}: cannot be read: no such file; check the path (relative to {Path.cwd()})")
     if path.is_dir():
-        found: Mapping[str, Any] = zarr_arrays(path)
-        chosen = {name: _named(path, found, name) for name in names}
-        for name, array in chosen.items():
-            _check_packing(f"{path}: {name}", array.nbytes, array.stored_bytes())
-        yield _arrays(path, chosen)
+        yield _arrays(path, _from_zarr(path, names))
     elif path.suffix == ".npy":
-        found = {"": map_npy("check", path, max_bytes=_MAX_FILE_BYTES)}
+        found = {"": map_npy("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)}
         yield _arrays(path, {name: _named(path, found, name) for name in names})
     elif path.suffix == ".npz":
         with _damage_named(str(path)):
             chosen = _from_npz(path, names)
         yield _arrays(path, chosen)
     elif path.suffix in (".h5", ".hdf5"):
-        import h5py
-
+        existing_file("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)
         with _damage_named(str(path)):
-            file = h5py.File(path, "r")
+            file = open_hdf5(path)
         with file:
             with _damage_named(str(path)):
                 chosen = _from_hdf5(path, file, names)
             yield _arrays(path, chosen)
     else:
+        existing_file("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)
         raise CacheError(f"{path}: is no .npz, .npy, .h5, .hdf5 file and no zarr directory")
 
 
@@ -94,44 +89,66 @@ def _arrays(path: Path, chosen: Mapping[str, Any]) -> dict[str, StoredArray]:
     return {name: StoredArray(f"{path}: {name}" if name else str(path), array) for name, array in chosen.items()}
 
 
+def _from_zarr(path: Path, names: Collection[str]) -> dict[str, Any]:
+    known = dict.fromkeys(zarr_names(path, _MAX_NAMES))
+    chosen = {}
+    for name in names:
+        array = zarr_array(path, name)
+        if array is None:
+            _named(path, {other: None for other in known if other != name}, name)
+        # Texts and objects are refused as such.
+        chosen[name] = array.checked() if array is not None and array.dtype.kind in "biuf" else array
+    return chosen
+
+
 def _from_npz(path: Path, names: Collection[str]) -> dict[str, Any]:
-    with zipfile.ZipFile(path) as archive:
-        members = {member.filename.removesuffix(".npy"): member for member in checked_members(archive, path)}
+    with open_input("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
+        archive = ZipArchive(file, os.fstat(file.fileno()).st_size)
+        members = array_names(archive)
         chosen = {name: _named(path, members, name) for name in names}
         for name, member in chosen.items():
-            _check_packing(f"{path}: {name}", member.file_size, member.compress_size)
-        return {name: read_npy(archive, member) for name, member in chosen.items()}
+            check_packing(f"{path}: {name}", member.size, member.packed)
+        return {name: read_array(archive, member) for name, member in chosen.items()}
 
 
 def _from_hdf5(path: Path, file: Any, names: Collection[str]) -> dict[str, Any]:
     import h5py
 
-    found: list[str] = []
-    file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
     chosen = {}
     for name in names:
-        _named(path, dict.fromkeys(found), name.strip("/"))
-        if file[name].dtype.kind in "biuf":  # texts and objects are refused as such
-            checked_dataset(file[name].parent, name.strip("/").rpartition("/")[2])
-        chosen[name] = file[name]
-        claimed = int(np.prod(chosen[name].shape or (), dtype=object)) * chosen[name].dtype.itemsize
-        _check_packing(f"{path}: {name}", claimed, chosen[name].id.get_storage_size())
+        dataset = hard_linked(file, name.strip("/"))
+        if not isinstance(dataset, h5py.Dataset):
+            _named(path, dict.fromkeys(islice(_datasets_below(file), _MAX_NAMES)), name)
+        elif dataset.dtype.kind in "biuf":
+            chosen[name] = checked_dataset(file, name.strip("/"), path.stat().st_size)
+        else:  # texts and objects are refused as such
+            chosen[name] = dataset
     return chosen
+
+
+def _datasets_below(group: Any) -> Iterator[str]:
+    """Yield the names of datasets, without links; groups that hold themselves are entered once."""
+    import h5py
+
+    waiting, seen = [("", group)], {group.id.__hash__()}
+    while waiting:
+        before, folder = waiting.pop(0)
+        for name in folder:
+            item = hard_linked(folder, name)
+            if isinstance(item, h5py.Dataset):
+                yield before + name
+            elif isinstance(item, h5py.Group) and (mark := item.id.__hash__()) not in seen:
+                seen.add(mark)
+                waiting.append((f"{before}{name}/", item))
 
 
 def _named(path: Path, found: Mapping[str, Any], name: str) -> Any:
     if name not in found:
         known = sorted(found)
-        raise CacheError(f"{path}: no array {name!r}{near_matches(name, known)}; it has {', '.join(known) or 'none'}")
+        shown = ", ".join(f"{other:.100}" for other in known[:_SHOWN]) or "none"
+        more = f" and {len(known) - _SHOWN} others" if len(known) > _SHOWN else ""
+        raise CacheError(f"{path}: no array {name!r:.100}{near_matches(name, known)}; it has {shown}{more}")
     return found[name]
-
-
-def _check_packing(where: str, claimed: int, stored: int) -> None:
-    if claimed > max(_ALWAYS, _MAX_PACKING * stored):
-        raise CacheError(
-            f"{where}: claims {claimed} bytes, stored in {stored}; measured numbers pack at most {_MAX_PACKING} to 1, "
-            "so its header is damaged or it would fill the memory; write it again, uncompressed if it is meant"
-        )
 
 
 @contextmanager
@@ -142,10 +159,12 @@ def _damage_named(where: str) -> Iterator[None]:
     except CacheError as error:
         if str(error).startswith(where):
             raise
-        raise CacheError(f"{where}: {error}; it is damaged or hostile: copy or write it again") from error
-    except (PcdataError, MemoryError):
+        raise CacheError(f"{where}: cannot be read: {error}; damaged or hostile? Copy or write it again") from error
+    except PcdataError:
         raise
-    except Exception as error:  # zipfile, numpy and h5py raise many types on damaged bytes
+    except MemoryError as error:
+        raise CacheError(f"{where}: there is not enough memory to read it ({error}); the file may be fine") from error
+    except Exception as error:  # numpy and h5py raise many types on damaged bytes
         raise CacheError(
             f"{where}: cannot be read ({type(error).__name__}: {error}); damaged, cut short or of another format? "
             "Copy or write it again"

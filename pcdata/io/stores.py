@@ -8,32 +8,27 @@ from __future__ import annotations
 
 import errno
 import os
-import pickletools
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, BinaryIO, ClassVar, Literal
 
 import numpy as np
 import torch
 
+from pcdata.array_files.npz import array_names, read_array, write_npz
+from pcdata.array_files.packing import check_packing
+from pcdata.array_files.zip_archive import ZipArchive
 from pcdata.errors import CacheError
-from pcdata.io.claimed_sizes import checked_dataset, checked_members, read_npy
+from pcdata.files import MAX_STREAMED_BYTES, check_inside, open_input
+from pcdata.io.hdf5_arrays import hard_linked, open_hdf5, read_group
+from pcdata.io.pt_tensors import read_pt
 from pcdata.io.record import Record, parse_info
 
 Format = Literal["hdf5", "npz", "pt"]
 Compression = Literal["none", "lzf", "gzip"]
 
 INFO = "pcdata"  # the name that the JSON text is stored under
-
-# All that a dict of tensors and one text needs. weights_only allows more, such as bytearray(10**12), which allocates.
-_PT_GLOBALS = frozenset(
-    ["torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor_v3", "collections OrderedDict"]
-    + ["torch.storage UntypedStorage", "torch uint16", "torch uint32", "torch uint64"]
-    + [f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")]
-)
-_PT_FORBIDDEN = ("STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4")
 
 
 class Store:
@@ -68,6 +63,28 @@ class Store:
     def close(self) -> None:
         """Flush to disk and close any handle of this process."""
 
+    @contextmanager
+    def _archive(self, path: Path) -> Iterator[ZipArchive]:
+        with self._opened(path) as file:
+            yield ZipArchive(file, os.fstat(file.fileno()).st_size)
+
+    def _opened(self, path: Path) -> BinaryIO:
+        """Open a file of the dataset; links may lead to other files of it."""
+        if not os.path.lexists(path):
+            raise CacheError(f"{path}: the file is missing; rebuild the dataset, or copy it again")
+        # Links are followed only where there is one: that takes longer than opening does.
+        if path.is_symlink() or path.parent.is_symlink():
+            try:
+                check_inside("dataset", path, [self.folder], CacheError)
+            except CacheError as error:
+                raise CacheError(f"{path}: is a link out of the dataset's folder; put the file itself there") from error
+        try:
+            return open_input("dataset", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)
+        except CacheError as error:
+            if isinstance(error.__cause__, PermissionError):
+                raise CacheError(f"{error}; the file itself may be fine") from error
+            raise CacheError(f"{error}; rebuild the dataset, or copy it again") from error
+
 
 class NpzStore(Store):
     """``clouds/<key>.npz``, readable with ``numpy.load``."""
@@ -76,17 +93,17 @@ class NpzStore(Store):
 
     def write(self, key: str, record: Record) -> None:
         """Write one file."""
-        save = np.savez if self.compression == "none" else np.savez_compressed
         with _synced(self.path_of(key)) as file:
-            arrays: dict[str, Any] = {**record.arrays, INFO: np.array(record.info_text())}
-            save(file, allow_pickle=False, **arrays)
+            arrays = {**record.arrays, INFO: np.array(record.info_text())}
+            write_npz(file, arrays, compressed=self.compression != "none")
 
     def read(self, key: str) -> Record:
         """Read one file."""
         path = self.path_of(key)
-        with _damage_named(path), zipfile.ZipFile(path) as archive:
-            members = checked_members(archive, path)
-            arrays = {member.filename.removesuffix(".npy"): read_npy(archive, member) for member in members}
+        with _damage_named(path), self._archive(path) as archive:
+            members = array_names(archive)
+            check_packing("it", sum(member.size for member in members.values()), archive.size)
+            arrays = {name: read_array(archive, member) for name, member in members.items()}
             if INFO not in arrays:
                 raise CacheError(f"has no member {INFO!r}")
             return Record(arrays, parse_info(str(arrays.pop(INFO))))
@@ -109,17 +126,13 @@ class PtStore(Store):
     def read(self, key: str) -> Record:
         """Read one file."""
         path = self.path_of(key)
-        with _damage_named(path):
-            with zipfile.ZipFile(path) as archive:
-                _check_pt(archive, checked_members(archive, path))
-            stored = torch.load(path, weights_only=True, map_location="cpu")
-            if not isinstance(stored, dict) or not isinstance(text := stored.pop(INFO, None), str):
-                raise CacheError(f"must hold a dict with tensors and a text {INFO!r}")
-            for name, value in stored.items():
-                # A stride of 0 makes gigabytes of one stored number.
-                if not isinstance(name, str) or not isinstance(value, torch.Tensor) or not value.is_contiguous():
-                    raise CacheError(f"entry {name!r:.100} must be a contiguous tensor")
-            return Record({name: value.numpy() for name, value in stored.items()}, parse_info(text))
+        with _damage_named(path), self._archive(path) as archive:
+            stored = read_pt(archive)
+            text = stored.pop(INFO, None)
+            arrays = {name: value for name, value in stored.items() if not isinstance(value, str)}
+            if not isinstance(text, str) or len(arrays) != len(stored):
+                raise CacheError(f"must hold a dict with tensors and one text, {INFO!r}")
+            return Record(arrays, parse_info(text))
 
 
 class Hdf5Store(Store):
@@ -158,13 +171,14 @@ class Hdf5Store(Store):
         import h5py
 
         with _damage_named(self.path):
-            file = self._open("r")
-            if not isinstance(file.get(key, getlink=True, default=None), h5py.HardLink):
+            if self._opened_by != os.getpid() or self._file is None:
+                self._opened(self.path).close()
+            group = hard_linked(self._open("r"), key)
+            if group is None:
                 raise CacheError(f"has no group {key!r}")
-            group = file[key]
             if not isinstance(group, h5py.Group):
                 raise CacheError(f"{key!r} must be a group, not a {type(group).__name__}")
-            arrays = {name: checked_dataset(group, name)[()] for name in group}
+            arrays = read_group(group, self.path.stat().st_size)
             if INFO not in arrays:
                 raise CacheError(f"group {key!r} has no dataset {INFO!r}")
             return Record(arrays, parse_info(bytes(arrays.pop(INFO))))
@@ -185,13 +199,11 @@ class Hdf5Store(Store):
         self._written = False
 
     def _open(self, mode: str) -> Any:
-        import h5py
-
         if self._file is None or self._opened_by != os.getpid():
             # A handle that came through fork shares its file position with the parent: never use or close it here.
             if self._file is not None:
                 _INHERITED.append(self._file)
-            self._file = h5py.File(self.path, mode)
+            self._file = open_hdf5(self.path, mode)
             self._opened_by = os.getpid()
         return self._file
 
@@ -235,29 +247,16 @@ def _damage_named(path: Path) -> Iterator[None]:
     """Turn whatever a damaged file makes a library raise into one error that names the file."""
     try:
         yield
-    except FileNotFoundError as error:
-        raise CacheError(f"{path}: the file is missing; rebuild the dataset") from error
     except CacheError as error:
+        if str(path) in str(error):  # complete in itself: the file may be fine
+            raise
         raise CacheError(f"{path}: {error}; the file is damaged or not pcdata's: rebuild the dataset") from error
-    except MemoryError:
-        raise
-    except Exception as error:  # zipfile, numpy, h5py and torch raise many types on damaged bytes
+    except MemoryError as error:
+        raise CacheError(f"{path}: there is not enough memory to read it ({error}); the file may be fine") from error
+    except Exception as error:  # numpy and h5py raise many types on damaged bytes
         if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
             raise CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine") from error
         raise CacheError(
             f"{path}: cannot be read ({type(error).__name__}: {error}); the file is damaged or truncated: "
             "rebuild the dataset"
         ) from error
-
-
-def _check_pt(archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Refuse a .pt file that is compressed, or whose pickle names anything but tensors."""
-    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-        raise CacheError("its members must not be compressed")
-    pickles = [member for member in members if member.filename.endswith(".pkl")]
-    if len(pickles) != 1:
-        raise CacheError(f"must hold one pickle of tensors, got {[member.filename for member in pickles]}")
-    for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
-        named = opcode.name == "GLOBAL" and argument not in _PT_GLOBALS
-        if named or opcode.name in _PT_FORBIDDEN:
-            raise CacheError(f"its pickle asks for {argument or opcode.name!r}, which no tensor needs; it was not run")

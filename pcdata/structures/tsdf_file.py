@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import uuid
 import zipfile
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
 
-from pcdata.errors import CacheError, ConfigError, VolumeTooLargeError
+from pcdata.array_files.npy import NpyHeader
+from pcdata.array_files.npz import npy_header, read_array
+from pcdata.array_files.zip_archive import ZipArchive
+from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeError
+from pcdata.files import MAX_STREAMED_BYTES, open_input
 from pcdata.functional.tsdf.blocks import CHUNK, Chunk, Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS
 from pcdata.structures.confidence import Confidence
@@ -51,30 +54,57 @@ def load_volume(path: str | os.PathLike[str], *, max_bytes: int, device: str) ->
     """Read what :func:`save_volume` wrote."""
     where = f"TSDFVolume.load: {path}"
     try:
-        with zipfile.ZipFile(path) as archive:
-            about = _about(where, archive)
-            keys = _keys(where, archive)
-            volume = _volume(where, about, max_bytes=max_bytes, device=device)
-            planes = Planes(**{name: bool(about["planes"][name]) for name in vars(Planes())})
-            needed = len(keys) * planes.bytes_per_block
-            if needed > max_bytes:
-                raise VolumeTooLargeError(
-                    f"{where}: {len(keys)} blocks take {needed / 2**20:.1f} MiB, but max_bytes allows "
-                    f"{max_bytes / 2**20:.1f} MiB"
-                )
-            blocks = VoxelBlocks(planes, torch.device(device))
-            _check_planes(where, archive, planes, len(keys))
-            order = np.argsort(keys)
-            blocks.add(torch.from_numpy(keys[order]).to(device))
-            rows = np.empty_like(order)
-            rows[order] = np.arange(len(order))  # blocks lie in key order now
-            for name in _plane_dtypes(planes):
-                _read_plane(archive, name, blocks, torch.from_numpy(rows).to(device))
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError) as error:
-        if isinstance(error, VolumeTooLargeError):
+        with open_input("TSDFVolume.load", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
+            return _loaded(where, ZipArchive(file, os.fstat(file.fileno()).st_size), max_bytes, device)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        if isinstance(error, PcdataError):
             raise
         raise CacheError(f"{where}: not a complete TSDFVolume file: {error}") from error
-    volume.blocks, volume.frame_id, volume.num_views = blocks, str(about["frame_id"]), int(about["num_views"])
+    except CacheError as error:
+        if str(error).startswith("TSDFVolume.load"):
+            raise
+        raise CacheError(f"{where}: not a complete TSDFVolume file: {error}") from error
+    except MemoryError as error:
+        if isinstance(error, PcdataError):
+            raise
+        raise VolumeTooLargeError(f"{where}: there is not enough memory for it ({error}); lower max_bytes") from error
+
+
+def _loaded(where: str, archive: ZipArchive, max_bytes: int, device: str) -> TSDFVolume:
+    about = _about(where, archive)
+    volume = _volume(where, about, max_bytes=max_bytes, device=device)
+    planes = Planes(**{name: bool(about["planes"][name]) for name in vars(Planes())})
+    dtypes = _plane_dtypes(planes)
+    if (found := set(archive.members)) != (wanted := {f"{name}.npy" for name in ("about", "keys", *dtypes)}):
+        raise CacheError(f"it must have {', '.join(sorted(wanted))}, but has {', '.join(sorted(found)):.500}")
+    headers = {name: _header(archive, name) for name in ("keys", *dtypes)}
+    count = headers["keys"].shape[0] if headers["keys"].shape else -1
+    if headers["keys"].dtype != np.int64 or headers["keys"].shape != (count,):
+        raise CacheError(f"keys must be int64 (B,), found {headers['keys'].dtype} {headers['keys'].shape}")
+    for name, dtype in dtypes.items():
+        if headers[name].shape != (count, VOXELS) or headers[name].dtype != dtype:
+            raise CacheError(
+                f"{name} must be {dtype} {(count, VOXELS)}, found {headers[name].dtype} {headers[name].shape}"
+            )
+    needed = count * planes.bytes_per_block
+    if needed > max_bytes:
+        raise VolumeTooLargeError(
+            f"{where}: {count} blocks take {needed / 2**20:.1f} MiB, but max_bytes allows {max_bytes / 2**20:.1f} MiB"
+        )
+    keys = read_array(archive, archive.members["keys.npy"])
+    if len(np.unique(keys)) != len(keys) or (len(keys) and keys.min() < 0):
+        raise CacheError("block keys must be distinct and not negative")
+    blocks = VoxelBlocks(planes, torch.device(device))
+    order = np.argsort(keys)
+    blocks.add(torch.from_numpy(keys[order]).to(device))
+    rows = np.empty_like(order)
+    rows[order] = np.arange(len(order))  # blocks lie in key order now
+    for name, dtype in dtypes.items():
+        _read_plane(archive, name, headers[name].begin, dtype, blocks, torch.from_numpy(rows).to(device))
+    num_views = about["num_views"]
+    if type(num_views) is not int or num_views < 1:
+        raise CacheError(f"num_views must be a whole number from 1 on, got {num_views!r:.100}")
+    volume.blocks, volume.frame_id, volume.num_views = blocks, str(about["frame_id"]), num_views
     return volume
 
 
@@ -118,16 +148,20 @@ def _write_plane(archive: zipfile.ZipFile, name: str, blocks: VoxelBlocks) -> No
             stream.write(plane.cpu().numpy().astype(dtype, copy=False).tobytes())
 
 
-def _read_plane(archive: zipfile.ZipFile, name: str, blocks: VoxelBlocks, rows: torch.Tensor) -> None:
-    dtype = _plane_dtypes(blocks.planes)[name]
-    with archive.open(f"{name}.npy") as stream:
-        _header(stream)
-        for start in range(0, len(rows), CHUNK):
-            some = rows[start : start + CHUNK]
-            data = _exactly(stream, len(some) * VOXELS * dtype.itemsize)
-            values = torch.from_numpy(np.frombuffer(data, dtype).astype(dtype.newbyteorder("=")).reshape(-1, VOXELS))
-            for chunk, inside, which in blocks.in_chunks(some):
-                _plane(chunk, name)[inside] = values.to(rows.device)[which]
+def _read_plane(
+    archive: ZipArchive, name: str, begin: int, dtype: np.dtype[Any], blocks: VoxelBlocks, rows: torch.Tensor
+) -> None:
+    member = archive.members[f"{name}.npy"]
+    row_bytes = VOXELS * dtype.itemsize
+    pieces = archive.pieces(member, begin, CHUNK * row_bytes)
+    next(pieces)
+    start = 0
+    for data in pieces:  # to the end, where the checksum is compared
+        some = rows[start : start + CHUNK]
+        start += CHUNK
+        values = torch.from_numpy(np.frombuffer(data, dtype).astype(dtype.newbyteorder("=")).reshape(-1, VOXELS))
+        for chunk, inside, which in blocks.in_chunks(some):
+            _plane(chunk, name)[inside] = values.to(rows.device)[which]
 
 
 def _plane(chunk: Chunk, name: str) -> torch.Tensor:
@@ -135,54 +169,21 @@ def _plane(chunk: Chunk, name: str) -> torch.Tensor:
     return plane
 
 
-def _about(where: str, archive: zipfile.ZipFile) -> dict[str, Any]:
-    shape, dtype = _shape(archive, "about")
-    if dtype != np.uint8 or len(shape) != 1 or shape[0] > _LONGEST_TEXT:
-        raise CacheError(f"{where}: it does not describe itself as a TSDFVolume")
-    with archive.open("about.npy") as stream:
-        about = json.loads(np.lib.format.read_array(stream, allow_pickle=False).tobytes())
+def _about(where: str, archive: ZipArchive) -> dict[str, Any]:
+    header = _header(archive, "about")
+    if header.dtype != np.uint8 or len(header.shape) != 1 or header.shape[0] > _LONGEST_TEXT:
+        raise CacheError("it does not describe itself as a TSDFVolume")
+    about = json.loads(read_array(archive, archive.members["about.npy"]).tobytes())
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         raise CacheError(f"{where}: its format is not {_FORMAT!r}; was it written by another version?")
     return about
 
 
-def _keys(where: str, archive: zipfile.ZipFile) -> np.ndarray:
-    shape, dtype = _shape(archive, "keys")
-    if dtype != np.int64 or len(shape) != 1 or math.prod(shape) * 8 > archive.getinfo("keys.npy").file_size:
-        raise CacheError(f"{where}: keys must be int64 (B,), found {dtype} {shape}")
-    with archive.open("keys.npy") as stream:
-        keys: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
-    if len(np.unique(keys)) != len(keys) or (len(keys) and keys.min() < 0):
-        raise CacheError(f"{where}: block keys must be distinct and not negative")
-    return keys
-
-
-def _check_planes(where: str, archive: zipfile.ZipFile, planes: Planes, count: int) -> None:
-    for name, dtype in _plane_dtypes(planes).items():
-        shape, found = _shape(archive, name)
-        if shape != (count, VOXELS) or found != dtype:
-            raise CacheError(f"{where}: {name} must be {dtype} {(count, VOXELS)}, found {found} {shape}")
-        if archive.getinfo(f"{name}.npy").file_size < count * VOXELS * dtype.itemsize:
-            raise CacheError(f"{where}: {name} ends early")
-
-
-def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    with archive.open(f"{name}.npy") as stream:
-        return _header(stream)
-
-
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"an array of .npy version {version}")
-    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
-    if fortran_order or dtype.hasobject:
-        raise ValueError("an array that is not plain rows of numbers")
-    return shape, dtype
-
-
-def _exactly(stream: IO[bytes], count: int) -> bytes:
-    data = stream.read(count)
-    if len(data) != count:
-        raise ValueError(f"{count} bytes wanted, {len(data)} left")
-    return data
+def _header(archive: ZipArchive, name: str) -> NpyHeader:
+    member = archive.members.get(f"{name}.npy")
+    if member is None or member.deflated:
+        raise CacheError(f"it has no member {name}.npy, stored as it is; it has {', '.join(archive.members):.300}")
+    header = npy_header(archive, member)
+    if header.by_columns:
+        raise CacheError(f"{name} is not stored row by row")
+    return header

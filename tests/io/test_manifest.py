@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pcdata.errors import CacheError
-from pcdata.io.manifest import FILE_NAME, SCHEMA, Manifest, Sample, key_of
+from pcdata.io.manifest import FILE_NAME, SCHEMA, Manifest, Sample, checksum_of, key_of
 
 GOOD = {
     "format": "npz",
@@ -43,8 +43,35 @@ def test_what_is_written_is_read(tmp_path):
 
 
 def test_the_example_of_these_tests_is_valid(tmp_path):
-    (tmp_path / FILE_NAME).write_text(json.dumps(GOOD))
+    (tmp_path / FILE_NAME).write_text(json.dumps({**GOOD, "checksum": checksum_of(GOOD)}))
     assert Manifest.read(tmp_path).samples == [Sample("a", "a", 3, "d")]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"samples": [{**GOOD["samples"][0], "num_points": 4}]},
+        {"samples": [{**GOOD["samples"][0], "digest": "e"}]},
+        {"samples": [{"id": "b", "key": "b", "num_points": 3, "digest": "d"}]},
+        {"samples": [*GOOD["samples"], {"id": "b", "key": "b", "num_points": 3, "digest": "d"}]},
+        {"fingerprint": "0" * 64},
+        {"pipeline": {"depth": [], "cloud": [], "augment": [{"RandomYaw": {}}]}},
+        {"versions": {"pcdata": "0.1.1"}},
+    ],
+    ids=str,
+)
+def test_an_edit_that_is_valid_in_itself_is_noticed(tmp_path, change):
+    assert "was changed after it was written" in _refused(tmp_path, {**GOOD, **change, "checksum": checksum_of(GOOD)})
+
+
+def test_one_without_a_checksum_says_that_edits_cannot_be_told(tmp_path):
+    (tmp_path / FILE_NAME).write_text(json.dumps(GOOD))
+    with pytest.warns(UserWarning, match="no checksum"):
+        Manifest.read(tmp_path)
+
+
+def test_json_that_takes_far_more_memory_than_its_text_is_refused(tmp_path):
+    assert "hostile" in _refused(tmp_path, b'{"a":[' + b"[]," * 1_000_000 + b"[]]}")
 
 
 @given(st.text(min_size=1), st.text(min_size=1))
@@ -154,5 +181,5 @@ def test_a_folder_without_one_says_how_to_make_one(tmp_path):
 def test_an_absurdly_large_file_is_refused_unread(tmp_path):
     with open(tmp_path / FILE_NAME, "wb") as file:
         file.truncate(2**40)  # sparse: reading it would never end
-    with pytest.raises(CacheError, match="too many"):
+    with pytest.raises(CacheError, match="more than the limit"):
         Manifest.read(tmp_path)

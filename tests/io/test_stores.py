@@ -25,6 +25,7 @@ from pcdata import PointCloud
 from pcdata.errors import CacheError
 from pcdata.io.record import Record, cloud_from_record, record_from_cloud
 from pcdata.io.stores import COMPRESSIONS, INFO, STORES
+from tests.io.memory import memory_limit
 
 KINDS = [(form, compression) for form, known in COMPRESSIONS.items() for compression in known]
 FORMATS = list(STORES)
@@ -97,19 +98,6 @@ def write(folder: Path, cloud: PointCloud, form: str, compression: str = "none",
     store.write(key, record_from_cloud(cloud))
     store.close()
     return store.path_of(key)
-
-
-@contextmanager
-def memory_limit(extra_bytes: int) -> Iterator[None]:
-    """Make any allocation beyond so many new bytes fail, so that a test of 'no huge allocation' can fail."""
-    with open("/proc/self/statm") as statm:
-        used = int(statm.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + extra_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def refused(folder: Path, form: str, path: Path, key: str = "a") -> str:

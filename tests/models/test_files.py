@@ -18,8 +18,8 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import CacheError, ConfigError, MissingExtraError
 from pcdata.exports.zarr_v2 import RowWriter
-from pcdata.io import zarr_arrays as zarr_module
-from pcdata.io.zarr_arrays import zarr_arrays
+from pcdata.io import zarr_codecs
+from pcdata.io.zarr_arrays import zarr_array, zarr_names
 from pcdata.models import CONTRACTS, check_files, preset
 from pcdata.models.pages import contract_page, index_page
 from pcdata.synthetic import SyntheticSource
@@ -53,10 +53,10 @@ def write_zarr(folder: Path, array: np.ndarray, chunks: tuple[int, ...], packer:
 def test_zarr_arrays_are_read_row_by_row_and_whole(tmp_path, packer):
     array = np.random.default_rng(0).normal(size=(7, 5, 3)).astype(np.float32)
     write_zarr(tmp_path / "data" / "point_cloud", array, (3, 4, 2), packer)
-    (stored,) = zarr_arrays(tmp_path).values()
+    stored = zarr_array(tmp_path, "data/point_cloud")
     assert np.array_equal(stored[...], array)
     assert all(np.array_equal(stored[row], array[row]) for row in range(7))
-    assert list(zarr_arrays(tmp_path)) == ["data/point_cloud"]
+    assert zarr_names(tmp_path, 10) == ["data/point_cloud"]
 
 
 @pytest.mark.parametrize("compression", ["zlib", "none"])
@@ -65,21 +65,23 @@ def test_what_our_exports_write_is_read_back(tmp_path, compression):
     writer = RowWriter(tmp_path / "a", rows.shape, "<f4", chunk_rows=3, compression=compression)
     for row in rows:
         writer.add(row)
-    assert np.array_equal(zarr_arrays(tmp_path)["a"][...], rows)
+    assert np.array_equal(zarr_array(tmp_path, "a")[...], rows)
 
 
-def test_a_zarr_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
+def test_a_zarr_chunk_that_is_missing_is_named_not_read_as_the_fill_value(tmp_path):
     array = np.arange(12.0).reshape(4, 3)
     write_zarr(tmp_path / "a", array, (2, 3), fill=-1.0)
     (tmp_path / "a" / "1.0").unlink()
-    assert zarr_arrays(tmp_path)["a"][...].tolist() == [[0, 1, 2], [3, 4, 5], [-1] * 3, [-1] * 3]
+    with pytest.raises(CacheError, match=r"claims 2 chunks.*but has 1; missing is 1\.0.*write_empty_chunks=True"):
+        zarr_array(tmp_path, "a")[...]
 
 
 def test_an_array_without_axes_is_read_from_its_one_chunk(tmp_path):
     write_zarr(tmp_path / "a", np.array(5.0), ())
-    assert float(zarr_arrays(tmp_path)["a"][...]) == 5.0
+    assert float(zarr_array(tmp_path, "a")[...]) == 5.0
     (tmp_path / "a" / "0").unlink()
-    assert float(zarr_arrays(tmp_path)["a"][...]) == 0.0
+    with pytest.raises(CacheError, match="missing is 0"):
+        zarr_array(tmp_path, "a")[...]
 
 
 def test_neighbouring_rows_decode_their_chunk_once(tmp_path, monkeypatch):
@@ -87,9 +89,9 @@ def test_neighbouring_rows_decode_their_chunk_once(tmp_path, monkeypatch):
     write_zarr(tmp_path / "a", array, (4, 3), "zlib")
     decoded = []
     monkeypatch.setitem(
-        zarr_module._DECODERS, "zlib", lambda content, most: decoded.append(1) or zlib.decompress(content)
+        zarr_codecs.COMPRESSORS, "zlib", lambda _: lambda content, most: decoded.append(1) or zlib.decompress(content)
     )
-    stored = zarr_arrays(tmp_path)["a"]
+    stored = zarr_array(tmp_path, "a")
     assert all(np.array_equal(stored[row], array[row]) for row in range(8))
     assert len(decoded) == 2
 
@@ -120,7 +122,7 @@ def test_what_the_zarr_package_writes_is_read(tmp_path, codec, filtered):
         filters = [codecs.Delta(values.dtype.str)] if filtered and values.dtype.kind == "i" else None
         chunks = (3, *values.shape[1:])
         group.create_dataset(name, data=values, chunks=chunks, compressor=CODECS[codec](codecs), filters=filters)
-    stored = zarr_arrays(tmp_path / "store")
+    stored = {name: zarr_array(tmp_path / "store", name) for name in arrays}
     for name, values in arrays.items():
         assert stored[name].dtype == values.dtype
         assert np.array_equal(stored[name][...], values)
@@ -129,21 +131,23 @@ def test_what_the_zarr_package_writes_is_read(tmp_path, codec, filtered):
 
 def test_faulty_zarr_directories_are_refused(tmp_path):
     with pytest.raises(CacheError, match="no zarr v2 array"):
-        zarr_arrays(tmp_path)
+        zarr_names(tmp_path, 10)
     write_zarr(tmp_path / "a", np.zeros((4, 3)), (2, 3), "zlib")
+    good = (tmp_path / "a" / "0.0").read_bytes()
     (tmp_path / "a" / "0.0").write_bytes(b"no zlib")
     with pytest.raises(CacheError, match="this chunk cannot be read"):
-        zarr_arrays(tmp_path)["a"][0]
+        zarr_array(tmp_path, "a")[0]
+    (tmp_path / "a" / "0.0").write_bytes(good)
     header = json.loads((tmp_path / "a" / ".zarray").read_text())
     (tmp_path / "a" / ".zarray").write_text(json.dumps({**header, "compressor": {"id": "blosc"}}))
     try:
         import numcodecs  # noqa: F401
     except ImportError:
         with pytest.raises(MissingExtraError, match="Blosc"):
-            zarr_arrays(tmp_path)["a"][0]
+            zarr_array(tmp_path, "a")[0]
     (tmp_path / "zarr.json").write_text("{}")
     with pytest.raises(CacheError, match="zarr v3"):
-        zarr_arrays(tmp_path)
+        zarr_names(tmp_path, 10)
 
 
 def test_a_dp3_zarr_passes_and_one_in_millimetres_fails(tmp_path):

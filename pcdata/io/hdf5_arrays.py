@@ -1,0 +1,235 @@
+"""HDF5 datasets, taken for no more than they can be: no links elsewhere, no unknown filters, no size beyond the bytes.
+
+Deflated chunks are unpacked here and not by HDF5, whose filter goes on for as long as the stream does, whatever the
+chunk's size is. LZF stays with HDF5: it cannot pack tighter than 88 to 1.
+
+Source: HDF5 File Format Specification 3.0, IV.A.2.l (filter pipeline); H5checksum.c (Fletcher32).
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.array_files.packing import check_packing
+from pcdata.errors import CacheError
+from pcdata.io.chunk_grid import ChunkGrid
+
+_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
+_KNOWN = {_DEFLATE: "gzip", _SHUFFLE: "shuffle", _FLETCHER32: "fletcher32", _LZF: "lzf"}
+_OTHERS = {4: "szip", 5: "nbit", 6: "scaleoffset", 32001: "blosc", 32004: "lz4", 32008: "bitshuffle", 32015: "zstd"}
+_MAX_ARRAYS = 4096  # in one group
+
+# What the operating system says when another process holds a lock; anything else means that there are no locks.
+_IN_USE = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES)
+
+
+def open_hdf5(path: Path, mode: str = "r") -> Any:
+    """Open a file.
+
+    Raises:
+        CacheError: it is locked by another process, or its file system has no locks: the file itself may be fine.
+        OSError: what else h5py raises.
+    """
+    import h5py
+
+    try:
+        return h5py.File(path, mode)
+    except OSError as error:
+        if "lock" not in str(error):
+            raise
+        told = re.search(r"errno = (\d+)", str(error))
+        number = int(told[1]) if told else error.errno
+        if number in _IN_USE:
+            raise CacheError(
+                f"{path}: is in use: another process has it open{' for writing' if mode == 'r' else ''} and holds its "
+                "lock; wait until that process has ended, or end it, and try again; the file itself may be fine"
+            ) from error
+        raise CacheError(
+            f"{path}: cannot be locked here: its file system has no locks ({error}); the file itself may be fine. If "
+            "nobody writes to it, set HDF5_USE_FILE_LOCKING=FALSE in the environment before Python starts, or copy it "
+            "to a local disk"
+        ) from error
+
+
+def hard_linked(group: Any, name: str) -> Any:
+    """Return the group or dataset under a path of names, none of which is a link; None if there is none."""
+    import h5py
+
+    found = group
+    for part in name.split("/"):
+        if not part or part == "." or not isinstance(found, h5py.Group):
+            return None
+        if not isinstance(found.get(part, getlink=True, default=None), h5py.HardLink):
+            return None
+        found = found[part]
+    return found
+
+
+def read_group(group: Any, file_bytes: int) -> dict[str, NDArray[Any]]:
+    """Read all datasets of a group.
+
+    Raises:
+        CacheError: one of them is no dataset in this file, or together they claim more than their bytes allow.
+    """
+    if len(group) > _MAX_ARRAYS:
+        raise CacheError(f"{group.name} has {len(group)} datasets, more than {_MAX_ARRAYS}")
+    datasets = {name: checked_dataset(group, name, file_bytes) for name in group}
+    stored = sum(dataset.stored_bytes for dataset in datasets.values())
+    if stored > file_bytes:
+        raise CacheError(f"{group.name} stores {stored} bytes, but the file has {file_bytes}")
+    check_packing(group.name, sum(dataset.nbytes for dataset in datasets.values()), stored)
+    return {name: dataset[...] for name, dataset in datasets.items()}
+
+
+def checked_dataset(group: Any, name: str, file_bytes: int) -> Hdf5Array | Hdf5Deflated:
+    """Return a dataset, unread, that lies in this very file and is no larger than its bytes allow.
+
+    Raises:
+        CacheError: it is none.
+    """
+    import h5py
+
+    where = f"{group.name.rstrip('/')}/{name}"
+    dataset = hard_linked(group, name)
+    if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+        raise CacheError(f"{where} must be a dataset stored in this file, not a link to another")
+    if dataset.shape is None or dataset.dtype.kind not in "biufS" or not dataset.dtype.itemsize:
+        raise CacheError(f"{where} must hold numbers or one text, got {dataset.dtype}")
+    filters = _filters_of(where, dataset)
+    stored, claimed = dataset.id.get_storage_size(), math.prod(dataset.shape) * dataset.dtype.itemsize
+    chunk = math.prod(dataset.chunks or dataset.shape) * dataset.dtype.itemsize
+    packed = bool(filters.keys() & {_DEFLATE, _LZF})
+    if stored > file_bytes or (max(claimed, chunk if claimed else 0) > stored and not packed):
+        raise CacheError(
+            f"{where} claims shape {dataset.shape} of {dataset.dtype}, but stores {stored} bytes in a file of "
+            f"{file_bytes}"
+        )
+    if dataset.chunks is not None:
+        check_packing(where, chunk, stored)  # chunks are unpacked whole, however little of one is used
+        grid = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks))
+        if (there := dataset.id.get_num_chunks()) != grid:
+            raise CacheError(
+                f"{where} claims shape {dataset.shape} in chunks {dataset.chunks}, but has {there} of {grid} chunks; "
+                "the others would be read as zeros; write the whole array"
+            )
+    check_packing(where, claimed, stored)
+    return Hdf5Deflated(where, dataset, filters) if _DEFLATE in filters else Hdf5Array(dataset, stored)
+
+
+class Hdf5Array:
+    """A dataset that HDF5 reads: not packed, or by LZF."""
+
+    def __init__(self, dataset: Any, stored_bytes: int) -> None:
+        self._dataset, self.stored_bytes = dataset, stored_bytes
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype: np.dtype = dataset.dtype
+        self.nbytes = math.prod(self.shape) * self.dtype.itemsize
+
+    def __getitem__(self, index: Any) -> NDArray[Any]:
+        """Read a part."""
+        return np.asarray(self._dataset[index])
+
+
+class Hdf5Deflated(ChunkGrid):
+    """A dataset of deflated chunks, each unpacked to exactly its size."""
+
+    def __init__(self, where: str, dataset: Any, filters: Mapping[int, tuple[int, ...]]) -> None:
+        import h5py
+
+        super().__init__(where, dataset.shape, dataset.chunks, dataset.dtype)
+        self._dataset, self._filters = dataset, filters
+        self.stored_bytes: int = dataset.id.get_storage_size()
+        if self.dtype.kind == "S" or dataset.id.get_type() != h5py.h5t.py_create(self.dtype, logical=True):
+            raise CacheError(f"{where} stores {self.dtype} in a form that no machine has; write it again")
+
+    def chunk(self, position: tuple[int, ...]) -> NDArray[Any]:
+        """Read and unpack one chunk."""
+        skipped, content = self._dataset.id.read_direct_chunk(
+            tuple(place * size for place, size in zip(position, self.chunks))
+        )
+        content = bytes(content)
+        for number, code in reversed(list(enumerate(self._filters))):
+            if not skipped >> number & 1:  # a chunk that would have grown is stored as it is
+                content = _UNDO[code](content, self.chunk_bytes, self.dtype.itemsize)
+        if len(content) != self.chunk_bytes:
+            raise CacheError(f"{self.where}: a chunk has {len(content)} bytes, not {self.chunk_bytes}")
+        # From a bytearray: what is read may be written to.
+        return np.frombuffer(bytearray(content), self.dtype).reshape(self.chunks)
+
+
+def _filters_of(where: str, dataset: Any) -> dict[int, tuple[int, ...]]:
+    """Return the filters of a dataset in the order of packing, with their numbers."""
+    plan = dataset.id.get_create_plist()
+    found: dict[int, tuple[int, ...]] = {}
+    for number in range(plan.get_nfilters()):
+        code, _, values, _ = plan.get_filter(number)
+        if code not in _KNOWN:
+            raise CacheError(
+                f"{where} is packed by the HDF5 filter {_OTHERS.get(code, code)}; only {', '.join(_KNOWN.values())} "
+                "are read; write it again with one of them, as in h5repack -f GZIP=4 IN OUT"
+            )
+        if code in found:
+            raise CacheError(f"{where} is packed twice by the filter {_KNOWN[code]}: a few bytes would fill the memory")
+        found[code] = tuple(values)
+    if {_DEFLATE, _LZF} <= found.keys():
+        raise CacheError(f"{where} is packed twice, by gzip and lzf: a few bytes would fill the memory")
+    chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    if (_SHUFFLE in found and found[_SHUFFLE][:1] != (dataset.dtype.itemsize,)) or (
+        _LZF in found and found[_LZF][2:3] != (chunk_bytes,)
+    ):
+        raise CacheError(f"{where} has filters for values or chunks of another size")
+    return found
+
+
+def _inflated(content: bytes, most: int, itemsize: int) -> bytes:
+    unpack = zlib.decompressobj()
+    try:
+        result = unpack.decompress(content, most + 8)  # 8 more than a chunk: too long is an error, and a checksum fits
+    except zlib.error as error:
+        raise CacheError(f"a chunk is damaged: {error}") from error
+    if not unpack.eof or unpack.unused_data:
+        raise CacheError(f"a chunk is damaged: it does not end with the {most} bytes that it stands for")
+    return result
+
+
+def _unshuffled(content: bytes, most: int, itemsize: int) -> bytes:
+    count = len(content) // itemsize
+    planes = np.frombuffer(content, np.uint8, count * itemsize).reshape(itemsize, count)
+    return planes.T.tobytes() + content[count * itemsize :]
+
+
+def _fletcher_checked(content: bytes, most: int, itemsize: int) -> bytes:
+    if len(content) < 4:
+        raise CacheError("a chunk is damaged: its checksum is missing")
+    data, stored = content[:-4], int.from_bytes(content[-4:], "little")
+    right = fletcher32(data)
+    # Files of HDF5 before 1.6.3 have the bytes of each half the other way round.
+    swapped = (right & 0x00FF00FF) << 8 | (right & 0xFF00FF00) >> 8
+    if stored not in (right, swapped):
+        raise CacheError("a chunk is damaged: its checksum is wrong")
+    return data
+
+
+def fletcher32(data: bytes) -> int:
+    """Return HDF5's checksum: sums of big-endian 16-bit words and of these sums, modulo 65535 with 65535 for 0."""
+    words = np.frombuffer(data + b"\0" * (len(data) % 2), ">u2")
+    first = second = 0
+    for start in range(0, len(words), 1 << 20):
+        part = words[start : start + (1 << 20)].astype(np.uint64)
+        # The sum after word i counts word j once for every j <= i.
+        second += first * len(part) + int((part * np.arange(len(part), 0, -1, dtype=np.uint64)).sum())
+        first += int(part.sum())
+    low, high = (total % 65535 or (65535 if total else 0) for total in (first, second))
+    return high << 16 | low
+
+
+_UNDO = {_DEFLATE: _inflated, _SHUFFLE: _unshuffled, _FLETCHER32: _fletcher_checked}
