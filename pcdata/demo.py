@@ -13,6 +13,7 @@ from pcdata.build import BuildReport, build_dataset, config_from_yaml
 from pcdata.build.builder import Progress
 from pcdata.datasets import CachedCloudDataset, collate_padded
 from pcdata.errors import CacheError
+from pcdata.interrupts import deaf_children
 from pcdata.report import save_pipeline_figure
 from pcdata.structures import PaddedClouds
 from pcdata.synthetic import SensorNoise, SyntheticSource
@@ -56,7 +57,9 @@ def run_demo(
 
     dataset = CachedCloudDataset(folder / "dataset", pipeline=config.pipeline)
     loader = DataLoader(dataset, batch_size=4, num_workers=num_workers, collate_fn=collate_padded)
-    batches = list(loader)
+    with deaf_children():
+        started = iter(loader)
+    batches = list(started)
 
     picture = folder / "demo.png"
     capture = source.load(source.ids[0])

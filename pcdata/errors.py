@@ -6,6 +6,7 @@ Every message says where, what must hold, what was given and what to do.
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 
 
@@ -87,6 +88,23 @@ class BackendError(PcdataError, RuntimeError):
 
 class MissingExtraError(PcdataError, ImportError):
     """An optional dependency is not installed, or cannot be loaded."""
+
+
+_WRITE_FAULTS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file may not become so large here (see ulimit -f)",
+    errno.EROFS: "the file system is read-only",
+    errno.EACCES: "there is no permission to write",
+    errno.EPERM: "there is no permission to write",
+    errno.ENAMETOOLONG: "the name is too long",
+}
+
+
+def write_fault(error: BaseException) -> str:
+    """Return why something cannot be written: in words where the system's number has a common cause."""
+    words = _WRITE_FAULTS.get(error.errno or 0) if isinstance(error, OSError) else None
+    return f"{words}: {error}" if words else str(error)
 
 
 def add_note(error: BaseException, note: str) -> None:

@@ -25,7 +25,9 @@ def generator_for(seed: int, epoch: int, sample_id: str) -> Generator:
 
     The key is hashed (SHA-256), so neighbouring seeds and ids give unrelated streams.
     """
-    digest = hashlib.sha256(f"{seed}\0{epoch}\0{sample_id}".encode()).digest()
+    digest = hashlib.sha256(
+        f"{seed}\0{epoch}\0{sample_id}".encode(errors="surrogatepass")
+    ).digest()  # file names may be no UTF-8
     return seeded(int.from_bytes(digest[:8], "big") >> 1)
 
 

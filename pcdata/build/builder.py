@@ -15,18 +15,16 @@ import torch
 
 import pcdata
 from pcdata.build.config import BuildConfig
+from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
-from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
-from pcdata.io.manifest import FILE_NAME, Manifest, Sample, key_of
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note, write_fault
+from pcdata.io.manifest import Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
 from pcdata.io.record import record_from_cloud
 from pcdata.io.source import REFUSALS, CaptureSource, checked_ids, reason_of, skipped_of
 from pcdata.io.stores import STORES
 from pcdata.io.whole_folders import complete_or_nothing
 from pcdata.structures import DepthFrame, PointCloud
-
-_OWN = {FILE_NAME, "pipeline.yaml", "load.py", "clouds", "clouds.h5", "raw"}
-_LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 
@@ -48,6 +46,7 @@ class BuildReport:
     folder: Path
     samples: list[BuiltSample] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
+    notes: list[str] = field(default_factory=list)  # what killed builds had left, and what became of it
 
 
 def build_dataset(
@@ -62,7 +61,8 @@ def build_dataset(
     """Store every capture of a source as the pipeline's deterministic steps leave it.
 
     The dataset appears under its name only when it is complete: everything is written to a hidden neighbour first, and
-    a failure removes that and leaves what was there before.
+    a failure removes that and leaves what was there before. Nothing is deleted that no build made: a folder that
+    somebody else makes under the name meanwhile makes the build fail.
 
     Args:
         config: pipeline, storage and loader settings; see :func:`pcdata.load_config`.
@@ -75,16 +75,17 @@ def build_dataset(
 
     Raises:
         ConfigError: the pipeline has nothing deterministic to store.
-        CacheError: the folder exists, or cannot be written.
+        CacheError: the folder exists, another process writes it, or it cannot be written (a full disk).
         PcdataError: a capture or a step failed; the note names the sample, the step and its input.
     """
     _check_arguments(config, source)
     # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
     folder = Path(os.path.realpath(Path(folder).expanduser()))
-    _check_target(folder, overwrite)
     report = BuildReport(folder, skipped=skipped_of(source))
     skip_refused = config.source.skip_refused if skip_refused is None else skip_refused
-    with complete_or_nothing(folder) as partial:
+    with complete_or_nothing(
+        folder, overwrite=overwrite, owned=check_only_dataset, note=report.notes.append
+    ) as partial:
         samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -105,7 +106,7 @@ def build_dataset(
             (partial / "load.py").write_text(loading_script(config.loader), encoding="utf-8")
             manifest.write(partial)
         except OSError as error:
-            raise CacheError(f"{folder}: cannot be written: {error}") from error
+            raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
     return report
 
 
@@ -198,23 +199,3 @@ def _built_sample(sample_id: str, capture: Any, cloud: PointCloud, seconds: floa
                 counts[position] = (step["step"], before + step["points"])
     entered = "depth" if isinstance(capture, DepthFrame) else "cloud"
     return BuiltSample(sample_id, entered, [counts[position] for position in sorted(counts)], seconds)
-
-
-def _check_target(folder: Path, overwrite: bool) -> None:
-    try:
-        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-            return
-        names = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
-    except OSError as error:
-        raise CacheError(f"{folder}: cannot be examined: {error}") from error
-    if not overwrite:
-        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting (--overwrite)")
-    if FILE_NAME not in names:
-        raise CacheError(f"{folder} is not a pcdata dataset, so it is not overwritten; choose another folder")
-    Manifest.read(folder)
-    foreign = sorted(names - _OWN - _LITTER)
-    if foreign:
-        raise CacheError(
-            f"{folder} is a dataset but also holds {', '.join(foreign[:5])}, which overwriting would delete; move that "
-            "out first, or choose another folder"
-        )

@@ -71,6 +71,8 @@ def _build(arguments: argparse.Namespace) -> None:
             progress=progress,
         )
     print(_build_table(report))
+    for note in report.notes:
+        print(f"note     {note}")
     print(f"\ndataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
 
 

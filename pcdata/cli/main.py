@@ -6,25 +6,40 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pcdata import __version__
-from pcdata.cli import calib, datasets, export, models, sensors, validate
-from pcdata.cli.progress import signals_interrupt
+from pcdata.cli import signals
+from pcdata.cli.signals import signals_interrupt
 from pcdata.errors import ConfigError, PcdataError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code: 0 done, 1 the data or a file is at fault, 2 the request is."""
+    """Run one command and return the exit code: 0 done, 1 the data or a file is at fault, 2 the request is.
+
+    128 and the number of the signal where one ended it. Without ``argv`` this is the whole life of the process.
+    """
+    with signals_interrupt(until_exit=argv is None) as heard:
+        try:
+            return _run(argv)
+        except KeyboardInterrupt:
+            heard.over = True
+        except Exception:  # a library may turn what a signal raises into an error of its own
+            if heard.first is None:
+                raise
+            heard.over = True
+        with suppress(OSError):  # the terminal may be gone
+            print("interrupted; nothing half-written was left behind", file=sys.stderr, flush=True)
+        return heard.code
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments = _parser().parse_args(argv)
     try:
-        with signals_interrupt():
-            verdict = arguments.run(arguments)  # a command that judges returns its exit code
-            sys.stdout.flush()
-    except KeyboardInterrupt:
-        print("interrupted; nothing half-written was left behind", file=sys.stderr)
-        return 130
+        verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code
+        sys.stdout.flush()
     except PcdataError as error:
-        if arguments.debug:
+        if arguments.debug or signals.current.first is not None:
             raise
         print(f"pcdata: {error}", file=sys.stderr)
         for note in getattr(error, "__notes__", ()):
@@ -34,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the flush at exit
         return 0
     except OSError as error:
-        if arguments.debug:
+        if arguments.debug or signals.current.first is not None:
             raise
         print(f"pcdata: {error}", file=sys.stderr)
         return 1
@@ -42,6 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    # Imported here, where a signal is heard already.
+    from pcdata.cli import calib, datasets, export, models, sensors, validate
+
     parser = argparse.ArgumentParser(prog="pcdata", description="From raw depth frames to training-ready point clouds.")
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")

@@ -1,43 +1,16 @@
-"""Progress of a long command, and the signals that end it."""
+"""Progress of a long command."""
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
-from typing import Any, ClassVar
+from typing import Any
 
-
-@contextmanager
-def signals_interrupt() -> Iterator[None]:
-    """Let a polite kill clean up like Ctrl-C; Python allows that in the main thread only."""
-    Progress.interrupted = False
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # One that is ignored (nohup, a job in the background) stays so.
-    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
-    previous = {number: signal.signal(number, _interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    Progress.interrupted = True
-    raise KeyboardInterrupt
+from pcdata.cli import signals
 
 
 class Progress:
     """A bar on a terminal, plain lines elsewhere; also the place where a lost Ctrl-C is heard."""
-
-    interrupted: ClassVar[bool] = False
 
     def __init__(self, what: str) -> None:
         self.what = what
@@ -53,8 +26,8 @@ class Progress:
 
     def __call__(self, done: int, total: int, sample_id: str) -> None:
         """Show that ``done`` of ``total`` samples are finished."""
-        if self.interrupted:  # it was raised inside a destructor or a callback, where Python drops exceptions
-            raise KeyboardInterrupt
+        if signals.current.first is not None:  # raised inside a destructor or a callback, where Python drops exceptions
+            raise signals.Interrupted
         if not sys.stderr.isatty():
             print(f"{self.what} {done}/{total} {sample_id} {time.perf_counter() - self.started:.1f} s", file=sys.stderr)
             return

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CacheError, ConfigError, PcdataError, add_note
-from pcdata.exports.record import ExportRecord, check_replaceable, files_of
+from pcdata.errors import CacheError, ConfigError, PcdataError, add_note, write_fault
+from pcdata.exports.record import FILE_NAME, ExportRecord, check_only_export, files_of
 from pcdata.exports.registry import target_named
 from pcdata.exports.sources import identity_of, open_for
 from pcdata.exports.target import Item, Samples, Target
+from pcdata.interrupts import shielded
+from pcdata.io.scratch import scratch_beside
 from pcdata.io.source import CaptureSource
-from pcdata.io.whole_folders import complete_or_nothing, scratch_beside
+from pcdata.io.whole_folders import complete_or_nothing, is_free, restore_retired
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 
@@ -75,8 +78,12 @@ def export_dataset(
     if resume:
         _continue(run, plan, folder)
         return report
-    check_replaceable(folder, overwrite)
-    with complete_or_nothing(folder) as partial:
+    if not overwrite and not is_free(folder):
+        raise CacheError(
+            f"{folder} exists already; choose another folder, finish an interrupted export (--continue), or replace it "
+            "(--overwrite)"
+        )
+    with complete_or_nothing(folder, overwrite=overwrite, owned=check_only_export, note=report.notes.append) as partial:
         for item in items:
             run.write(item, partial)
         run.finish(partial)
@@ -130,49 +137,84 @@ class _Run:
 
 
 def _continue(run: _Run, plan: ExportRecord, folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        found = ExportRecord.read(folder)
-        difference = plan.difference(found)
-        if difference is not None:
-            raise CacheError(
-                f"{folder} cannot be continued: {difference}; choose another folder, or replace it (--overwrite)"
-            )
-        if found.complete:
-            for item in run.items:
+    with scratch_beside(folder, alone=True, note=run.report.notes.append) as scratch:
+        restore_retired(folder, check_only_export, run.report.notes.append)
+        if is_free(folder):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise CacheError(f"{folder}: cannot write there: {write_fault(error)}") from error
+            plan.write(folder)
+        else:
+            _refuse_links(folder, [FILE_NAME])
+            found = ExportRecord.read(folder)
+            difference = plan.difference(found)
+            if difference is not None:
+                raise CacheError(
+                    f"{folder} cannot be continued: {difference}; choose another folder, or replace it (--overwrite)"
+                )
+            if found.complete:
+                for item in run.items:
+                    run.keep(item)
+                return
+        for number, item in enumerate(run.items):
+            _refuse_links(folder, item.paths)
+            if (folder / item.paths[-1]).exists():
                 run.keep(item)
-            return
-    else:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CacheError(f"{folder}: cannot write there: {error}") from error
-        plan.write(folder)
-    for item in run.items:
-        if (folder / item.paths[-1]).exists():
-            run.keep(item)
-            continue
-        with scratch_beside(folder) as scratch:
-            run.write(item, scratch)
-            _move(item.paths, scratch, folder)
-    with scratch_beside(folder) as scratch:
-        run.finish(scratch)
-        _move(files_of(scratch), scratch, folder)
-    replace(plan, complete=True, files=files_of(folder)).write(folder)
+                continue
+            with _part(scratch, f"item-{number}") as part:
+                run.write(item, part)
+                _move(item.paths, part, folder)
+        with _part(scratch, "finish") as part:
+            run.finish(part)
+            _move(files_of(part), part, folder)
+        replace(plan, complete=True, files=files_of(folder)).write(folder)
+
+
+@contextmanager
+def _part(scratch: Path, name: str) -> Iterator[Path]:
+    """Give an empty folder in the scratch folder, and remove what is left of it."""
+    part = scratch / name
+    try:
+        part.mkdir()
+    except OSError as error:
+        raise CacheError(f"{scratch}: cannot be written: {write_fault(error)}") from error
+    yield part
+    shutil.rmtree(part, ignore_errors=True)
 
 
 def _move(paths: Sequence[str], scratch: Path, folder: Path) -> None:
     """Put finished files and folders into place, in order; what an interrupted move had put there is replaced."""
+    _refuse_links(folder, paths)
     try:
-        for number, path in enumerate(paths):
-            new, place = scratch / path, folder / path
-            if not new.exists():  # an item may do without, e.g. colour
-                continue
-            place.parent.mkdir(parents=True, exist_ok=True)
-            if place.is_dir():  # a folder cannot be renamed onto one
-                os.replace(place, scratch / f".replaced-{number}")
-            os.replace(new, place)
+        with shielded():
+            for number, path in enumerate(paths):
+                new, place = scratch / path, folder / path
+                if not new.exists():  # an item may do without, e.g. colour
+                    continue
+                place.parent.mkdir(parents=True, exist_ok=True)
+                if place.is_dir():  # a folder cannot be renamed onto one
+                    os.replace(place, scratch / f".replaced-{number}")
+                os.replace(new, place)
     except OSError as error:
-        raise CacheError(f"{folder}: cannot be put into place: {error}") from error
+        raise CacheError(f"{folder}: cannot be put into place: {write_fault(error)}") from error
+
+
+def _refuse_links(folder: Path, paths: Sequence[str]) -> None:
+    """Require that nothing below the folder leads out of it: an export writes into its own folder only.
+
+    Raises:
+        CacheError: a file or folder on the way is a link.
+    """
+    for path in paths:
+        place = folder
+        for part in Path(path).parts:
+            place = place / part
+            if place.is_symlink():
+                raise CacheError(
+                    f"{place}: is a link to {os.readlink(place)}, and an export that is continued writes into its own "
+                    "folder only; put the folder itself there, or export into another one"
+                )
 
 
 @contextmanager
@@ -183,4 +225,4 @@ def _writing(folder: Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, PcdataError):
             raise
-        raise CacheError(f"{folder}: cannot be written: {error}; is the disk full, or the folder read-only?") from error
+        raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error

@@ -68,20 +68,13 @@ class ExportRecord:
         return None
 
 
-def check_replaceable(folder: Path, overwrite: bool) -> None:
-    """Require that nothing is at a folder, or an export that may be replaced without a loss.
+def check_only_export(folder: Path) -> None:
+    """Require that a folder is a complete export and holds nothing else.
 
     Raises:
-        CacheError: something is there that must stay.
+        CacheError: deleting it would delete something that the export did not write, or an unfinished one.
     """
     try:
-        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-            return
-        if not overwrite:
-            raise CacheError(
-                f"{folder} exists already; choose another folder, finish an interrupted export (--continue), or "
-                "replace it (--overwrite)"
-            )
         record = ExportRecord.read(folder)
         if not record.complete:
             raise CacheError(f"{folder} holds an unfinished export; finish it (--continue), or remove it yourself")

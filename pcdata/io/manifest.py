@@ -15,6 +15,7 @@ from urllib.parse import quote
 from pcdata.errors import CacheError
 from pcdata.files import read_bytes
 from pcdata.io.record import parse_info
+from pcdata.io.scratch import retired_of
 from pcdata.io.stores import COMPRESSIONS, STORES, Compression, Format
 
 SCHEMA = "pcdata.dataset/1"
@@ -66,6 +67,11 @@ class Manifest:
         """
         path = Path(folder) / FILE_NAME
         if not path.is_file():
+            if not os.path.lexists(folder) and (retired := retired_of(Path(os.path.realpath(folder)))):
+                raise CacheError(
+                    f"{folder}: is missing, since an overwrite of it was killed: the old one is {retired[0]}; "
+                    "rename it back, or build again"
+                )
             raise CacheError(f"{folder}: not a pcdata dataset: it has no {FILE_NAME}; make one with 'pcdata build'")
         text = read_bytes("dataset", path, max_bytes=_MAX_BYTES, error=CacheError)
         try:

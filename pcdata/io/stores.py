@@ -7,6 +7,7 @@ spawned at any time. Nothing is ever unpickled, and sizes that a file claims are
 from __future__ import annotations
 
 import errno
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,9 +20,11 @@ import torch
 from pcdata.array_files.npz import array_names, read_array, write_npz
 from pcdata.array_files.packing import check_packing
 from pcdata.array_files.zip_archive import ZipArchive
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, write_fault
 from pcdata.files import MAX_STREAMED_BYTES, check_inside, open_input
+from pcdata.interrupts import shielded
 from pcdata.io.hdf5_arrays import hard_linked, open_hdf5, read_group
+from pcdata.io.hdf5_writing import FaultKeepingFile
 from pcdata.io.pt_tensors import read_pt
 from pcdata.io.record import Record, parse_info
 
@@ -120,8 +123,11 @@ class PtStore(Store):
         tensors: dict[str, Any] = {
             name: torch.from_numpy(np.array(array, order="C")) for name, array in record.arrays.items()
         }
+        # Through memory: torch's own writer says nothing of the cause where it meets a full disk.
+        packed = io.BytesIO()
+        torch.save({**tensors, INFO: record.info_text()}, packed)
         with _synced(self.path_of(key)) as file:
-            torch.save({**tensors, INFO: record.info_text()}, file)
+            file.write(packed.getbuffer())
 
     def read(self, key: str) -> Record:
         """Read one file."""
@@ -145,7 +151,7 @@ class Hdf5Store(Store):
         self.path = self.folder / "clouds.h5"
         self._file: Any = None
         self._opened_by = 0
-        self._written = False
+        self._disk: FaultKeepingFile | None = None  # under a file that is written
 
     def path_of(self, key: str) -> Path:
         """Return the one file that holds all records."""
@@ -153,18 +159,13 @@ class Hdf5Store(Store):
 
     def write(self, key: str, record: Record) -> None:
         """Append one group."""
-        with _writing(self.path):
-            group = self._open("a").create_group(key)
-            self._written = True
-            for name, array in record.arrays.items():
-                # One chunk per array: a sample is always read whole.
-                packed = self.compression != "none" and array.size > 0
-                options = {"compression": self.compression, "shuffle": True, "chunks": array.shape} if packed else {}
-                group.create_dataset(name, data=array, track_times=False, **options)
-            # A dataset, not an attribute: attributes end at 64 KB and a history may be longer.
-            group.create_dataset(INFO, data=np.bytes_(record.info_text().encode()), track_times=False)
-            for name in ("frame_id", "unit"):
-                group.attrs[name] = record.info[name]
+        # HDF5 calls back into Python, where a signal must not raise.
+        with _writing(self.path), shielded():
+            file, disk = self._open_to_write()
+            try:
+                _write_group(file.create_group(key), record, self.compression)
+            finally:
+                disk.check()
 
     def read(self, key: str) -> Record:
         """Read one group."""
@@ -191,12 +192,23 @@ class Hdf5Store(Store):
         if self._opened_by != os.getpid():
             _INHERITED.append(file)
             return
-        with _writing(self.path):
-            file.close()
-            if self._written:
-                with open(self.path, "rb+") as written:
-                    os.fsync(written.fileno())
-        self._written = False
+        with _writing(self.path), shielded():
+            try:
+                file.close()
+            finally:
+                disk, self._disk = self._disk, None
+                if disk is not None:
+                    disk.close()
+
+    def _open_to_write(self) -> tuple[Any, FaultKeepingFile]:
+        import h5py
+
+        if self._file is None or self._disk is None or self._opened_by != os.getpid():
+            self.close()
+            disk = FaultKeepingFile(self.path)
+            self._file = h5py.File(disk, "w" if disk.is_new else "r+")
+            self._disk, self._opened_by = disk, os.getpid()
+        return self._file, self._disk
 
     def _open(self, mode: str) -> Any:
         if self._file is None or self._opened_by != os.getpid():
@@ -208,7 +220,7 @@ class Hdf5Store(Store):
         return self._file
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_opened_by": 0, "_written": False}
+        return {**self.__dict__, "_file": None, "_opened_by": 0, "_disk": None}
 
 
 STORES: dict[Format, type[Store]] = {"hdf5": Hdf5Store, "npz": NpzStore, "pt": PtStore}
@@ -222,13 +234,25 @@ COMPRESSIONS: dict[Format, tuple[Compression, ...]] = {
 _INHERITED: list[Any] = []
 
 
+def _write_group(group: Any, record: Record, compression: Compression) -> None:
+    for name, array in record.arrays.items():
+        # One chunk per array: a sample is always read whole.
+        packed = compression != "none" and array.size > 0
+        options = {"compression": compression, "shuffle": True, "chunks": array.shape} if packed else {}
+        group.create_dataset(name, data=array, track_times=False, **options)
+    # A dataset, not an attribute: attributes end at 64 KB and a history may be longer.
+    group.create_dataset(INFO, data=np.bytes_(record.info_text().encode()), track_times=False)
+    for name in ("frame_id", "unit"):
+        group.attrs[name] = record.info[name]
+
+
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
     """Name the file in what a full disk or a missing permission makes a library raise."""
     try:
         yield
     except (OSError, RuntimeError) as error:  # h5py raises both
-        raise CacheError(f"{path}: cannot be written: {error}; is the disk full, or the folder read-only?") from error
+        raise CacheError(f"{path}: cannot be written: {write_fault(error)}") from error
 
 
 @contextmanager

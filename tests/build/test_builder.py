@@ -296,22 +296,24 @@ def test_a_failed_overwrite_leaves_the_old_dataset_untouched(tmp_path, source, c
 
 
 @pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)
-@pytest.mark.parametrize("failing_rename", [1, 2])
+@pytest.mark.parametrize(("swaps", "failing_rename"), [(True, 1), (False, 1), (False, 2)])
 def test_a_failure_while_the_datasets_are_swapped_brings_the_old_one_back(
-    tmp_path, source, configure, monkeypatch, fault, failing_rename
+    tmp_path, source, configure, monkeypatch, fault, swaps, failing_rename
 ):
     build_dataset(configure(), source, tmp_path / "out")
     before = tree(tmp_path)
     calls = []
-    rename = os.replace
+    rename = os.rename
 
-    def replace(a, b):
+    def failing(a, b):
         calls.append(b)
         if len(calls) == failing_rename:
             raise fault
         rename(a, b)
 
-    monkeypatch.setattr("pcdata.build.builder.os.replace", replace)
+    monkeypatch.setattr("pcdata.io.whole_folders.os.rename", failing)
+    if not swaps:
+        monkeypatch.setattr("pcdata.io.whole_folders.exchange", lambda one, other: False)
     with pytest.raises((CacheError, KeyboardInterrupt)):
         build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "out", overwrite=True)
     assert len(calls) >= failing_rename
