@@ -11,11 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.checks import check_tensors
-from pcdata.errors import CaptureError, DTypeError, ShapeError, UnitError
+from pcdata.errors import CaptureError, DTypeError, ShapeError
+from pcdata.io.cloud_statement import CloudStatement
 from pcdata.lengths import check_metres
 from pcdata.structures import METRE, Kind, PointCloud
 from pcdata.structures.fields import CORE_KINDS
 
+_ROUNDED = 1e-5  # that a float colour may lie above 1
 _FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
 
 # What torch can hold and compute with; unsigned integers go to the next wider signed type.
@@ -28,70 +30,73 @@ class CloudArrays:
 
     xyz: NDArray[np.floating[Any]]  # (N, 3)
     normals: NDArray[np.floating[Any]] | None = None  # (N, 3)
-    rgb: NDArray[Any] | None = None  # (N, 3): uint8, uint16, or float in [0, 1]
+    rgb: NDArray[Any] | None = None  # (N, 3): see _unit_colors
     labels: NDArray[Any] | None = None  # (N,) whole numbers
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # name -> (N, ...)
+    kinds: Mapping[str, Kind] = field(default_factory=dict)  # of extra fields, where known
 
 
 def to_cloud(
     where: str,
     arrays: CloudArrays,
     *,
-    frame_id: str,
+    statement: CloudStatement,
+    frame_id: str | None,
     metres_per_unit: float | None,
     viewpoint: Sequence[float] | None = None,
     meta: Mapping[str, Any] | None = None,
 ) -> PointCloud:
     """Make the cloud of all rows whose x, y and z are finite; ``source_index`` keeps their row in the file.
 
-    ``metres_per_unit=None`` takes the file's numbers as metres, provided that they look like it. Normals get unit
-    length, as only their direction means anything; a NaN normal becomes the zero vector. Extra names that are no Python
-    names, or are taken, are changed with underscores.
+    Frame and unit are those that the file or the caller states; numbers whose unit nobody states are metres, provided
+    that they look like it. Normals get unit length, as only their direction means anything; a NaN normal becomes the
+    zero vector. Extra names that are no Python names, or are taken, are changed with underscores.
     """
+    frame = statement.frame(where, frame_id)
+    stated = statement.metres_per_unit(where, metres_per_unit)
     keep = np.isfinite(arrays.xyz).all(axis=1)
     if len(keep) and not keep.any():
         raise CaptureError(f"{where}: none of the {len(keep)} points has finite coordinates; drop this file")
     rows = slice(None) if keep.all() else keep
     xyz = arrays.xyz[rows]
-    unit = check_metres(where, xyz, metres_per_unit, viewpoint=viewpoint or (0.0, 0.0, 0.0))
+    unit = check_metres(where, xyz, stated, viewpoint=viewpoint or (0.0, 0.0, 0.0))
     points = _metres(where, xyz, unit)
     extra: dict[str, torch.Tensor] = {}
-    for name, values in arrays.extra.items():
-        name = _free_name(name, extra)
-        extra[name] = _tensor(f"{where}: field {name!r}", values[rows])
+    kinds: dict[str, Kind] = {}
+    for given, values in arrays.extra.items():
+        name = _free_name(given, extra)
+        extra[name] = _tensor(f"{where}: field {given!r}", values[rows])
+        kinds[name] = arrays.kinds.get(given) or _kind(name, extra[name])
+        if kinds[name] is Kind.POSITION:
+            extra[name] = extra[name] * unit
+    source = statement.source_from_cloud
     return PointCloud(
         points=torch.from_numpy(points),
-        frame_id=frame_id,
+        frame_id=frame,
         colors=None if arrays.rgb is None else torch.from_numpy(_unit_colors(where, arrays.rgb[rows])),
         normals=None if arrays.normals is None else torch.from_numpy(_unit_normals(arrays.normals[rows])),
         labels=None if arrays.labels is None else torch.from_numpy(_whole(where, arrays.labels[rows])),
         source_index=torch.from_numpy(np.flatnonzero(keep)),
         extra=extra,
-        kinds={name: _kind(name, value) for name, value in extra.items()},
+        kinds=kinds,
         viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32, device="cpu") * unit,
+        source_from_cloud=None if source is None else source[None],  # type: ignore[arg-type]
+        source_frame=statement.source_frame or "",
+        frames={name: matrix[None] for name, matrix in statement.frames.items()},
+        unit=statement.unit or METRE,
         meta=(dict(meta or {}),),
     )
 
 
 def from_cloud(where: str, cloud: PointCloud) -> CloudArrays:
-    """Return the arrays of a single cloud in metres, colours as uint8; ``source_index`` is left behind.
+    """Return the arrays of a single cloud, colours as uint8; ``source_index`` is left behind.
 
     Raises:
         ShapeError: the cloud is a batch.
-        UnitError: it is normalised.
-        CaptureError: an extra field moves with the cloud, which the file cannot express.
-        DTypeError, NonFiniteError: a field cannot be stored.
+        DTypeError, NonFiniteError, CaptureError: a field cannot be stored.
     """
     if cloud.num_clouds != 1:
         raise ShapeError(f"{where}: a file holds one cloud, got a batch of {cloud.num_clouds}; write each of unbatch()")
-    if cloud.unit != METRE:
-        raise UnitError(f"{where}: the cloud is {cloud.unit}, a file is in metres; call in_source_frame() first")
-    moving = [name for name, kind in cloud.kinds.items() if kind in (Kind.POSITION, Kind.DIRECTION)]
-    if moving:
-        raise CaptureError(
-            f"{where}: the file cannot say that {', '.join(moving)} move with the cloud, so a later step would leave "
-            "them behind; drop them with with_fields(name=None), or keep the cloud in a cache"
-        )
     foreign = [name for name in cloud.extra if not name.isascii()]
     if foreign:
         raise CaptureError(f"{where}: field names must be ASCII in a file, got {', '.join(foreign)}; rename them")
@@ -134,15 +139,24 @@ def _metres(where: str, xyz: NDArray[Any], unit: float) -> NDArray[np.float32]:
 
 
 def _unit_colors(where: str, rgb: NDArray[Any]) -> NDArray[np.float32]:
-    if rgb.dtype.kind == "u":
-        return (rgb / np.float32(np.iinfo(rgb.dtype).max)).astype(np.float32)
-    colors = rgb.astype(np.float32)
-    if rgb.dtype.kind != "f" or (len(colors) and not (colors.min() >= 0 and colors.max() <= 1)):
-        raise CaptureError(
-            f"{where}: colours must be unsigned integers, or floats in 0..1, got {rgb.dtype} "
-            f"{rgb.min():g} .. {rgb.max():g}; rescale them when exporting"
-        )
-    return colors
+    """Return colours in 0..1: bytes, 16 bits, whole numbers up to 255 of any type, or floats that are in 0..1 already.
+
+    Whole numbers that reach beyond 1 and not beyond 255 are bytes in a wider type: no other scale has them.
+    """
+    if not len(rgb) or rgb.dtype == np.uint8:
+        return (rgb / np.float32(255)).astype(np.float32)
+    low, high = float(rgb.min()), float(rgb.max())
+    is_float = rgb.dtype.kind == "f"
+    if is_float and low >= 0 and high <= 1 + _ROUNDED:
+        return np.minimum(rgb.astype(np.float32), np.float32(1))
+    if low >= 0 and high <= 255 and (not is_float or bool((rgb == np.rint(rgb)).all())):
+        return (rgb / np.float32(255)).astype(np.float32)
+    if rgb.dtype.kind == "u" and rgb.dtype.itemsize == 2:
+        return (rgb / np.float32(65535)).astype(np.float32)
+    raise CaptureError(
+        f"{where}: colours must be whole numbers in 0..255 or unsigned 16 bits, or floats in 0..1, got {rgb.dtype} "
+        f"{low:g} .. {high:g}; rescale them when exporting"
+    )
 
 
 def _unit_normals(normals: NDArray[Any]) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ from pcdata.io.listing import absolute, entries, is_folder, unread_entries, visi
 from pcdata.io.pcd import read_pcd
 from pcdata.io.ply import read_ply
 from pcdata.io.source import Source
-from pcdata.structures import CAMERA_FRAME, PointCloud
+from pcdata.structures import PointCloud
 
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
 
@@ -20,19 +20,27 @@ class CloudFilesSource(Source):
     kind = "clouds"
     needs = "one .pcd or .ply file, or a folder with such files in it"
 
-    def __init__(self, path: Path, *, frame_id: str = CAMERA_FRAME, metres_per_unit: float | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        frame_id: str | None = None,
+        metres_per_unit: float | None = None,
+        labels_from: str | None = None,
+    ) -> None:
         """List the files.
 
         Args:
             path: a file or a folder.
-            frame_id: the frame that the coordinates are in; the files do not say.
-            metres_per_unit: None = metres, refused when the numbers look like millimetres.
+            frame_id: the frame that the coordinates are in; None = as each file says, else ``camera``.
+            metres_per_unit: None = as each file says, else metres, refused where the numbers do not look like metres.
+            labels_from: the column that holds the labels; "" = none of them, None = found by its name.
 
         Raises:
             CaptureError: there is no cloud file, or two differ in the suffix alone.
         """
         path = absolute(path)
-        self.frame_id, self.metres_per_unit = frame_id, metres_per_unit
+        self.frame_id, self.metres_per_unit, self.labels_from = frame_id, metres_per_unit, labels_from
         self._files: dict[str, Path] = {}
         for file in visible_files(path, _is_cloud) if is_folder(path) else [path]:
             if file.stem in self._files:
@@ -59,7 +67,7 @@ class CloudFilesSource(Source):
     def _load(self, sample_id: str) -> PointCloud:
         file = self._files[sample_id]
         read = _READERS[file.suffix.lower()]
-        cloud = read(file, frame_id=self.frame_id, metres_per_unit=self.metres_per_unit)
+        cloud = read(file, frame_id=self.frame_id, metres_per_unit=self.metres_per_unit, labels_from=self.labels_from)
         facts = {**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit or 1.0}
         return cloud.with_meta([{"sample_id": sample_id, "provenance": facts}])
 

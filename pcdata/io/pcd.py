@@ -16,8 +16,10 @@ from pcdata.errors import CaptureError, add_note, near_matches
 from pcdata.files import read_bytes, replacing
 from pcdata.io import lzf
 from pcdata.io.cloud_arrays import CloudArrays, from_cloud, narrowest_int, to_cloud
-from pcdata.io.numbers_as_text import format_rows, parse_words
-from pcdata.io.pcd_header import ENCODINGS, PADDING, Field, PcdHeader, parse_header
+from pcdata.io.cloud_columns import arrays_of_columns
+from pcdata.io.cloud_statement import read_statement, statement_lines
+from pcdata.io.numbers_as_text import format_rows, table_columns, text_blocks
+from pcdata.io.pcd_header import ENCODINGS, PADDING, Field, PcdHeader, check_header_size, parse_header
 from pcdata.structures import PointCloud
 
 _MAX_BYTES = 1 << 32
@@ -28,49 +30,61 @@ _NORMALS = ("normal_x", "normal_y", "normal_z")
 def read_pcd(
     path: str | os.PathLike[str],
     *,
-    frame_id: str = "camera",
+    frame_id: str | None = None,
     metres_per_unit: float | None = None,
+    labels_from: str | None = None,
 ) -> PointCloud:
     """Read a PCD file in any of its encodings as one cloud in metres.
 
-    ``rgb`` / ``rgba`` become ``colors`` (alpha is dropped), ``normal_x normal_y normal_z`` ``normals``, ``label``
-    ``labels``, every other field an invariant ``extra``. Points whose x, y or z is NaN or infinite carry no reading and
-    are dropped; ``source_index`` keeps the row in the file. ``viewpoint`` is the translation of VIEWPOINT;
-    ``meta[0]["viewpoint"]`` has all seven numbers (tx ty tz qw qx qy qz), ``meta[0]["organised_size"]`` is [H, W] when
-    the rows are the pixels of an image.
+    ``rgb`` / ``rgba`` become ``colors`` (alpha is dropped), ``normal_x normal_y normal_z`` ``normals``, ``label`` and
+    its like (see :func:`read_ply`) ``labels``, ``vp_x vp_y vp_z`` the viewpoint of each point, every other field an
+    extra. Points whose x, y or z is NaN or infinite carry no reading and are dropped; ``source_index`` keeps the row in
+    the file. ``viewpoint`` is the translation of VIEWPOINT; ``meta[0]["viewpoint"]`` has all seven numbers
+    (tx ty tz qw qx qy qz), ``meta[0]["organised_size"]`` is [H, W] when the rows are the pixels of an image. A file
+    that pcdata wrote comes back in its frame and unit, with the way to its source.
 
     Args:
         path: the file.
-        frame_id: the frame its coordinates are in; the format does not say.
-        metres_per_unit: None = metres, as PCL has them, refused when the numbers look like millimetres.
+        frame_id: the frame its coordinates are in; None = as the file says, else ``camera``.
+        metres_per_unit: None = as the file says, else metres, refused where the numbers do not look like metres.
+        labels_from: the field that holds the labels; "" = none of them, None = found by its name.
 
     Raises:
-        CaptureError: the file is missing, damaged, contradicts itself, or has points but none that is finite.
-        UnitError: the coordinates cannot be metres.
+        CaptureError: the file is missing, damaged, contradicts itself, has points but none that is finite, or its
+            fields are ambiguous.
+        FrameError: the file states another frame.
+        UnitError: the coordinates do not look like metres and no unit is stated, or two units are.
     """
     where = f"read_pcd: {path}"
     data = read_bytes(where, path, max_bytes=_MAX_BYTES)
     header, start = parse_header(where, data)
+    statement = read_statement(where, header.comments)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.encoding]
-    columns = read(where, header, memoryview(data)[start:])
+    columns = {
+        name: values[:, 0] if values.shape[1] == 1 else values
+        for name, values in read(where, header, memoryview(data)[start:]).items()
+    }
     meta: dict[str, Any] = {"viewpoint": list(header.viewpoint)}
     if header.height > 1:
         meta["organised_size"] = [header.height, header.width]
+    is_own = statement.frame_id is not None
     return to_cloud(
         where,
-        _arrays(where, columns),
+        arrays_of_columns(where, columns, statement, labels_from=labels_from),
+        statement=statement,
         frame_id=frame_id,
         metres_per_unit=metres_per_unit,
-        viewpoint=header.viewpoint[:3],
+        viewpoint=statement.viewpoint if is_own else header.viewpoint[:3],
         meta=meta,
     )
 
 
 def write_pcd(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
-    """Write one cloud in metres as PCD 0.7; colours are rounded to 8 bits, as the format has them.
+    """Write one cloud as PCD 0.7; colours are rounded to 8 bits, as the format has them.
 
-    Written: points, normals, colours (``rgb``), labels, invariant extra fields, viewpoint. Not written, because the
-    format has no place: frame, source frame, history, ``source_index``.
+    Written: points, normals, colours (``rgb``), labels, extra fields, viewpoint; as comments, which :func:`read_pcd`
+    understands and others skip: frame, unit, the way back to the source frame, known frames, and what each extra field
+    is. Not written: ``meta``, ``history``, ``layout``, ``source_index``.
 
     Args:
         cloud: a single cloud.
@@ -88,9 +102,12 @@ def write_pcd(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str 
         Field(name, {"f": "F", "i": "I", "u": "U"}[values.dtype.kind], values.dtype.itemsize, values.shape[1])
         for name, values in columns.items()
     )
-    header = PcdHeader(fields, cloud.num_points, 1, encoding, _seven_numbers(cloud))
+    comments = statement_lines(where, cloud, "label")
+    header = PcdHeader(fields, cloud.num_points, 1, encoding, _seven_numbers(cloud), comments=tuple(comments))
+    text = header.to_text().encode("ascii")
+    check_header_size(where, text)
     with replacing(where, path) as temporary:
-        temporary.write_bytes(header.to_text().encode("ascii") + _body(header, columns))
+        temporary.write_bytes(text + _body(header, columns))
 
 
 def _read_binary(where: str, header: PcdHeader, body: memoryview) -> dict[str, NDArray[Any]]:
@@ -135,58 +152,26 @@ def _check_length(where: str, what: str, expected: int, body: memoryview) -> Non
 
 
 def _read_ascii(where: str, header: PcdHeader, body: memoryview) -> dict[str, NDArray[Any]]:
-    lines = [line for line in bytes(body).splitlines() if line.strip()]
-    per_row = sum(field.count for field in header.fields)
-    words = b" ".join(lines).split()
-    if len(lines) != header.num_points or len(words) != header.num_points * per_row:
+    names = [field.name for field in header.fields for _ in range(field.count)]
+    dtypes = [field.dtype for field in header.fields for _ in range(field.count)]
+    blocks, found = [], 0
+    for lines in text_blocks(where, body):
+        found += len(lines.bounds) - 1
+        if found > header.num_points:
+            break
+        blocks.append(table_columns(where, names, dtypes, lines))
+    if found != header.num_points:
         raise CaptureError(
-            f"{where}: POINTS {header.num_points} of {per_row} values each must follow, but there are "
-            f"{len(lines)} lines with {len(words)} values; is the file truncated?"
+            f"{where}: POINTS {header.num_points} lines of {len(names)} values each must follow, but there are "
+            f"{found}{' or more' if found > header.num_points else ''}; is the file truncated?"
         )
-    table = np.array(words, dtype=object).reshape(header.num_points, per_row)
     columns, first = {}, 0
     for field in header.fields:
         if field.name != PADDING:
-            words_of_field = table[:, first : first + field.count]
-            columns[field.name] = parse_words(f"{where}: {field.name}", words_of_field, field.dtype)
+            parts = [np.stack(block[first : first + field.count], axis=1) for block in blocks]
+            columns[field.name] = np.concatenate(parts) if parts else np.zeros((0, field.count), field.dtype)
         first += field.count
     return columns
-
-
-def _arrays(where: str, columns: dict[str, NDArray[Any]]) -> CloudArrays:
-    """Give the columns their meaning by name."""
-
-    def take(*names: str) -> NDArray[Any] | None:
-        if not all(name in columns and columns[name].shape[1] == 1 for name in names):
-            return None
-        return np.concatenate([columns.pop(name) for name in names], axis=1)
-
-    found = " ".join(columns)
-    xyz = take("x", "y", "z")
-    if xyz is None:
-        raise CaptureError(f"{where}: fields x, y and z are needed, one value each, but the file has {found}")
-    rgb = None
-    for name in ("rgb", "rgba"):
-        if name in columns and rgb is None:
-            rgb = _unpack_rgb(where, name, columns.pop(name))
-    normals = take(*_NORMALS)
-    labels = take("label")
-    return CloudArrays(
-        xyz=xyz if xyz.dtype.kind == "f" else xyz.astype(np.float64),
-        normals=None if normals is None else normals.astype(np.float64),
-        rgb=rgb,
-        labels=None if labels is None else labels[:, 0],
-        extra={name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns.items()},
-    )
-
-
-def _unpack_rgb(where: str, name: str, column: NDArray[Any]) -> NDArray[np.uint8]:
-    """Split 0xAARRGGBB, stored as an integer or as the float of the same bits, into (N, 3)."""
-    if column.dtype.itemsize != 4 or column.shape[1] != 1:
-        found = f"{column.dtype} x {column.shape[1]}"
-        raise CaptureError(f"{where}: field {name!r} must be four bytes per point, got {found}")
-    channels = np.ascontiguousarray(column).view(np.uint8).reshape(-1, 4)  # little-endian: blue first
-    return channels[:, 2::-1]
 
 
 def _pack_rgb(rgb: NDArray[np.uint8]) -> NDArray[np.uint32]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,7 @@ class PcdHeader:
     encoding: str
     viewpoint: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # tx ty tz qw qx qy qz
     version: str = "0.7"
+    comments: tuple[str, ...] = ()  # without the sign
 
     @property
     def num_points(self) -> int:
@@ -62,7 +63,7 @@ class PcdHeader:
     def to_text(self) -> str:
         """Return the header as it stands in a file."""
         columns = list(zip(*((f.name, str(f.size), f.kind, str(f.count)) for f in self.fields)))
-        lines = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
+        lines = ["# .PCD v0.7 - Point Cloud Data file format", *(f"# {line}" for line in self.comments), "VERSION 0.7"]
         lines += [f"{key} {' '.join(column)}" for key, column in zip(("FIELDS", "SIZE", "TYPE", "COUNT"), columns)]
         lines += [f"WIDTH {self.width}", f"HEIGHT {self.height}"]
         lines += ["VIEWPOINT " + " ".join(f"{value:.9g}" for value in self.viewpoint)]
@@ -81,8 +82,11 @@ def parse_header(where: str, data: bytes) -> tuple[PcdHeader, int]:
     if end is None:
         raise CaptureError(f"{where}: not a PCD file: no DATA line in its first {_MAX_HEADER} bytes")
     lines: dict[str, list[str]] = {}
-    for line in head[: end.end()].decode("ascii", "replace").splitlines():
-        words = line.split("#")[0].split()
+    comments = []
+    for line in head[: end.end()].decode("ascii", "replace").split("\n"):
+        fact, _, comment = line.partition("#")
+        comments += [comment.strip()] if comment.strip() else []
+        words = fact.split()
         if not words:
             continue
         key = "FIELDS" if words[0] == "COLUMNS" else words[0]  # the name before version 0.7
@@ -97,10 +101,20 @@ def parse_header(where: str, data: bytes) -> tuple[PcdHeader, int]:
     version = lines.get("VERSION", ["0.7"])[:1]
     if version not in (["0.7"], [".7"], ["0.6"], [".6"]):
         raise CaptureError(f"{where}: PCD version {version} is not known; convert the file to 0.7")
-    return _consistent(where, lines), min(end.end(), len(data))
+    return _consistent(where, lines, comments), min(end.end(), len(data))
 
 
-def _consistent(where: str, lines: dict[str, list[str]]) -> PcdHeader:
+def check_header_size(where: str, text: bytes) -> None:
+    """Refuse to write a header that would not be read.
+
+    Raises:
+        CaptureError: it is too long.
+    """
+    if len(text) > _MAX_HEADER:
+        raise CaptureError(f"{where}: the header would take {len(text)} bytes, more than {_MAX_HEADER}; drop fields")
+
+
+def _consistent(where: str, lines: dict[str, list[str]], comments: list[str]) -> PcdHeader:
     names = lines["FIELDS"]
     columns = [lines["SIZE"], lines["TYPE"], lines.get("COUNT", ["1"] * len(names))]
     if any(len(column) != len(names) for column in columns):
@@ -116,8 +130,9 @@ def _consistent(where: str, lines: dict[str, list[str]]) -> PcdHeader:
     encoding = lines["DATA"][0]
     if encoding not in ENCODINGS:
         raise CaptureError(f"{where}: DATA must be one of {', '.join(ENCODINGS)}, not {encoding!r}")
-    header = PcdHeader(fields, width, height, encoding)
-    return PcdHeader(fields, width, height, encoding, _viewpoint(where, lines.get("VIEWPOINT")) or header.viewpoint)
+    header = PcdHeader(fields, width, height, encoding, comments=tuple(comments))
+    viewpoint = _viewpoint(where, lines.get("VIEWPOINT"))
+    return header if viewpoint is None else replace(header, viewpoint=viewpoint)
 
 
 def _field(where: str, name: str, size: str, kind: str, count: str) -> Field:

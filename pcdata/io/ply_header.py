@@ -47,8 +47,18 @@ class Element:
         return np.dtype([(entry.name, entry.dtype) for entry in self.properties])
 
 
-def parse_header(where: str, data: bytes) -> tuple[str, list[Element], int]:
-    """Return the encoding, the elements in file order, and where the data begins.
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a header says, and where the data begins."""
+
+    encoding: str
+    elements: list[Element]
+    comments: list[str]  # of the lines ``comment`` and ``obj_info``
+    size: int  # bytes
+
+
+def parse_header(where: str, data: bytes) -> PlyHeader:
+    """Read the header.
 
     Raises:
         CaptureError: the header is missing, damaged, or of a kind that is not known.
@@ -60,10 +70,13 @@ def parse_header(where: str, data: bytes) -> tuple[str, list[Element], int]:
     encoding = ""
     names: list[tuple[str, int]] = []
     properties: list[list[Property]] = []
-    for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
+    comments = []
+    for line in head[: end.start()].decode("ascii", "replace").split("\n")[1:]:
         match line.split():
-            case [] | ["comment" | "obj_info", *_]:
+            case []:
                 continue
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.strip().partition(" ")[2].strip())
             case ["format", given, "1.0"] if given in BYTE_ORDERS and not encoding:
                 encoding = given
             case ["element", name, count] if encoding and re.fullmatch(r"[0-9]{1,15}", count):
@@ -81,10 +94,21 @@ def parse_header(where: str, data: bytes) -> tuple[str, list[Element], int]:
     for element in elements:
         unique = {entry.name for entry in element.properties}
         if len(unique) != len(element.properties):
-            raise CaptureError(f"{where}: element {element.name!r} lists a property twice")
+            raise CaptureError(f"{where}: element {element.name!r:.60} lists a property twice")
     if [element.name for element in elements].count("vertex") != 1:
-        raise CaptureError(f"{where}: exactly one element 'vertex' is needed, but the file has {[n for n, _ in names]}")
-    return encoding, elements, min(end.end(), len(data))
+        found = ", ".join(repr(name)[:60] for name, _ in names[:8]) or "none"
+        raise CaptureError(f"{where}: exactly one element 'vertex' is needed, but the file has {found}")
+    return PlyHeader(encoding, elements, comments, min(end.end(), len(data)))
+
+
+def check_header_size(where: str, header: bytes) -> None:
+    """Refuse to write a header that would not be read.
+
+    Raises:
+        CaptureError: it is too long.
+    """
+    if len(header) > _MAX_HEADER:
+        raise CaptureError(f"{where}: the header would take {len(header)} bytes, more than {_MAX_HEADER}; drop fields")
 
 
 def _dtype(encoding: str, kind: str) -> np.dtype:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from pcdata.errors import DeviceError, FrameError, ShapeError, UnitError
+from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
 
 if TYPE_CHECKING:
     from pcdata.structures.point_cloud import PointCloud
@@ -23,6 +23,12 @@ def joinable_parts(clouds: Sequence[PointCloud]) -> dict[str, list[Tensor]]:
         if own.keys() != fields[0].keys() or cloud.kinds != clouds[0].kinds:
             different = own.keys() ^ fields[0].keys() or "kinds"
             raise ShapeError(f"PointCloud.cat: cloud {position} and cloud 0 carry different fields: {different}")
+        for name, value in own.items():
+            if value.dtype != fields[0][name].dtype:  # torch would turn integers into floats, which are averaged
+                raise DTypeError(
+                    f"PointCloud.cat: {name} is {value.dtype} in cloud {position} but {fields[0][name].dtype} in cloud "
+                    "0; convert one of them"
+                )
     return {name: [own[name] for own in fields] for name in fields[0]}
 
 

@@ -81,13 +81,33 @@ def test_lists_within_vertices_are_skipped(tmp_path: Path, encoding: str) -> Non
 XYZ = "element vertex {}\nproperty float x\nproperty float y\nproperty float z"
 
 
-def test_float_colours_are_taken_as_they_are_and_must_lie_in_0_to_1(tmp_path: Path) -> None:
-    declarations = XYZ.format(1) + "".join(f"\nproperty float {name}" for name in ("red", "green", "blue"))
-    cloud = read_ply(write(tmp_path / "c.ply", ply("ascii", declarations, ("", (0, 0, 1, 0.5, 0, 1)))))
+@pytest.mark.parametrize(
+    ("kind", "values", "expected"),
+    [
+        ("float", (0.5, 0, 1), (0.5, 0, 1)),
+        ("float", (51, 0, 255), (0.2, 0, 1)),
+        ("double", (51, 0, 102), (0.2, 0, 0.4)),
+        ("int", (51, 0, 255), (0.2, 0, 1)),
+        ("uint", (51, 0, 255), (0.2, 0, 1)),
+        ("ushort", (51, 0, 255), (0.2, 0, 1)),
+        ("ushort", (13107, 0, 65535), (0.2, 0, 1)),
+        ("float", (1.000001, 0, 0.2), (1, 0, 0.2)),
+    ],
+)
+def test_colours_of_every_type_land_in_0_to_1(
+    tmp_path: Path, kind: str, values: tuple[float, ...], expected: tuple[float, ...]
+) -> None:
+    declarations = XYZ.format(1) + "".join(f"\nproperty {kind} {name}" for name in ("red", "green", "blue"))
+    cloud = read_ply(write(tmp_path / "c.ply", ply("ascii", declarations, ("", (0, 0, 1, *values)))))
     assert cloud.colors is not None
-    assert cloud.colors.tolist() == [[0.5, 0, 1]]
+    assert cloud.colors[0].tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("values", [(127.5, 0, 255), (300, 0, 1), (-1, 0, 1), (np.nan, 0, 0)])
+def test_colours_on_no_known_scale_are_refused(tmp_path: Path, values: tuple[float, ...]) -> None:
+    declarations = XYZ.format(1) + "".join(f"\nproperty float {name}" for name in ("red", "green", "blue"))
     with pytest.raises(CaptureError, match=r"floats in 0\.\.1"):
-        read_ply(write(tmp_path / "c.ply", ply("ascii", declarations, ("", (0, 0, 1, 128, 0, 255)))))
+        read_ply(write(tmp_path / "c.ply", ply("ascii", declarations, ("", (0, 0, 1, *values)))))
 
 
 def test_names_that_python_cannot_use_are_changed_but_kept(tmp_path: Path) -> None:
@@ -139,7 +159,10 @@ def test_millimetres_are_noticed(tmp_path: Path) -> None:
         ("property float x", "not known"),
         (XYZ.format(1) + "\nproperty list float int a", "not known"),
         (XYZ.format(1) + "\nproperty list int int a", "truncated|does not fit|length"),
-        ("element face 1000000000000\nproperty list uchar int i\n" + XYZ.format(1), "truncated|early|list"),
+        (
+            "element face 1000000000000\nproperty list uchar int i\n" + XYZ.format(1),
+            "truncated|early|list|does not fit",
+        ),
         ("element nothing 99999999999\n" + XYZ.format(0) + "\nsurprise", "not known"),
     ],
 )
@@ -204,7 +227,7 @@ def test_a_written_cloud_reads_back_bit_for_bit(
 ) -> None:
     path = tmp_path_factory.mktemp("ply") / "c.ply"
     write_ply(path, cloud, encoding=encoding)
-    expected, found = cloud.fields(), read_ply(path, metres_per_unit=1.0).fields()
+    expected, found = cloud.fields(), read_ply(path).fields()
     assert torch.equal(found.pop("source_index"), torch.arange(cloud.num_points))
     assert set(found) == set(expected)
     for name, value in expected.items():

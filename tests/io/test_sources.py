@@ -430,11 +430,11 @@ def test_a_damaged_meta_file_is_a_capture_error(tmp_path: Path) -> None:
 
 def test_a_single_cloud_file_is_a_source_of_one(clouds: Path) -> None:
     for name, count in (("a.ply", 4), ("b.pcd", 5)):
-        source = open_source(clouds / name, frame_id="table")
+        source = open_source(clouds / name)
         assert source.ids == [name[0]]
         cloud = source.load(name[0])
         assert isinstance(cloud, PointCloud)
-        assert (cloud.num_points, cloud.frame_id) == (count, "table")
+        assert (cloud.num_points, cloud.frame_id) == (count, "x")
 
 
 def test_two_cloud_files_of_one_name_are_refused(clouds: Path) -> None:
