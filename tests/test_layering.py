@@ -16,7 +16,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "extras", "interrupts", "array_files"},
+    {"checks", "lengths", "rng", "threads", "extras", "interrupts", "array_files"},
     {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -45,6 +45,7 @@ OUTSIDE = {
     "checks": {"torch", "numpy"},
     "lengths": {"numpy"},
     "rng": {"torch", "numpy"},
+    "threads": {"torch"},
     "dispatch": {"torch", "numpy", "typing_extensions"},
     "functional": {"torch", "numpy"},
     "kernels": {"torch", "numpy"},

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pcdata import __version__
 from pcdata.cli import signals
 from pcdata.cli.signals import signals_interrupt
+from pcdata.cli.threads import wait_asleep
 from pcdata.errors import ConfigError, PcdataError
 
 
@@ -34,6 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    wait_asleep()
     arguments = _parser().parse_args(argv)
     try:
         verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code

@@ -1,7 +1,7 @@
 """The compiled CPU core: finding it, choosing the instruction set, calling it.
 
 The core is a plain C library reached through ctypes, which releases the GIL during a call. It starts its own threads
-per call, ``torch.get_num_threads()`` of them, so it is safe after fork and serial inside DataLoader workers.
+per call, as many as torch has (:mod:`pcdata.threads`), so it is safe after fork and serial inside DataLoader workers.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from pcdata.threads import core_threads
 
 INTERFACE_VERSION = 5
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
@@ -73,7 +75,7 @@ def call(function: str, *arguments: Any) -> None:
     raised: list[BaseException] = []
     polls = _polls(raised)
     next(polls)
-    context = _Context(torch.get_num_threads(), _Poll(polls.__next__))
+    context = _Context(core_threads(), _Poll(polls.__next__))
     status = getattr(library(), function)(ctypes.byref(context), *map(_argument, arguments))
     if raised:
         raise raised[0]

@@ -18,6 +18,7 @@ from pcdata.synthetic.scene import make_floor, make_table, place_objects
 from pcdata.synthetic.shading import shade
 from pcdata.synthetic.shapes import Box, Shape
 from pcdata.synthetic.viewpoints import Miscalibration, place_cameras
+from pcdata.threads import torch_on_one_thread
 
 BASE_FRAME = "base"
 
@@ -55,6 +56,7 @@ class Tabletop:
     seed: int
     noise: SensorNoise | None
 
+    @torch_on_one_thread()
     def render(self, seed_noise: int = 0) -> DepthFrame:
         """Return the same scene from the same cameras under another draw of the sensor's noise.
 
@@ -78,6 +80,7 @@ class Tabletop:
         return torch.stack([shape.signed_distance(points.double()).abs() for shape in self.truth.shapes]).amin(0)
 
 
+@torch_on_one_thread()
 def tabletop(
     seed: int = 0,
     num_objects: int = 5,

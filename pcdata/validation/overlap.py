@@ -15,6 +15,7 @@ from pcdata.functional.surfaces import Surface
 from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
 from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part, sigma_along
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.threads import torch_on_one_thread
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.surfaces import surfaces_of
 
@@ -23,6 +24,7 @@ _MAX_SAMPLES = 4000  # per view and capture: what two cores align well within a 
 _MIN_MEETING = 0.3  # of the samples that the other camera could see, the share that it sees within reach
 
 
+@torch_on_one_thread()
 def verify_overlap(
     *captures: DepthFrame | PointCloud,
     names: Sequence[str] | None = None,

@@ -9,6 +9,7 @@ from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataErr
 from pcdata.functional.edge_offset import EdgeVotes
 from pcdata.io.source import Source, checked_ids
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.threads import torch_on_one_thread
 from pcdata.validation.cameras import intrinsics_checks, pose_checks
 from pcdata.validation.check import Check, Verdict, worst
 from pcdata.validation.clouds import cloud_checks
@@ -42,6 +43,7 @@ class Captures(Protocol):
     def load(self, sample_id: str) -> DepthFrame | PointCloud: ...  # noqa: D102
 
 
+@torch_on_one_thread()
 def validate_frame(frame: DepthFrame, *, limits: Limits | None = None) -> list[Check]:
     """Check every view of one capture on its own, then the views against each other.
 
@@ -110,6 +112,7 @@ class _Series:
         self._votes: list[EdgeVotes] = []  # by view, summed over the captures
         self._voted = 0
 
+    @torch_on_one_thread()
     def check(self, source: Captures, sample_id: str) -> list[Check]:
         checks: list[Check] = []
         try:
@@ -130,6 +133,7 @@ class _Series:
             checks += self._poses.check(capture)
         return checks
 
+    @torch_on_one_thread()
     def whole(self) -> list[Check]:
         """Judge what all captures tell together."""
         checks = self._poses.whole()

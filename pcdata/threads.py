@@ -1,0 +1,41 @@
+"""Threads: how many the compiled core uses, and how torch's own are kept from waiting for each other.
+
+Torch splits every operation on more than about 32,000 elements over its OpenMP threads, which meet at a barrier where
+they wait awake. With a core of their own that costs microseconds. Where another process has the core, every operation
+lasts until the system gives it back, milliseconds later: a hundred operations on an image turn into seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+
+_core_threads: ContextVar[int | None] = ContextVar("core_threads", default=None)
+
+
+def core_threads() -> int:
+    """Return how many threads a call of the compiled core may start: torch's number, as the user set it."""
+    return _core_threads.get() or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Run torch's operations on the calling thread alone; the compiled core keeps its threads.
+
+    For long sequences of operations that are short each, such as those on one image. Also a decorator. The number of
+    threads is back afterwards. A thread that uses torch for the first time meanwhile takes over the number 1.
+    """
+    before = torch.get_num_threads()
+    if before == 1:
+        yield
+        return
+    token = _core_threads.set(core_threads())
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _core_threads.reset(token)
