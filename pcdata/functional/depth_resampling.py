@@ -126,7 +126,7 @@ def resize_depth(
     closest = torch.minimum(torch.minimum(corners[0], corners[1]), torch.minimum(corners[2], corners[3]))
     farthest = torch.maximum(torch.maximum(corners[0], corners[1]), torch.maximum(corners[2], corners[3]))
     one_surface = (closest > 0) & (farthest - closest <= max_jump * closest)
-    inverse = [1 / corner for corner in corners]
+    inverse = [1 / torch.where(one_surface, corner, 1.0) for corner in corners]  # 1 / 0 has no gradient
     top, bottom = torch.lerp(inverse[0], inverse[1], across), torch.lerp(inverse[2], inverse[3], across)
     return torch.where(one_surface, 1 / torch.lerp(top, bottom, down[:, None]), nearest), pixel_index
 

@@ -24,6 +24,9 @@ _CONVERGED = 1e-12
 _MAX_STEPS = 60
 # Coordinates inverted at once: the dozens of intermediate tensors stay in a CPU core's cache.
 _CHUNK = 16384
+# A zero this near a pole, as a share of it, takes it away: a fit with coefficients to spare makes such pairs. Together
+# they bend rays by less than 1e-3 of their radius but within 1 % of the pole, where no lens does what they say.
+_CANCELS = 1e-5
 # Largest r^2 of a ray that any pinhole image holds: 89.4 degrees off axis.
 _FAR = 1e4
 
@@ -89,35 +92,78 @@ def undistort_normalized(
     """Invert :func:`distort_normalized` to 1e-12; NaN where the lens model has no inverse.
 
     Newton's method from the distorted position, kept inside :func:`fold_radius`: beyond it the model folds back over
-    itself and a second solution exists that no ray took.
+    itself and a second solution exists that no ray took. A pole that a zero cancels (to 1e-5 of its place) is taken out
+    with it. First derivatives are those of the inverse function, none where there is no inverse.
 
     Raises:
         ShapeError, CaptureError: as :func:`distort_normalized`.
     """
     _check_views("undistort_normalized", xy, distortion)
-    solved = torch.empty_like(xy, dtype=torch.float64).reshape(len(xy), -1, 2)
-    for view, (target, coefficients) in enumerate(zip(xy.double().reshape(solved.shape), distortion)):
-        fold = float(fold_radius(coefficients[None]))
-        for begin in range(0, len(target), _CHUNK):
-            some = slice(begin, begin + _CHUNK)
-            solved[view, some] = _invert(target[some], _split(coefficients[None], 1), fold)
+    target = xy.double().reshape(len(xy), -1, 2)
+    with torch.no_grad():
+        solved = torch.empty_like(target)
+        for view, coefficients in enumerate(distortion):
+            fold = float(fold_radius(coefficients[None]))
+            split = _split(_without_cancelled_poles(coefficients)[None], 1)
+            for begin in range(0, target.shape[1], _CHUNK):
+                some = slice(begin, begin + _CHUNK)
+                solved[view, some] = _invert(target[view, some], split, fold)
+    if torch.is_grad_enabled() and (xy.requires_grad or distortion.requires_grad):
+        solved = _with_gradient(solved, target, distortion)
     return solved.reshape(xy.shape)
+
+
+def _with_gradient(solved: Tensor, target: Tensor, distortion: Tensor) -> Tensor:
+    """Attach the inverse function's derivative to its values (V, P, 2): that of one Newton step at the solution."""
+    known = ~solved.isnan().any(-1, keepdim=True)
+    at = torch.where(known, solved, 0.0)  # the centre of the image stands in where there is no solution
+    x, y = at.unbind(-1)
+    coefficients = _split(distortion, 2)
+    with torch.no_grad():
+        xx, xy, yx, yy = _jacobian(x, y, coefficients)
+        determinant = xx * yy - xy * yx
+    bent_x, bent_y = _bend(x, y, coefficients)
+    error_x, error_y = bent_x - target[..., 0], bent_y - target[..., 1]
+    step = torch.stack([yy * error_x - xy * error_y, xx * error_y - yx * error_x], -1) / determinant[..., None]
+    step = torch.where(known, step, 0.0)
+    return solved - (step - step.detach())  # the value keeps every bit
 
 
 def fold_radius(distortion: Tensor) -> Tensor:
     """Return (V,) float64: the normalised radius at which each view's radial model stops growing, or infinity.
 
-    It is the first zero of d(r N/D)/dr, or the first pole; with t = r^2 both are polynomials in t.
+    It is the first zero of d(r N/D)/dr, or the first pole that no zero cancels; with t = r^2 both are polynomials in t.
     """
     radii = []
-    for k1, k2, _, _, k3, k4, k5, k6 in _padded(distortion)[:, :8].cpu().tolist():
-        numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
-        denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
+    for coefficients in _padded(distortion):
+        numerator, denominator = _radial_parts(coefficients)
         t = np.polynomial.Polynomial([0.0, 1.0])
         slope = numerator * denominator + 2 * t * (numerator.deriv() * denominator - numerator * denominator.deriv())
         folds = [*_positive_roots(slope), *_positive_roots(denominator)]
         radii.append(min(folds, default=np.inf) ** 0.5)
     return torch.tensor(radii, dtype=torch.float64, device=distortion.device)
+
+
+def _radial_parts(coefficients: Tensor) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:
+    """Return numerator and denominator of one view's radial quotient in t = r^2, without cancelled poles."""
+    k1, k2, _, _, k3, k4, k5, k6 = _padded(coefficients)[:8].tolist()
+    numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
+    denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
+    for pole in _positive_roots(denominator):
+        zero = min(_positive_roots(numerator), key=lambda root: abs(root - pole), default=np.inf)
+        if abs(zero - pole) <= _CANCELS * pole:
+            numerator //= np.polynomial.Polynomial([1.0, -1.0 / zero])
+            denominator //= np.polynomial.Polynomial([1.0, -1.0 / pole])
+    return numerator, denominator
+
+
+def _without_cancelled_poles(coefficients: Tensor) -> Tensor:
+    """Return (12,) float64 coefficients of the same lens whose radial quotient is reduced."""
+    reduced = _padded(coefficients)
+    for part, places in zip(_radial_parts(coefficients), ([0, 1, 4], [5, 6, 7])):
+        given = part.coef[1:4].tolist()
+        reduced[places] = reduced.new_tensor([*given, *[0.0] * (3 - len(given))])
+    return reduced
 
 
 def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:

@@ -22,7 +22,9 @@ def counts_from_ptr(ptr: Tensor) -> Tensor:
 
 def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None = None) -> Tensor:
     """Return (B+1,) row pointers for (B,) counts."""
-    counts = torch.as_tensor(counts if isinstance(counts, Tensor) else list(counts), dtype=torch.int64, device=device)
+    if not isinstance(counts, Tensor):
+        counts = torch.tensor(list(counts), dtype=torch.int64, device="cpu" if device is None else device)
+    counts = counts.to(dtype=torch.int64, device=device)
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 

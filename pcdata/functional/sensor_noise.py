@@ -67,8 +67,10 @@ def err_in_disparity(
 
     Source: Chang & Chatterjee, Quantization Error Analysis in Stereo Vision, 1992.
     """
-    disparity = quantized(focal_baseline / depth + sigma * wobble, step)
-    return torch.where(disparity > 0, focal_baseline / disparity, 0.0)
+    known = depth > 0  # elsewhere the quotients have no gradient
+    disparity = quantized(focal_baseline / torch.where(known, depth, 1.0) + sigma * wobble, step)
+    known = known & (disparity > 0)
+    return torch.where(known, focal_baseline / torch.where(known, disparity, 1.0), 0.0)
 
 
 def quantized(values: Tensor, step: float) -> Tensor:
@@ -98,7 +100,8 @@ def surface_slope(
     oblique off the image's centre is left out.
     """
     across = [_flatter_side(depth, dim, reach, tolerance) * focal / (reach * depth.clamp(min=1e-9)) for dim in (1, 2)]
-    return torch.where(depth > 0, torch.hypot(across[0], across[1]), 0.0)
+    sloped = (depth > 0) & ((across[0] > 0) | (across[1] > 0))
+    return torch.where(sloped, torch.hypot(torch.where(sloped, across[0], 1.0), across[1]), 0.0)
 
 
 def _flatter_side(depth: Tensor, dim: int, reach: int, tolerance: Tensor | float) -> Tensor:

@@ -29,7 +29,6 @@ _SIZE_TOLERANCE = 1e-6
 
 
 @op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
 def voxel_downsample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -41,7 +40,7 @@ def voxel_downsample(
 
     Voxels are ordered by the lowest row they contain. The mean is
     ``origin + (voxel + mean offset) * voxel_size`` with offsets summed in fixed point (2^-31 of a voxel), so neither
-    the order of the points nor the device changes a bit of it.
+    the order of the points nor the device changes a bit of it. The gradient is that of the mean.
 
     Args:
         points: the clouds, in any unit of length.
@@ -55,15 +54,19 @@ def voxel_downsample(
     """
     assert ptr is not None
     sizes = sizes_per_cloud("voxel_downsample", voxel_size, ptr)
-    cloud, origin, scaled = _scale_to_grid(points, ptr, sizes)
-    voxel = scaled.floor()
-    inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
-    offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
-    count = group_count(inverse, len(first))
-    mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
-    owner = cloud[first]
-    means = origin[owner] + (voxel[first] + mean_offset) * sizes[owner, None]
-    return means.float(), ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
+    with torch.no_grad():
+        cloud, origin, scaled = _scale_to_grid(points, ptr, sizes)
+        voxel = scaled.floor()
+        inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
+        offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
+        count = group_count(inverse, len(first))
+        mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
+        owner = cloud[first]
+        means = (origin[owner] + (voxel[first] + mean_offset) * sizes[owner, None]).float()
+    if torch.is_grad_enabled() and points.requires_grad:
+        plain = voxel_mean(points, inverse, len(first))
+        means = means + (plain - plain.detach())  # the value keeps every bit
+    return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
 
 
 @op(points="N 3", ptr="ptr N B")

@@ -41,7 +41,7 @@ class InpaintDepth(Transform):
         if not bool(hole.any()):
             return replace(data)
         cv2 = require("cv2")
-        filled = np.stack([_inpainted(cv2, view) for view in data.depth.cpu().numpy()])
+        filled = np.stack([_inpainted(cv2, view) for view in data.depth.detach().cpu().numpy()])
         depth = torch.where(hole, torch.from_numpy(filled).to(data.depth), data.depth)
         reach = 2 * self.max_distance + 1
         near = max_pool2d((~hole)[:, None].float(), reach, 1, self.max_distance)[:, 0] > 0

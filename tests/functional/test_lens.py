@@ -126,3 +126,44 @@ def test_other_numbers_of_coefficients_are_refused(count, message):
 def test_views_must_agree():
     with pytest.raises(ShapeError, match="the same V views"):
         undistort_normalized(torch.zeros(2, 3, 2), torch.zeros(1, 5))
+
+
+# One lens that never folds, one with its fold inside the image, and the rational ones.
+CURVED = {"never folds": [0.18, 0.02, 0.0, 0.0], "folds inside": [-0.8, 0.0, 0.0, 0.0], "8": LENSES[8], "12": LENSES[12]}
+
+
+@pytest.mark.parametrize("lens", CURVED.values(), ids=CURVED)
+def test_the_gradient_of_unbending_is_that_of_the_inverse_function(lens):
+    given = torch.tensor([lens, [0.1 * value for value in lens]], dtype=torch.float64, requires_grad=True)
+    bent = torch.tensor([[0.0, 0.0], [0.2, -0.1], [-0.31, 0.22]], dtype=torch.float64).repeat(2, 1, 1).requires_grad_()
+    assert torch.autograd.gradcheck(undistort_normalized, (bent, given), eps=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", CURVED.values(), ids=CURVED)
+def test_where_there_is_no_inverse_there_is_no_gradient(lens):
+    given = torch.tensor([lens], dtype=torch.float64, requires_grad=True)
+    bent = grid_of_rays(1.5, 1.2).requires_grad_()
+    straight = undistort_normalized(bent, given)
+    solved = ~straight.isnan()
+    straight[solved].square().sum().backward()
+    assert bent.grad is not None
+    assert given.grad is not None
+    assert bool(torch.isfinite(bent.grad).all())
+    assert bool(torch.isfinite(given.grad).all())
+    assert bool((bent.grad[~solved] == 0).all())
+    assert torch.equal(straight.detach(), undistort_normalized(bent.detach(), given.detach())) or not solved.all()
+
+
+@pytest.mark.parametrize("apart", [0.0, 3e-7, 2.9e-6, 9e-6])
+def test_a_pole_that_a_zero_cancels_is_no_end_of_the_lens(apart):
+    zero, pole = 0.35, 0.35 * (1 + apart)
+    pair = [0.1 - 1 / zero, -0.1 / zero, 0, 0, 0, -1 / pole, 0, 0]  # (1 - t/zero) (1 + 0.1 t) / (1 - t/pole)
+    lens, plain = torch.tensor([pair, [0.1, 0, 0, 0, 0, 0, 0, 0]], dtype=torch.float64).split(1)
+    assert float(fold_radius(lens)) == float(fold_radius(plain)) > 1
+    bent = grid_of_rays(0.8, 0.6)
+    torch.testing.assert_close(undistort_normalized(bent, lens), undistort_normalized(bent, plain), atol=1e-9, rtol=0)
+
+
+def test_a_pole_beside_a_zero_that_does_not_cancel_it_ends_the_lens():
+    pair = [-1 / 0.35, 0, 0, 0, 0, -1 / 0.36, 0, 0]
+    assert float(fold_radius(torch.tensor([pair], dtype=torch.float64))) <= 0.36**0.5
