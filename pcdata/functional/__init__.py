@@ -1,4 +1,10 @@
-"""Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device."""
+"""Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
+
+Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
+decimated, resized and filled depth, disparity, Chamfer distance. None flow through decisions (indices, masks, labels,
+planes, sizes, the neighbours and distances of a search), nor through estimated normals, ``register_depth``,
+``spatial_filter`` and TSDF volumes. The distance of neighbours with a gradient is that of the rows that a search named.
+"""
 
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.depth import deproject_depth, pixel_rays, project_points, range_to_depth

@@ -172,14 +172,15 @@ def project_points(
     view = cloud_of_rows(ptr)
     x, y, z = points.double().unbind(-1)
     visible = z > 0
-    xy = torch.stack([x, y], dim=-1) / torch.where(visible, z, torch.nan)[:, None]
+    # What is not visible is not computed with: a NaN on the way would be in every gradient.
+    xy = torch.stack([x, y], dim=-1) / torch.where(visible, z, 1.0)[:, None]
     if distortion is not None:
-        inside = xy.norm(dim=-1) < fold_radius(distortion)[view]
-        xy = torch.where(inside[:, None], _distort_rows(xy, ptr, distortion), torch.nan)
+        visible = visible & (xy.norm(dim=-1) < fold_radius(distortion)[view])
+        xy = _distort_rows(torch.where(visible[:, None], xy, 0.0), ptr, distortion)
     fx, skew, cx, fy, cy = (value[view] for value in _pinhole(intrinsics))
     u = fx * xy[:, 0] + skew * xy[:, 1] + cx
     v = fy * xy[:, 1] + cy
-    return torch.stack([u, v], dim=-1), points[:, 2]
+    return torch.where(visible[:, None], torch.stack([u, v], dim=-1), torch.nan), points[:, 2]
 
 
 def range_to_depth(
@@ -198,8 +199,10 @@ def range_to_depth(
     height, width = ray_length.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion)
     check_rays("range_to_depth", rays, ray_length > 0)
+    known = ray_length > 0
+    rays = torch.where(known[..., None], rays, 0.0)  # a pixel without a ray has no gradient
     depth = ray_length.double() / (1 + rays.square().sum(-1)).sqrt()
-    return torch.where(ray_length > 0, depth, 0.0).float()
+    return torch.where(known, depth, 0.0).float()
 
 
 def check_intrinsics(where: str, intrinsics: Tensor) -> None:

@@ -69,7 +69,12 @@ def decimate_depth(
     middle = factor // 2 * factor + factor // 2
     place = torch.where(count > 0, median & 63, middle)
     if rule == "median":
-        lower, upper = ((one >> 6).int().view(torch.float32) for one in (median, pick_image(ordered, count // 2)))
+        chosen = (median, pick_image(ordered, count // 2))
+        if torch.is_grad_enabled() and depth.requires_grad:
+            readings = torch.stack(blocks)
+            lower, upper = (readings.gather(0, (one & 63).clamp(max=len(blocks) - 1)[None])[0] for one in chosen)
+        else:
+            lower, upper = ((one >> 6).int().view(torch.float32) for one in chosen)
         # Without the upper one a slanted surface would come out nearer than it is.
         reduced = torch.where(upper - lower <= max_jump * lower, lower + 0.5 * (upper - lower), lower)
     else:

@@ -103,4 +103,5 @@ def _reciprocal(where: str, name: str, values: Tensor, focal: Tensor, baseline: 
     if not (baseline > 0 and bool((focal > 0).all())):
         raise ConfigError(f"{where}: baseline and focal length must be positive, got {baseline} and {focal.tolist()}")
     scale = (STEPS_PER_PIXEL * baseline * focal.double())[:, None, None].float()
-    return torch.where(values > 0, scale / values, 0.0)
+    known = values > 0
+    return torch.where(known, scale / torch.where(known, values, 1.0), 0.0)  # 1 / 0 has no gradient

@@ -82,7 +82,7 @@ def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Ten
     linear = torch.linalg.inv(matrix[:, :3, :3].double()).mT
     moved = transform_points(directions.double(), ptr, from_rotation_translation(linear, linear.new_zeros(3)))
     x, y, z = moved.unbind(1)
-    length = ((x * x + y * y) + z * z).sqrt().clamp(min=1e-12)
+    length = ((x * x + y * y) + z * z).clamp(min=1e-24).sqrt()  # the root of 0 has no gradient
     return (moved / length[:, None]).to(directions.dtype)
 
 

@@ -109,6 +109,13 @@ def motion_from_twist(twist: Tensor, pivot: Tensor) -> Tensor:  # (..., 6), (3,)
     angle = rotation_vector.norm(dim=-1)
     axis = rotation_vector / torch.where(angle > 0, angle, 1.0)[..., None]
     rotation = rigid.rotation_about_axis(axis, angle)
+    if torch.is_grad_enabled() and rotation_vector.requires_grad:
+        # At rest there is no axis, but there is a derivative: that of I + [v]x.
+        x, y, z = rotation_vector.unbind(-1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(rotation.shape)
+        identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
+        rotation = torch.where((angle > 0)[..., None, None], rotation, identity + cross)
     pivot = pivot.double()
     return rigid.from_rotation_translation(rotation, pivot + shift - (rotation @ pivot[:, None]).squeeze(-1))
 

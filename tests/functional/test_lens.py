@@ -129,7 +129,12 @@ def test_views_must_agree():
 
 
 # One lens that never folds, one with its fold inside the image, and the rational ones.
-CURVED = {"never folds": [0.18, 0.02, 0.0, 0.0], "folds inside": [-0.8, 0.0, 0.0, 0.0], "8": LENSES[8], "12": LENSES[12]}
+CURVED = {
+    "never folds": [0.18, 0.02, 0.0, 0.0],
+    "folds inside": [-0.8, 0.0, 0.0, 0.0],
+    "8": LENSES[8],
+    "12": LENSES[12],
+}
 
 
 @pytest.mark.parametrize("lens", CURVED.values(), ids=CURVED)
