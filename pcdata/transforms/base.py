@@ -12,7 +12,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, get_args, get_type_hints
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.fields import CORE_KINDS
+from pcdata.transforms.fields import LengthIn
 
 Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
@@ -36,7 +37,7 @@ class Transform(nn.Module):
     """A configured step from captures or clouds to clouds; the same for one cloud, a batch, CPU and GPU."""
 
     is_random: ClassVar[bool] = False  # draws from the generator
-    needs_metres: ClassVar[bool] = False  # its fields are lengths: refuse normalised clouds
+    needs_metres: ClassVar[bool] = False  # works in metres, whatever its fields: refuse normalised clouds
     runs_statistics: ClassVar[bool] = False  # its cost and its answer depend on the rest of the scene
     keeps_clouds: ClassVar[bool] = True  # cloud b of the result is cloud b of the input: none is joined or split
     takes: ClassVar[type] = PointCloud
@@ -89,6 +90,11 @@ class Transform(nn.Module):
     def frame_after(self, frame: str | None) -> str | None:
         """The frame of the result for an input in ``frame``; None = not known yet."""
         return self.frame_given() or self.frame_needed() or frame
+
+    def unit_needed(self) -> str | None:
+        """The unit that the fields' lengths are in, or None when no length is given: any will do."""
+        given = [unit for name, unit in length_fields(type(self)).items() if getattr(self, name) is not None]
+        return METRE if self.needs_metres else next(iter(given), None)
 
     def unit_given(self) -> str | None:
         """The unit of the result, or None when it is the input's."""
@@ -159,9 +165,12 @@ class Transform(nn.Module):
                 f"{name}: its fields are given in frame {needed!r} but the cloud is in {data.frame_id!r}; "
                 f"add ToFrame(frame={needed!r}) before it"
             )
-        if self.needs_metres and data.unit != METRE:
+        unit = self.unit_needed()
+        if unit is not None and data.unit != unit:
+            lengths = "metres" if unit == METRE else "the unit of normalised clouds"
+            found = "in metres" if data.unit == METRE else data.unit
             raise UnitError(
-                f"{name}: its fields are lengths in metres but the cloud is {data.unit}; put it before normalising"
+                f"{name}: its fields are lengths in {lengths} but the cloud is {found}; {unit_advice(self)}"
             )
 
     def recorded(self, data: Any, result: Any, params: Params) -> Any:
@@ -228,6 +237,14 @@ class SelectTransform(Transform, abstract=True):
         return data.select(params["index"], params["ptr"])
 
 
+def unit_advice(step: Transform) -> str:
+    """What to do where a step's lengths are not in the unit of the cloud."""
+    if step.unit_needed() != METRE:
+        return "put it after normalising, or leave unit out and give metres"
+    own = ", or say unit: normalized if the length is meant in the normalised cloud"
+    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"
+
+
 def num_clouds(data: Data) -> int:
     """The number of independent clouds: B of a cloud, 1 of a capture."""
     return data.num_clouds if isinstance(data, PointCloud) else 1
@@ -249,6 +266,18 @@ def field_types(cls: type[Transform]) -> dict[str, Any]:
     """Return the declared fields' types with their limits."""
     hints = get_type_hints(cls, include_extras=True)
     return {name: hints[name] for name in field_names(cls)}
+
+
+@functools.cache
+def length_fields(cls: type[Transform]) -> dict[str, str]:
+    """Return the unit of every declared field that is a length in a unit."""
+    found = {name: _length_unit(hint) for name, hint in field_types(cls).items()}
+    return {name: unit for name, unit in found.items() if unit is not None}
+
+
+def _length_unit(hint: Any) -> str | None:
+    own = [note.unit for note in getattr(hint, "__metadata__", ()) if isinstance(note, LengthIn)]
+    return next(iter(own), None) or next(filter(None, map(_length_unit, get_args(hint))), None)
 
 
 @functools.cache

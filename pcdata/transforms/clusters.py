@@ -23,7 +23,6 @@ class ClusterObjects(Transform):
     ``meta["objects"]`` lists label and point count.
     """
 
-    needs_metres = True
     runs_statistics = True
 
     eps: Metres = 0.02  # points closer than this are neighbours

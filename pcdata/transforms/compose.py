@@ -12,8 +12,8 @@ from torch import Generator, nn
 
 from pcdata.errors import ConfigError
 from pcdata.rng import Streams, seeded
-from pcdata.structures import METRE, PointCloud
-from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds
+from pcdata.structures import METRE, NORMALIZED, PointCloud
+from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds, unit_advice
 from pcdata.transforms.capture import find_capture, run_capture
 from pcdata.transforms.fields import Fraction
 
@@ -179,7 +179,7 @@ def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
 
 def _check_chain(steps: Sequence[Transform]) -> None:
     frame: str | None = None
-    unit = METRE
+    unit = METRE if steps and steps[0].takes is not PointCloud else None  # None: that of whatever comes in
     for position, (before, after) in enumerate(itertools.pairwise(steps), start=1):
         if not issubclass(before.gives, after.takes):
             raise ConfigError(
@@ -192,10 +192,13 @@ def _check_chain(steps: Sequence[Transform]) -> None:
         needed = step.frame_needed()
         if frame is not None and needed is not None and needed != frame:
             raise ConfigError(f"{where} works in frame {needed!r} but the cloud is in {frame!r} there")
-        if step.needs_metres and unit != METRE:
-            raise ConfigError(f"{where} works in metres but the cloud is normalised there; put it earlier")
+        wanted = step.unit_needed()
+        if unit is not None and wanted is not None and wanted != unit:
+            names = {METRE: "in metres", NORMALIZED: "normalised"}
+            works = "in metres" if wanted == METRE else "on normalised clouds"
+            raise ConfigError(f"{where} works {works} but the cloud is {names[unit]} there; {unit_advice(step)}")
         frame = step.frame_after(frame)
-        unit = step.unit_given() or unit
+        unit = step.unit_given() or wanted or unit
 
 
 def _warn_statistics_before_crop(steps: Sequence[Transform]) -> None:

@@ -21,9 +21,9 @@ from pcdata.functional.voxels import (
 )
 from pcdata.rng import Streams, seeded
 from pcdata.sensors import SensorProfile
-from pcdata.structures import Kind, PointCloud
+from pcdata.structures import METRE, Kind, PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
-from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres
+from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres, Unit
 
 
 class VoxelDownsample(Transform):
@@ -35,14 +35,21 @@ class VoxelDownsample(Transform):
     cloud gets the largest size that leaves at least so many points.
     """
 
-    # Edge length, in the cloud's unit.
+    # Edge length, in `unit`.
     voxel_size: Annotated[Metres | None, FromSensor(SensorProfile.voxel_size)] = None
     num_points: Count | None = None  # wanted count instead of a size
+    unit: Unit = "m"  # of voxel_size; a cloud in another one is refused
 
     def check_fields(self) -> None:
         """Require exactly one of the two."""
         if (self.voxel_size is None) == (self.num_points is None):
             raise ConfigError("VoxelDownsample: give either voxel_size or num_points")
+        if self.voxel_size is None and self.unit != METRE:
+            raise ConfigError("VoxelDownsample: unit is that of voxel_size; leave it out, num_points works in any")
+
+    def unit_needed(self) -> str | None:
+        """The unit of the voxel size."""
+        return None if self.voxel_size is None else self.unit
 
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Decide the voxel size of every cloud."""

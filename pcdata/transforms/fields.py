@@ -9,9 +9,18 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Interval, MinLen
 
 from pcdata.sensors import SensorProfile
-from pcdata.structures import Confidence
+from pcdata.structures import METRE, Confidence
 
-Metres = Annotated[float, Gt(0)]
+
+@dataclass(frozen=True)
+class LengthIn:
+    """Marks, inside ``Annotated``, a length in a unit; its step refuses clouds in another unit."""
+
+    unit: str
+
+
+Metres = Annotated[float, Gt(0), LengthIn(METRE)]
+Unit = Literal["m", "normalized"]
 NonNegative = Annotated[float, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 Fraction = Annotated[float, Interval(ge=0, le=1)]

@@ -18,7 +18,6 @@ class EstimateNormals(Transform):
     After merging, every point's normal faces the camera that saw that point.
     """
 
-    needs_metres = True
     runs_statistics = True
 
     radius: Metres = 0.02

@@ -36,7 +36,6 @@ class RemoveStatisticalOutliers(SelectTransform):
 class RemoveRadiusOutliers(SelectTransform):
     """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
 
-    needs_metres = True
     runs_statistics = True
 
     min_neighbors: Count = 5

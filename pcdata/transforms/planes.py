@@ -27,7 +27,6 @@ class RemovePlane(SelectTransform):
     :func:`planes_in_cloud` gives it in the cloud's present coordinates.
     """
 
-    needs_metres = True
     runs_statistics = True
 
     distance: Metres = 0.01  # inliers are closer to the plane than this

@@ -11,7 +11,7 @@ from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import Metres
+from pcdata.transforms.fields import Positive, Unit
 
 
 def voxel_cells(points: Tensor, voxel_size: float) -> Tensor:
@@ -22,7 +22,12 @@ def voxel_cells(points: Tensor, voxel_size: float) -> Tensor:
 class VoxelSample(SelectTransform):
     """Keep the first point of every occupied voxel of a grid through the origin; nothing is averaged."""
 
-    voxel_size: Metres  # edge length, in the cloud's unit
+    voxel_size: Positive  # edge length, in `unit`
+    unit: Unit = "m"  # of voxel_size; a cloud in another one is refused
+
+    def unit_needed(self) -> str:
+        """The unit of the voxel size."""
+        return self.unit
 
     def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
         """Pick the row with the lowest rank in each voxel; rows of the result are in their old order."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from pcdata import transforms as T
-from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures import NORMALIZED, DepthFrame, PointCloud
 from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
 QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
@@ -32,6 +32,12 @@ def tabletop_with_counts(counts: Sequence[int]) -> DepthFrame:
     """A rendered capture with as many views as there are counts, each with confidences."""
     frame = tabletop_frame(len(counts))
     return replace(frame, confidence=3 - (frame.depth == 0).to(torch.uint8))
+
+
+def normalized_cloud(counts: Sequence[int]) -> PointCloud:
+    """The batch in a unit that is half a metre; its clouds may have no extent."""
+    cloud = cloud_in_base(counts)
+    return cloud.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])).repeat(len(counts), 1, 1), unit=NORMALIZED)
 
 
 def _of(*transforms: T.Transform, **others: object) -> list[Example]:
@@ -177,8 +183,14 @@ EXAMPLES: dict[str, list[Example]] = {
     "VoxelDownsample": [
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
         Example(T.VoxelDownsample(num_points=40), displacement=0.1 * math.sqrt(3)),
+        Example(
+            T.VoxelDownsample(voxel_size=0.1, unit="normalized"), normalized_cloud, displacement=0.1 * math.sqrt(3)
+        ),
     ],
-    "VoxelSample": _of(T.VoxelSample(voxel_size=0.05)),
+    "VoxelSample": [
+        *_of(T.VoxelSample(voxel_size=0.05)),
+        Example(T.VoxelSample(voxel_size=0.2, unit="normalized"), normalized_cloud),
+    ],
 }
 
 ALL = [example for examples in EXAMPLES.values() for example in examples]

@@ -15,7 +15,7 @@ from pcdata import transforms as T
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataError, UnitError
 from pcdata.rng import seeded
 from pcdata.structures import METRE, NORMALIZED, DepthFrame, PointCloud
-from pcdata.transforms.base import field_names
+from pcdata.transforms.base import field_names, length_fields
 from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
 from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, torch_defaults, tree
 from tests.messages import told
@@ -49,7 +49,7 @@ each_random = only_some(ALL, NAMES, lambda t: t.is_random)
 each_fixed = only_some(ALL, NAMES, lambda t: not t.is_random)
 each_spatial = only_some(ALL, NAMES, lambda t: isinstance(t, T.SpatialTransform))
 each_select = only_some(ALL, NAMES, lambda t: isinstance(t, T.SelectTransform))
-each_in_metres = only_some(ALL, NAMES, lambda t: t.needs_metres)
+each_in_metres = only_some(ALL, NAMES, lambda t: t.takes is PointCloud and t.unit_needed() == METRE)
 each_in_a_frame = only_some(ALL, NAMES, lambda t: t.frame_needed() is not None)
 
 
@@ -282,6 +282,7 @@ def changed_values(value: Any) -> list[Any]:
             "angle",
             "floor",
             "never",
+            "normalized",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]
@@ -477,3 +478,28 @@ def test_cuda_agrees_with_the_cpu(example):
     on_cpu, on_gpu = run(example, data), run(example, data.to("cuda"))
     assert on_gpu.device.type == "cuda"
     assert_same(on_cpu, on_gpu.to("cpu"), tolerance=2e-6)
+
+
+def test_every_length_in_metres_makes_its_step_refuse_normalised_clouds():
+    with_lengths = {name for name, cls in T.REGISTRY.items() if length_fields(cls) and cls.takes is PointCloud}
+    assert {"ClusterObjects", "EstimateNormals", "RandomColumn", "RemovePlane", "VoxelDownsample"} <= with_lengths
+    for name in with_lengths:
+        assert any(example.transform.unit_needed() == METRE for example in EXAMPLES[name]), name
+
+
+@pytest.mark.parametrize("step", [T.VoxelDownsample, T.VoxelSample, T.RandomVoxelSample])
+def test_a_voxel_size_works_in_the_unit_that_it_is_given_in(step):
+    cloud = cloud_in_base(COUNTS)
+    sphere = T.NormalizeUnitSphere()
+    with pytest.raises(UnitError, match=r"lengths in metres but the cloud is normalized; .* or say unit: normalized"):
+        step(voxel_size=0.1)(sphere(cloud), generator=seeded(0))
+    with pytest.raises(ConfigError, match=r"works in metres but the cloud is normalised there; .*unit: normalized"):
+        T.Compose([sphere, step(voxel_size=0.1)])
+    with pytest.raises(UnitError, match=r"the unit of normalised clouds but the cloud is in metres; put it after"):
+        step(voxel_size=0.1, unit="normalized")(cloud, generator=seeded(0))
+    with pytest.raises(ConfigError, match=r"works on normalised clouds but the cloud is in metres there"):
+        T.Compose([T.RemovePlane(), step(voxel_size=0.1, unit="normalized")])
+    followed = T.Compose([sphere, step(voxel_size=0.1, unit="normalized"), T.RandomJitter()])
+    assert 0 < followed(cloud, generator=seeded(0)).num_points < cloud.num_points
+    random_suffix = T.Compose([step(voxel_size=0.1, unit="normalized"), T.RandomJitter()])
+    assert random_suffix(sphere(cloud), generator=seeded(0)).unit == NORMALIZED
