@@ -45,7 +45,8 @@ def ransac_plane(
     longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
-    The normal points along ``up`` when given, else towards the origin, where the sensor is (d >= 0).
+    The normal points along ``up`` when given, else towards the origin, where the sensor is (d >= 0). A plane nearer to
+    the origin than ``distance`` has no such side: its normal's largest component is positive; noise does not decide.
 
     Args:
         points: the clouds, in any unit of length.
@@ -105,7 +106,7 @@ def search_planes(
         where = f"ransac_plane: cloud {cloud}"
         winner = _best_plane(own, hypotheses, allowed(hypotheses), distance, where, work)
         plane, inlier_mask = _refine(own, winner, distance, allowed, work)
-        planes[cloud] = _face(plane, ups[cloud])
+        planes[cloud] = _face(plane, ups[cloud], distance)
         inlier_masks.append(inlier_mask)
     return planes.to(points.device), inlier_masks[0] if num_clouds == 1 else torch.cat(inlier_masks)
 
@@ -246,11 +247,17 @@ def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
     return plane_distance(points, plane[None])[0].abs_() < distance
 
 
-def _face(plane: Tensor, up: Tensor | None) -> Tensor:
-    """Turn the normal along ``up``, else towards the origin; where both are open, its first component is positive."""
+def _face(plane: Tensor, up: Tensor | None, distance: float) -> Tensor:
+    """Turn the normal along ``up``, else towards an origin off the plane, else its largest component is positive."""
     along_up = 0.0 if up is None else float(plane[:3] @ up)
-    deciding = [along_up, float(plane[3]), *plane[:3].tolist()]
+    towards_origin = 0.0 if through_origin(plane, distance) else float(plane[3])
+    deciding = [along_up, towards_origin, float(plane[:3][plane[:3].abs().argmax()])]
     return -plane if next(value for value in deciding if value != 0.0) < 0 else plane
+
+
+def through_origin(plane: Tensor, distance: float) -> bool:
+    """Whether the origin is an inlier of a plane (4,): then no side of it can be told by where the origin lies."""
+    return abs(float(plane[3])) < distance
 
 
 def _tilt_test(up: Tensor | None, max_tilt: float | None) -> Callable[[Tensor], Tensor]:

@@ -2,7 +2,7 @@
 
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
-from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.clusters import ClusterObjects, LeftOutWarning, SplitObjects
 from pcdata.transforms.columns import RandomColumn, ShiftToOrigin
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
@@ -42,6 +42,7 @@ __all__ = [
     "FuseTSDF",
     "InpaintDepth",
     "KeepConfidence",
+    "LeftOutWarning",
     "MarkUnreliableDepth",
     "MaskDepth",
     "MergeViews",

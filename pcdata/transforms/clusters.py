@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, Literal
 
 import torch
@@ -16,14 +17,23 @@ from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
 from pcdata.transforms.fields import Count, Metres
 
 
+class LeftOutWarning(UserWarning):
+    """A step left out what may be wanted."""
+
+
 class ClusterObjects(Transform):
     """Label density clusters (DBSCAN) as objects and keep those of a plausible size.
 
     Labels become 0..K-1 per cloud in the order of their lowest core point; any labels the cloud had are replaced.
-    ``meta["objects"]`` lists label and point count.
+    ``meta["objects"]`` lists label and point count; ``meta["no_objects"]`` what is no object: the points of ``noise``,
+    and of every cluster that is ``too_small`` or ``too_large``. The history counts them.
+
+    Warns:
+        LeftOutWarning: a cluster is larger than ``max_size``.
     """
 
     runs_statistics = True
+    version = 2
 
     eps: Metres = 0.02  # points closer than this are neighbours
     min_points: Count = 50  # neighbours, the point itself included, that make a core point
@@ -39,21 +49,42 @@ class ClusterObjects(Transform):
     def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
         raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=data.image_grid())
-        parts = torch.tensor_split(raw, data.ptr[1:-1].cpu())
-        return {"labels": torch.cat([self._numbered(part) for part in parts])}
+        parts = [self._numbered(part) for part in torch.tensor_split(raw, data.ptr[1:-1].cpu())]
+        sizes = [other.tolist() for _, other in parts]  # per cloud: noise, then every cluster that is no object
+        left_out = {
+            "noise": [noise for noise, *_ in sizes],
+            "too_small": [sum(one for one in clusters if one < self.min_size) for _, *clusters in sizes],
+            "too_large": [sum(one for one in clusters if one > self.max_size) for _, *clusters in sizes],
+        }
+        for b, (_, *clusters) in enumerate(sizes):
+            if clusters and max(clusters) > self.max_size:
+                warnings.warn(
+                    f"ClusterObjects: cloud {b}{sample_name(data, b)}: a cluster of {max(clusters)} points is left out, as "
+                    f"it has more than max_size={self.max_size}; raise max_size if it is an object or a heap of them, "
+                    "or put RemovePlane or CropWorkspace before it if it is the table or a wall",
+                    LeftOutWarning,
+                    stacklevel=2,
+                )
+        counts = {name: torch.tensor(values, dtype=torch.int64, device="cpu") for name, values in left_out.items()}
+        return {"labels": torch.cat([labels for labels, _ in parts]), **counts}
 
-    def _numbered(self, raw: Tensor) -> Tensor:
-        """Number the clusters of plausible size in one cloud by 0, 1, ... and call all else -1."""
-        size = torch.bincount(raw + 1)  # noise first
+    def _numbered(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Number the clusters of plausible size in one cloud by 0, 1, ... and call all else -1; return what is else.
+
+        The second result is the number of points of noise, then those of every cluster that is no object.
+        """
+        size = torch.bincount(raw + 1, minlength=1)  # noise first
         accepted = (size >= self.min_size) & (size <= self.max_size)
         accepted[:1] = False
         number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
-        return number[raw + 1]
+        return number[raw + 1], size[~accepted]
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Write the labels and drop the rest unless the whole scene is kept."""
         labels = params["labels"]
-        labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data))
+        counted = {name: params[name].tolist() for name in ("noise", "too_small", "too_large")}
+        others = [{"no_objects": {name: counted[name][b] for name in counted}} for b in range(data.num_clouds)]
+        labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data)).with_meta(others)
         if self.keep == "all":
             return labelled
         member = labels >= 0
@@ -61,12 +92,15 @@ class ClusterObjects(Transform):
 
 
 class SplitObjects(Transform):
-    """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped."""
+    """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped.
+
+    ``meta["object"]`` keeps the label, ``meta["unlabelled"]`` the number of points dropped from the whole cloud.
+    """
 
     keeps_clouds = False
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
-        """Split each cloud by its labels; ``meta["object"]`` keeps the label."""
+        """Split each cloud by its labels."""
         if data.labels is None:
             raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")
         parts = []
@@ -78,10 +112,11 @@ class SplitObjects(Transform):
                     f"SplitObjects: cloud {b}{sample_name(data, b)} has no labelled point among its "
                     f"{cloud.num_points}; check the fields of ClusterObjects"
                 )
+            unlabelled = int((cloud.labels < 0).sum())
             for label in found:
                 rows = rows_of_mask(cloud.labels == label)
                 ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
-                parts.append(cloud.select(rows, ptr).with_meta([{"object": label}]))
+                parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabelled": unlabelled}]))
         return PointCloud.cat(parts)
 
 

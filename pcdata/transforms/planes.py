@@ -12,27 +12,36 @@ from torch import Tensor
 from pcdata.checks import negated
 from pcdata.errors import ConfigError
 from pcdata.functional import rigid
-from pcdata.functional.planes import ransac_plane
+from pcdata.functional.planes import ransac_plane, through_origin
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SelectTransform
+from pcdata.transforms.base import Params, SelectTransform, sample_name
 from pcdata.transforms.fields import Count, Metres, Name, Vec3
+
+# Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.
+_LEAST_RISE = math.radians(5)
 
 
 class RemovePlane(SelectTransform):
     """Remove the plane with the most inliers, found by RANSAC and refined by least squares.
 
     The plane joins ``meta["planes"]`` of every cloud, in the source frame, so later steps cannot make it stale;
-    :func:`planes_in_cloud` gives it in the cloud's present coordinates.
+    :func:`planes_in_cloud` gives it in the cloud's present coordinates. ``faces`` says what its normal was turned to:
+    ``up``, the ``origin`` of the frame it was found in, or ``neither side`` of a plane through that origin.
+
+    Raises:
+        ConfigError: ``keep="above"`` where the plane passes the origin and no ``up`` is given, or holds ``up``.
     """
 
     runs_statistics = True
+    version = 2
 
     distance: Metres = 0.01  # inliers are closer to the plane than this
     num_hypotheses: Count = 1000
     seed: int = 0  # of the hypotheses: the same cloud always gives the same plane
-    keep: Literal["both", "above"] = "both"  # "above": also drop what lies beyond the plane, seen along its normal
+    # "above": also drop what lies beyond the plane, seen along its normal; then the plane must have an upper side.
+    keep: Literal["both", "above"] = "both"
     up: Vec3 | None = None  # the normal's rough direction in `frame`; None = any, facing the origin of the frame
     frame: Name | None = None  # the frame that `up` is given in; given with it
     max_tilt: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = None  # radians between normal and up at most
@@ -61,6 +70,8 @@ class RemovePlane(SelectTransform):
         )
         keep = negated(inlier)
         if self.keep == "above":
+            for b, plane in enumerate(planes.cpu()):
+                self._require_upper_side(data, b, plane)
             plane = planes.double()[cloud_of_rows(data.ptr)]
             keep &= (plane[:, :3] * data.points).sum(1) + plane[:, 3] > 0
         return {
@@ -69,6 +80,24 @@ class RemovePlane(SelectTransform):
             "planes": planes,
             "num_inliers": counts_from_ptr(ptr_after_mask(inlier, data.ptr)),
         }
+
+    def _require_upper_side(self, data: PointCloud, b: int, plane: Tensor) -> None:
+        """Refuse a plane whose normal noise could turn round: it decides which half of the scene is dropped."""
+        where = f"RemovePlane: keep='above' of cloud {b}{sample_name(data, b)} is open: the plane"
+        if self.up is None and through_origin(plane, self.distance):
+            raise ConfigError(
+                f"{where} passes the origin of {data.frame_id!r} at {1000 * abs(float(plane[3])):.3g} mm, nearer than "
+                f"distance={self.distance:g}, so the origin is on neither side; say which way is up: "
+                f"up=(x, y, z), frame={data.frame_id!r}"
+            )
+        if self.up is not None:
+            up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
+            rise = math.pi / 2 - float(rigid.angle_between(plane[:3], up))
+            if abs(rise) < _LEAST_RISE:
+                raise ConfigError(
+                    f"{where} contains up to within {math.degrees(abs(rise)):.2g} degrees, so neither side is above; "
+                    "give max_tilt to look for a level plane, or the up of this one"
+                )
 
     def apply(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
@@ -81,7 +110,10 @@ class RemovePlane(SelectTransform):
                 "frame": data.source_frame,
                 "num_inliers": int(params["num_inliers"][b]),
             }
+            if self.up is None:
+                found["faces"] = "neither side" if through_origin(params["planes"][b], self.distance) else "origin"
             if self.up is not None:
+                found["faces"] = "up"
                 up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
                 found["tilt"] = float(rigid.angle_between(params["planes"][b, :3].cpu(), up))
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})

@@ -6,7 +6,16 @@ import torch
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
-from pcdata.transforms import ClusterObjects, Compose, Deproject, MergeViews, RemovePlane, SplitObjects, ToFrame
+from pcdata.transforms import (
+    ClusterObjects,
+    Compose,
+    Deproject,
+    LeftOutWarning,
+    MergeViews,
+    RemovePlane,
+    SplitObjects,
+    ToFrame,
+)
 from tests.factories import cloud_in_base
 
 
@@ -24,6 +33,30 @@ def blobs(*counts: int, frame_id: str = "base") -> PointCloud:
 STEP = {"eps": 0.05, "min_points": 5, "min_size": 20, "max_size": 100}
 
 
+too_large = pytest.mark.filterwarnings("ignore::pcdata.transforms.LeftOutWarning")
+
+
+@pytest.mark.parametrize("keep", ["objects", "all"])
+def test_what_is_no_object_is_counted_and_too_large_is_said(keep):
+    batch = PointCloud.cat([blobs(60, 10, 40, 150, 300), blobs(30, 15, 1)])
+    with pytest.warns(
+        LeftOutWarning, match=r"cloud 0.*a cluster of 300 points .* more than max_size=100; raise max_size"
+    ):
+        found = ClusterObjects(**STEP, keep=keep)(batch)
+    wanted = [{"noise": 0, "too_small": 10, "too_large": 450}, {"noise": 1, "too_small": 15, "too_large": 0}]
+    assert [entry["no_objects"] for entry in found.meta] == wanted
+    assert [steps[-1]["params"] for steps in found.history] == wanted
+    for entry, single in zip(found.meta, batch.unbatch()):
+        objects = sum(one["points"] for one in entry["objects"])
+        assert objects + sum(entry["no_objects"].values()) == single.num_points
+
+
+def test_the_advice_for_a_large_heap_keeps_it():
+    heap = ClusterObjects(**{**STEP, "max_size": 400})(blobs(60, 300))
+    assert sorted(one["points"] for one in heap.meta[0]["objects"]) == [60, 300]
+
+
+@too_large
 def test_every_blob_of_plausible_size_becomes_one_object():
     cloud = blobs(60, 10, 40, 150)  # the second is too small, the last too large
     found = ClusterObjects(**STEP)(cloud)
@@ -37,6 +70,7 @@ def test_every_blob_of_plausible_size_becomes_one_object():
     assert found.meta[0]["objects"] == [{"label": numbers[label], "points": sizes[label]} for label in by_number]
 
 
+@too_large
 def test_the_whole_scene_can_be_kept():
     cloud = blobs(60, 10, 40, 150)
     found = ClusterObjects(**STEP, keep="all")(cloud)
@@ -44,6 +78,7 @@ def test_the_whole_scene_can_be_kept():
     assert torch.equal(found.labels >= 0, torch.isin(cloud.labels, torch.tensor([0, 2])))
 
 
+@too_large
 def test_numbers_start_at_zero_in_every_cloud():
     batch = PointCloud.cat([blobs(10, 30, 40), blobs(30), blobs(150, 50, 60, 70)])
     found = ClusterObjects(**STEP)(batch)

@@ -129,3 +129,52 @@ def test_the_rendered_table_is_found_from_several_views():
     (plane,) = planes_in_cloud(cloud)
     torch.testing.assert_close(plane, scene.truth.table_plane, atol=1e-4, rtol=0)
     assert float((cloud.labels > 0).float().mean()) > 0.5  # what is left is mostly objects
+
+
+def table_through_the_origin(seed: int, *, offset: float = 0.0) -> PointCloud:
+    """A noisy table in the frame on its top, and an object on it."""
+    generator = seeded(seed)
+    table = torch.rand(3000, 3, generator=generator) - 0.5
+    table[:, 2] = offset + 0.001 * torch.randn(3000, generator=generator)
+    block = torch.rand(400, 3, generator=generator) * 0.1 + torch.tensor([0.0, 0.0, 0.02 + offset])
+    return PointCloud(points=torch.cat([table, block]), frame_id="base", viewpoint=torch.tensor([[0.2, 0.1, 0.9]]))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("offset", [0.0, 0.006, -0.006])
+def test_the_upper_side_of_a_plane_through_the_origin_is_asked_for(seed, offset):
+    cloud = table_through_the_origin(seed, offset=offset)
+    with pytest.raises(
+        ConfigError, match=r"is open: the plane passes the origin of 'base' .* up=\(x, y, z\), frame='base'"
+    ):
+        RemovePlane(keep="above")(cloud)
+    above = RemovePlane(keep="above", up=(0, 0, 1), frame="base")(cloud)
+    assert int((above.points[:, 2] > offset + 0.015).sum()) == 400
+    assert above.meta[0]["planes"][0]["faces"] == "up"
+
+
+def test_the_normal_of_a_plane_through_the_origin_does_not_hang_on_noise():
+    left = [RemovePlane()(table_through_the_origin(seed)) for seed in range(8)]
+    assert {cloud.meta[0]["planes"][0]["faces"] for cloud in left} == {"neither side"}
+    assert all(float(planes_in_cloud(cloud)[0, 2]) > 0.99 for cloud in left)
+
+
+def test_a_plane_off_the_origin_faces_it_and_has_an_upper_side():
+    for offset in (-0.5, 0.5):
+        cloud = table_through_the_origin(0, offset=offset)
+        above = RemovePlane(keep="above")
+        if offset < 0:
+            assert int((above(cloud).points[:, 2] > offset + 0.015).sum()) == 400
+            assert above(cloud).meta[0]["planes"][0]["faces"] == "origin"
+        assert float(planes_in_cloud(RemovePlane()(cloud))[0, 3]) > 0
+
+
+@pytest.mark.parametrize("lean", [-0.05, 0.0, 0.05])
+def test_a_wall_has_no_upper_side(lean):
+    generator = seeded(0)
+    wall = torch.rand(2000, 3, generator=generator)
+    wall[:, 0] = 0.7 + lean * wall[:, 2]
+    cloud = PointCloud(points=torch.cat([wall, torch.rand(200, 3, generator=generator) * 0.3]), frame_id="base")
+    with pytest.raises(ConfigError, match=r"contains up to within .* degrees, so neither side is above"):
+        RemovePlane(keep="above", up=(0, 0, 1), frame="base")(cloud)
+    assert RemovePlane(up=(0, 0, 1), frame="base")(cloud).num_points > 0
