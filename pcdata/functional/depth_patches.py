@@ -154,7 +154,8 @@ def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: i
     powers = offset[:, None] ** torch.arange(degree + 1, dtype=torch.int64, device=image.device)
     height, width = image.shape
     if height <= 2 * first or width <= 2 * first:
-        return image.new_zeros(max(0, height - 2 * first), max(0, width - 2 * first), degree + 1, degree + 1)
+        down, across = (len(range(first, length - first, stride)) for length in (height, width))
+        return image.new_zeros(down, across, degree + 1, degree + 1)
     # Row i of the padded image is row i - half of the image: the window about centre c starts at row c.
     padded = torch.nn.functional.pad(image, (half,) * 4)[
         first : height - first + 2 * half, first : width - first + 2 * half

@@ -10,7 +10,7 @@ from torch import Tensor
 from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.functional import rigid
 from pcdata.models.batch import ModelBatch
-from pcdata.structures import PointCloud
+from pcdata.structures import PaddedClouds, PointCloud
 
 GRASP_WIDTH = 17  # graspnetAPI's row: score, width, height, depth, rotation (9), translation (3), object
 
@@ -27,7 +27,7 @@ class Predictions:
 
 
 def to_source(
-    cloud: PointCloud | ModelBatch,
+    cloud: PointCloud | PaddedClouds | ModelBatch,
     *,
     points: Tensor | None = None,  # (B, M, 3)
     poses: Tensor | None = None,  # (B, M, 4, 4) rigid
@@ -54,7 +54,7 @@ def to_source(
 
 
 def to_frame(
-    cloud: PointCloud | ModelBatch,
+    cloud: PointCloud | PaddedClouds | ModelBatch,
     frame: str,
     *,
     frame_from_source: Tensor | None = None,  # (4, 4) or (B, 4, 4) extrinsics; None = those of the capture
@@ -83,7 +83,7 @@ def to_frame(
     return _moved(matrix, frame, points, poses, grasps, directions)
 
 
-def _source_of(cloud: PointCloud | ModelBatch) -> tuple[Tensor, str]:
+def _source_of(cloud: PointCloud | PaddedClouds | ModelBatch) -> tuple[Tensor, str]:
     if cloud.source_from_cloud is None:
         raise FrameError("the batch does not say where it came from; make it by a preset's collate")
     return cloud.source_from_cloud, cloud.source_frame

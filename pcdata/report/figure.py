@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pcdata import extras
-from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures import METRE, DepthFrame, PointCloud
 
 _PALETTE = (
     *("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951"),
@@ -21,13 +21,13 @@ _MAX_DRAWN = 60_000  # more points than a panel has pixels only cost time
 
 
 def save_pipeline_figure(
-    path: str | Path, capture: DepthFrame, stages: Sequence[tuple[str, PointCloud]], *, title: str = ""
+    path: str | Path, capture: DepthFrame | PointCloud, stages: Sequence[tuple[str, PointCloud]], *, title: str = ""
 ) -> None:
     """Draw a capture and the clouds that came of it into one PNG; needs no display.
 
     Args:
         path: the PNG file.
-        capture: the first view is drawn.
+        capture: of depth images the first view is drawn; a capture that is a cloud is drawn as one.
         stages: (caption, cloud) in order; drawn in the camera's colours, by object once clustered, by normal at last.
         title: printed above all.
 
@@ -44,8 +44,12 @@ def save_pipeline_figure(
     if title:
         figure.suptitle(title, fontsize=15, fontweight="bold")
     axes = iter(figure.subplots(rows, _COLUMNS, squeeze=False).flatten())
-    _draw_colors(next(axes), capture)
-    _draw_depth(figure, next(axes), capture)
+    if isinstance(capture, PointCloud):
+        _draw_cloud(next(axes), "capture", capture)
+        _draw_distances(next(axes), capture)
+    else:
+        _draw_colors(next(axes), capture)
+        _draw_depth(figure, next(axes), capture)
     for caption, cloud in stages:
         _draw_cloud(next(axes), caption, cloud)
     _draw_counts(next(axes), stages)
@@ -70,11 +74,19 @@ def _draw_depth(figure: Any, axis: Any, capture: DepthFrame) -> None:
     figure.colorbar(image, ax=axis, label="metres", shrink=0.8)
 
 
+def _draw_distances(axis: Any, capture: PointCloud) -> None:
+    seen_from = capture.viewpoint_per_point()
+    away = capture.points if seen_from is None else capture.points - seen_from
+    axis.set_title("points by distance from the " + ("origin" if seen_from is None else "sensor"))
+    axis.hist(away.norm(dim=1).cpu().numpy(), bins=60, color=_PALETTE[0])
+    axis.set_xlabel("metres" if capture.unit == METRE else capture.unit)
+
+
 def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
     names = [caption for caption, _ in stages]
     counts = [cloud.num_points for _, cloud in stages]
     axis.set_title("points left after each step")
-    axis.barh(range(len(counts)), counts, color=_PALETTE[0], log=True)  # by position: captions may repeat
+    axis.barh(range(len(counts)), counts, color=_PALETTE[0], log=any(counts))  # by position: captions may repeat
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_xlim(left=0.8, right=max(counts, default=1) * 8 + 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
@@ -30,6 +31,12 @@ def joinable_parts(clouds: Sequence[PointCloud]) -> dict[str, list[Tensor]]:
                     "0; convert one of them"
                 )
     return {name: [own[name] for own in fields] for name in fields[0]}
+
+
+def joined_frames(clouds: Sequence[PointCloud]) -> dict[str, Tensor]:
+    """Return the poses (B, 4, 4) of the frames that every cloud knows."""
+    known = [name for name in clouds[0].frames if all(name in cloud.frames for cloud in clouds)]
+    return {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in known}
 
 
 def rows_per_cloud(values: Sequence[Tensor], counts: Sequence[Sequence[int]]) -> list[Tensor]:

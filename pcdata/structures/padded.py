@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.structures.fields import CORE_KINDS
+from pcdata.structures.joining import joined_frames
 
 if TYPE_CHECKING:
     from pcdata.structures.point_cloud import PointCloud
@@ -28,7 +29,9 @@ class PaddedClouds:
     extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (B, M, ...)
     frame_id: str
     unit: str
+    source_frame: str = ""  # the frame that source_from_cloud leads to
     source_from_cloud: Tensor  # (B, 4, 4) float64
+    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) frame_from_source
     meta: Sequence[Mapping[str, Any]] = ()
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PaddedClouds:
@@ -42,7 +45,8 @@ class PaddedClouds:
     def _map(self, move: Callable[[Tensor], Tensor]) -> PaddedClouds:
         names = ("points", "mask", "colors", "normals", "labels", "source_index", "source_from_cloud")
         moved = {name: move(value) for name in names if (value := getattr(self, name)) is not None}
-        return replace(self, **moved, extra={name: move(value) for name, value in self.extra.items()})  # type: ignore[arg-type]
+        extra, frames = ({name: move(one) for name, one in held.items()} for held in (self.extra, self.frames))
+        return replace(self, **moved, extra=extra, frames=frames)  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         batch, width = self.mask.shape
@@ -57,7 +61,9 @@ def padded_clouds(clouds: Sequence[PointCloud], rows: Mapping[str, Tensor], coun
         < torch.tensor(counts, dtype=torch.int64, device=device)[:, None],
         frame_id=clouds[0].frame_id,
         unit=clouds[0].unit,
+        source_frame=clouds[0].source_frame,
         source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
+        frames=joined_frames(clouds),
         meta=tuple(entry for cloud in clouds for entry in cloud.meta),
         **{name: rows[name] for name in CORE_KINDS if name in rows},
         extra={name: value for name, value in rows.items() if name not in CORE_KINDS},

@@ -19,7 +19,7 @@ from pcdata.structures.cloud_checks import check_cloud, check_names
 from pcdata.structures.derive import derived
 from pcdata.structures.fields import CORE_KINDS, METRE, Kind
 from pcdata.structures.image_layout import ImageLayout, joined_layout, within_image
-from pcdata.structures.joining import joinable_parts, rows_per_cloud
+from pcdata.structures.joining import joinable_parts, joined_frames, rows_per_cloud
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 
 Step = dict[str, Any]
@@ -251,14 +251,13 @@ class PointCloud:
         parts = joinable_parts(clouds)
         viewpoints = [cloud.viewpoint for cloud in clouds]
         first = clouds[0]
-        known = [name for name in first.frames if all(name in cloud.frames for cloud in clouds)]
         return first._with_rows(
             join_rows(parts),
             layout=joined_layout([cloud.layout for cloud in clouds]),
             ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
             viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
             source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
-            frames={name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in known},
+            frames=joined_frames(clouds),
             meta=tuple(entry for cloud in clouds for entry in cloud.meta),
             history=tuple(steps for cloud in clouds for steps in cloud.history),
         )

@@ -93,7 +93,8 @@ class Transform(nn.Module):
 
     def unit_needed(self) -> str | None:
         """The unit that the fields' lengths are in, or None when no length is given: any will do."""
-        given = [unit for name, unit in length_fields(type(self)).items() if getattr(self, name) is not None]
+        units = length_fields(type(self))  # type: ignore[arg-type]
+        given = [unit for name, unit in units.items() if getattr(self, name) is not None]
         return METRE if self.needs_metres else next(iter(given), None)
 
     def unit_given(self) -> str | None:
@@ -271,7 +272,7 @@ def field_types(cls: type[Transform]) -> dict[str, Any]:
 @functools.cache
 def length_fields(cls: type[Transform]) -> dict[str, str]:
     """Return the unit of every declared field that is a length in a unit."""
-    found = {name: _length_unit(hint) for name, hint in field_types(cls).items()}
+    found = {name: _length_unit(hint) for name, hint in field_types(cls).items()}  # type: ignore[arg-type]
     return {name: unit for name, unit in found.items() if unit is not None}
 
 

@@ -60,8 +60,8 @@ class ClusterObjects(Transform):
             if clusters and max(clusters) > self.max_size:
                 warnings.warn(
                     f"ClusterObjects: cloud {b}{sample_name(data, b)}: a cluster of {max(clusters)} points, more than "
-                    f"max_size={self.max_size}, is left out; raise max_size if it is an object or a heap of them, or put "
-                    "RemovePlane or CropWorkspace before it if it is the table or a wall",
+                    f"max_size={self.max_size}, is left out; raise max_size if it is an object or a heap of them, or "
+                    "put RemovePlane or CropWorkspace before it if it is the table or a wall",
                     LeftOutWarning,
                     stacklevel=2,
                 )

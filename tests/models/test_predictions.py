@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from pcdata.datasets import collate_fixed, collate_padded
 from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.functional import rigid
 from pcdata.models import preset, to_frame, to_source
@@ -183,3 +184,17 @@ def grasp_rows(*shape: int) -> torch.Tensor:
     poses = random_poses(*shape)
     size = torch.full((*shape, 4), 0.05, dtype=torch.float64)
     return torch.cat([size, poses[..., :3, :3].flatten(-2), poses[..., :3, 3], size[..., :1]], dim=-1)
+
+
+@pytest.mark.parametrize("counts", [(120, 90, 150), (60, 60, 60)])
+def test_predictions_on_padded_clouds_go_back_as_those_on_packed_ones(counts):
+    packed = NormalizeUnitSphere()(cloud_in_base(counts))
+    collate = collate_fixed if len(set(counts)) == 1 else collate_padded
+    padded = collate(packed.unbatch())
+    points = torch.rand(3, 7, 3, generator=seeded(0))
+    assert padded.source_frame == packed.source_frame
+    assert torch.equal(to_source(padded, points=points).points, to_source(packed, points=points).points)
+    for frame in packed.frames:
+        assert torch.equal(to_frame(padded, frame, points=points).points, to_frame(packed, frame, points=points).points)
+    with pytest.raises(FrameError, match="the cloud knows the frames"):
+        to_frame(padded, "elsewhere", points=points)

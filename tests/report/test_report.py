@@ -102,7 +102,17 @@ def test_odd_clouds_are_drawn_without_an_error(tmp_path):
     one_point = PointCloud(points=torch.ones(1, 3), frame_id="base")
     nothing = PointCloud(points=torch.zeros(0, 3), frame_id="base", colors=torch.zeros(0, 3))
     for stages in ([], [("one", one_point)], [("none", nothing), ("one", one_point)]):
-        save_pipeline_figure(tmp_path / "a.png", frame, stages)
+        for capture in (frame, one_point, nothing):
+            save_pipeline_figure(tmp_path / "a.png", capture, stages)
+            assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@needs_matplotlib
+def test_a_capture_that_is_a_cloud_is_drawn_as_one(tmp_path):
+    cloud = PointCloud(points=torch.rand(200, 3, generator=torch.Generator().manual_seed(0)), frame_id="camera")
+    save_pipeline_figure(tmp_path / "one.png", cloud, [("raw", cloud)])
+    save_pipeline_figure(tmp_path / "other.png", cloud.with_fields(points=2 * cloud.points), [("raw", cloud)])
+    assert (tmp_path / "one.png").read_bytes() != (tmp_path / "other.png").read_bytes()
 
 
 def test_without_matplotlib_the_picture_says_what_to_install(tmp_path, monkeypatch):
