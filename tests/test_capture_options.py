@@ -60,6 +60,8 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "folders": (["color=rgb"], {"color": "rgb"}),
         "intrinsics": (["585", "585", "320", "240"], [585, 585, 320, 240]),
         "registered": ([], True),
+        "labels_from": (["scalar_Label"], "scalar_Label"),
+        "links_to": (["/store"], ["/store"]),
         "max_time_apart": (["0.05"], 0.05),
     }
     for name, (flag, _) in _FLAGS.items():

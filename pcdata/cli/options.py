@@ -49,12 +49,17 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         "--registered",
         {"action": "store_const", "const": True, "help": "depth as the colour camera sees it, of realsense_bag"},
     ),
+    "labels_from": ("--labels-from", {"metavar": "COLUMN", "help": "column of cloud files that holds the labels"}),
+    "links_to": (
+        "--links-to",
+        {"action": "append", "metavar": "DIR", "help": "folder outside that links may lead to, such as a DVC cache"},
+    ),
     "max_time_apart": (
         "--max-time-apart",
         {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
     ),
 }
-RIG_OPTIONS = ("metres_per_unit", "invalid_values", "background_label", "folders")
+RIG_OPTIONS = ("metres_per_unit", "invalid_values", "background_label", "folders", "links_to")
 
 
 def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pcdata.errors import CaptureError
-from pcdata.io.listing import absolute, entries, is_folder, unread_entries, visible_files
+from pcdata.io.listing import LinkTargets, absolute, entries, is_folder, unread_entries, visible_files
 from pcdata.io.pcd import read_pcd
 from pcdata.io.ply import read_ply
 from pcdata.io.source import Source
@@ -27,6 +27,7 @@ class CloudFilesSource(Source):
         frame_id: str | None = None,
         metres_per_unit: float | None = None,
         labels_from: str | None = None,
+        links_to: LinkTargets = (),
     ) -> None:
         """List the files.
 
@@ -35,6 +36,7 @@ class CloudFilesSource(Source):
             frame_id: the frame that the coordinates are in; None = as each file says, else ``camera``.
             metres_per_unit: None = as each file says, else metres, refused where the numbers do not look like metres.
             labels_from: the column that holds the labels; "" = none of them, None = found by its name.
+            links_to: folders outside that links in the folder may lead to.
 
         Raises:
             CaptureError: there is no cloud file, or two differ in the suffix alone.
@@ -46,7 +48,7 @@ class CloudFilesSource(Source):
             if file.stem in self._files:
                 raise CaptureError(f"{path}: {self._files[file.stem].name} and {file.name} are both {file.stem!r}")
             self._files[file.stem] = file
-        super().__init__(path, self._files)
+        super().__init__(path, self._files, links_to)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -11,12 +11,22 @@ from typing import cast
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, UnitError
+from pcdata.files import check_inside
 from pcdata.io.calibration import Calibration
 from pcdata.io.capture_camera import read_capture_camera
 from pcdata.io.folder_roles import ROLES, role_folders
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
-from pcdata.io.listing import absolute, by_stem, check_links, entries, has_file, unread_entries
+from pcdata.io.listing import (
+    LinkTargets,
+    absolute,
+    by_stem,
+    check_links,
+    entries,
+    has_file,
+    link_targets,
+    unread_entries,
+)
 from pcdata.io.option_checks import check_invalid_values, check_label, check_name
 from pcdata.io.sample_names import positions
 from pcdata.io.source import Source, check_partners
@@ -49,6 +59,7 @@ class FolderSource(Source):
         calibration: Calibration | str | os.PathLike[str] | None = None,
         camera: str | None = None,
         folders: Mapping[str, str | None] | None = None,
+        links_to: LinkTargets = (),
     ) -> None:
         """Read the calibration and the file names.
 
@@ -65,6 +76,7 @@ class FolderSource(Source):
             camera: its name in the calibration; None = the only one.
             folders: the names of folders that are called otherwise, by role, such as ``{"pose": "pose"}``; None leaves
                 a role out. The roles: depth, color, labels, mask, confidence, pose.
+            links_to: folders outside that links in the capture may lead to; no other ones are followed out of it.
 
         Raises:
             CaptureError: the calibration is missing, wrong or of another image size, a sample lacks a file that
@@ -78,6 +90,8 @@ class FolderSource(Source):
         if len(present) != 1:
             found = "both" if present else "neither"
             raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
+        allowed = [path, *link_targets(links_to)]
+        check_inside(str(path), present[0], allowed)
         stated = read_capture_camera(present[0])
         self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
         check_name(str(path), "frame_id", frame_id)
@@ -119,7 +133,7 @@ class FolderSource(Source):
         check_links(entry for folder in roles.values() for entry in entries(folder))  # all of them in one message
         self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
         self._used = {present[0], *roles.values()}
-        super().__init__(path, self._files["depth"])
+        super().__init__(path, self._files["depth"], links_to)
         check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
@@ -127,6 +141,7 @@ class FolderSource(Source):
         times = path / _TIMESTAMPS
         self.timestamps: dict[str, float] = {}  # seconds by id
         if has_file(times):
+            check_inside(str(path), times, allowed)
             self.timestamps = read_timestamps(times, self._ids)
             self._used.add(times)
 

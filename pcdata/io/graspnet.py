@@ -18,7 +18,7 @@ from pcdata.files import existing_file
 from pcdata.functional import rigid
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
-from pcdata.io.listing import absolute, check_links, entries, has_file, is_folder, unread_entries
+from pcdata.io.listing import LinkTargets, absolute, check_links, entries, has_file, is_folder, unread_entries
 from pcdata.io.sample_names import positions
 from pcdata.io.source import Source, check_partners
 from pcdata.lengths import check_metres_per_unit
@@ -41,11 +41,12 @@ class GraspNetSource(Source):
         "depth.png, color.png and meta.mat (optional workspace_mask.png, label.png) in it, or in each of its folders"
     )
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, links_to: LinkTargets = ()) -> None:
         """List the frames.
 
         Args:
             path: the folder of a frame, or of such folders.
+            links_to: folders outside that links in the capture may lead to.
 
         Raises:
             CaptureError: there is none, or one lacks a file that it needs or that others have.
@@ -55,7 +56,7 @@ class GraspNetSource(Source):
             raise CaptureError(f"{self.kind} source {path}: is no folder; this layout needs {self.needs}")
         self._folders = {folder.name: folder for folder in _frame_folders(path)}
         found = {name: _known_files(folder) for name, folder in self._folders.items()}
-        super().__init__(path, found)
+        super().__init__(path, found, links_to)
         roles = {role for files in found.values() for role in files} | {*_REQUIRED}
         having = {role: [name for name, files in found.items() if role in files] for role in roles}
         check_partners(str(self), self._ids, having)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, ConfigError
 from pcdata.io.sample_names import check_utf8, in_order, name_some
 
 # What desktops, servers and archivers leave behind, in lower case; hidden entries are litter too.
@@ -16,6 +16,21 @@ _LITTER = {"thumbs.db", "ehthumbs.db", "desktop.ini", "icon\r", "__macosx", "@ea
 def absolute(path: str | os.PathLike[str]) -> Path:
     """Return the path so that it survives a change of the working folder, e.g. in a worker; no ``..`` is left in it."""
     return Path(os.path.abspath(Path(path).expanduser()))
+
+
+LinkTargets = str | os.PathLike[str] | Collection[str | os.PathLike[str]]  # one folder, or several
+
+
+def link_targets(links_to: LinkTargets) -> tuple[Path, ...]:
+    """Return folders that links may lead to, as absolute paths.
+
+    Raises:
+        ConfigError: they are no paths.
+    """
+    listed = [links_to] if isinstance(links_to, str | os.PathLike) else links_to
+    if not isinstance(listed, Collection) or not all(isinstance(one, str | os.PathLike) and one for one in listed):
+        raise ConfigError(f"links_to must be a folder, or a list of folders, got {links_to!r:.200}")
+    return tuple(absolute(one) for one in listed)
 
 
 def is_file(path: Path) -> bool:
@@ -35,7 +50,7 @@ def is_folder(path: Path) -> bool:
 
 
 def entries(folder: Path) -> list[Path]:
-    """Return what is in a folder in the order of the names, without hidden entries and litter.
+    """Return what is in a folder in the order of the alphabet, without hidden entries and litter.
 
     Raises:
         CaptureError: the folder cannot be listed.
@@ -44,7 +59,7 @@ def entries(folder: Path) -> list[Path]:
         names = os.listdir(folder)
     except OSError as error:
         raise CaptureError(f"{folder}: cannot be listed: {error.strerror or error}") from error
-    return [folder / name for name in in_order(names) if not name.startswith(".") and name.lower() not in _LITTER]
+    return [folder / name for name in sorted(names) if not name.startswith(".") and name.lower() not in _LITTER]
 
 
 def visible_files(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Path]:
@@ -57,6 +72,11 @@ def visible_files(folder: Path, wanted: Callable[[str], bool] = lambda name: Tru
     Raises:
         CaptureError: the folder cannot be listed, or a wanted entry is no file: a link to nothing, a folder, a device.
     """
+    found = {file.name: file for file in _files(folder, wanted)}
+    return [found[name] for name in in_order(found)]
+
+
+def _files(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Path]:
     chosen = [entry for entry in entries(folder) if wanted(entry.name)]
     check_links(chosen)
     others = [entry.name for entry in chosen if not is_file(entry)]
@@ -113,7 +133,7 @@ def by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
         CaptureError: an entry has another suffix or is no file, or two differ in the suffix alone.
     """
     found: dict[str, Path] = {}
-    for file in visible_files(folder):
+    for file in _files(folder):
         if file.suffix.lower() not in suffixes:
             raise CaptureError(f"{folder}: may hold {', '.join(suffixes)} only, but there is {file.name}; move it out")
         if file.stem in found:

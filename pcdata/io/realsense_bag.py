@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
+from pcdata.files import check_inside
 from pcdata.functional import rigid
 from pcdata.io.images import check_plausible, metres_of_value
-from pcdata.io.listing import absolute, check_links, entries, is_file, is_folder
+from pcdata.io.listing import LinkTargets, absolute, check_links, entries, is_file, is_folder, link_targets
 from pcdata.io.option_checks import check_seconds, check_switch
 from pcdata.io.rosbag import MAGIC, Bag, depth_units, opened_bag, rgb_pixels
 from pcdata.io.sample_names import name_some
@@ -49,7 +50,14 @@ class RealSenseBagSource(Source):
     kind = "realsense_bag"
     needs = "a ROS 1 .bag that a RealSense recorded, or a folder with one; reading it needs rosbags"
 
-    def __init__(self, path: Path, *, registered: bool = False, max_time_apart: float = 0.034) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        registered: bool = False,
+        max_time_apart: float = 0.034,
+        links_to: LinkTargets = (),
+    ) -> None:
         """Read the index, the calibration and the depth unit.
 
         Args:
@@ -57,6 +65,7 @@ class RealSenseBagSource(Source):
             registered: register each depth image to the colour image nearest in time; those without one within
                 ``max_time_apart`` are left out.
             max_time_apart: seconds; the default is one frame at 30 Hz.
+            links_to: folders outside that a link to the recording, in the folder that is given, may lead to.
 
         Raises:
             CaptureError: no bag or several, damaged, not of one depth camera, or no depth has a colour image near
@@ -72,7 +81,8 @@ class RealSenseBagSource(Source):
         if not self.recognises(path):
             raise CaptureError(f"{where}: is no ROS 1 bag; this layout needs {self.needs}")
         if is_folder(path):
-            path = _only_bag(where, path)
+            folder, path = path, _only_bag(where, path)
+            check_inside(where, path, [folder, *link_targets(links_to)])
         with opened_bag(where, path) as bag:
             self._depth = _one_stream(bag, "Depth")
             self._color = _one_stream(bag, "Color") if registered else None
@@ -84,13 +94,13 @@ class RealSenseBagSource(Source):
         if self._color is not None:
             self._partner = _partners(where, self._depth.times, self._color.times, max_time_apart)
         numbers = self._partner if registered else range(len(self._depth.times))
-        super().__init__(path, [f"{number:06d}" for number in numbers])
+        super().__init__(path, [f"{number:06d}" for number in numbers], links_to)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A file that begins as ROS 1 bags do, or a folder with one."""
         try:
-            return any(map(_is_bag, entries(path) if is_folder(path) else [path]))
+            return any(map(_is_bag, _bag_files(path) if is_folder(path) else [path]))
         except CaptureError:
             return False
 
@@ -139,9 +149,14 @@ def _is_bag(path: Path) -> bool:
         return False
 
 
+def _bag_files(folder: Path) -> list[Path]:
+    return [entry for entry in entries(folder) if entry.suffix.lower() == ".bag"]
+
+
 def _only_bag(where: str, folder: Path) -> Path:
-    check_links(entry for entry in entries(folder) if entry.suffix.lower() == ".bag")
-    bags = [entry for entry in entries(folder) if _is_bag(entry)]
+    found = _bag_files(folder)
+    check_links(found)
+    bags = [file for file in found if _is_bag(file)]
     if len(bags) != 1:
         raise CaptureError(
             f"{where}: holds {len(bags)} recordings, {name_some(bag.name for bag in bags)}; give the path of one"

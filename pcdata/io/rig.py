@@ -11,7 +11,16 @@ from pcdata.errors import CaptureError, FrameError
 from pcdata.io.calibration import Calibration
 from pcdata.io.folder import FolderSource, opened_calibration
 from pcdata.io.joined_views import join_views
-from pcdata.io.listing import absolute, check_links, entries, is_dangling, is_folder, unread_entries
+from pcdata.io.listing import (
+    LinkTargets,
+    absolute,
+    check_links,
+    entries,
+    is_dangling,
+    is_folder,
+    link_targets,
+    unread_entries,
+)
 from pcdata.io.sample_names import check_names, in_order_of_last_number, name_some
 from pcdata.io.source import Source
 from pcdata.structures import DepthFrame
@@ -44,6 +53,7 @@ class RigSource(Source):
         frame_id: str | None = None,
         calibration: Calibration | str | os.PathLike[str] | None = None,
         folders: Mapping[str, str | None] | None = None,
+        links_to: LinkTargets = (),
     ) -> None:
         """Read the calibrations and the file names.
 
@@ -56,6 +66,7 @@ class RigSource(Source):
             calibration: a :class:`Calibration` or its file, with exactly the cameras that have a folder. Its
                 intrinsics replace theirs; where it has transforms, it gives the poses of cameras without ``poses/``.
             folders: as for the layout ``folder``, of every camera.
+            links_to: folders outside that links in the cameras' folders may lead to.
 
         Raises:
             CaptureError: a folder is missing, is no camera's or is incomplete; a camera lacks what others have, has no
@@ -77,11 +88,12 @@ class RigSource(Source):
                 calibration=known,
                 camera=None if known is None else name,
                 folders=folders,
+                links_to=[path, *link_targets(links_to)],  # a camera's file may be a link to elsewhere in the rig
             )
             for name in self.names
         }
         _check_ids(path, self.cameras)
-        super().__init__(path, self.cameras[self.names[0]].ids)
+        super().__init__(path, self.cameras[self.names[0]].ids, links_to)
         _check_contents(str(self), self.cameras)
         _check_sizes(str(self), self.cameras)
         _check_poses(str(self), self.cameras, known)

@@ -21,7 +21,8 @@ _LAST = re.compile(r"[0-9]+\Z")
 _HEX = re.compile(r"[0-9a-f]+|[0-9A-F]+")
 _MAX_POSITION = 10**18  # what fits into 64 bits
 
-_Key = tuple[tuple[int, Decimal, str], ...]  # numbers before texts
+_Token = tuple[int, int | Decimal, str]  # numbers before texts
+_Key = tuple[_Token, ...]
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -32,7 +33,7 @@ def in_order(names: Iterable[str]) -> list[str]:
     """
     names = list(names)
     keys = _keys(names)
-    return sorted(names, key=lambda name: (keys[name], name))
+    return sorted(sorted(names), key=keys.__getitem__)
 
 
 def positions(names: Sequence[str]) -> dict[str, int]:
@@ -110,22 +111,24 @@ def _keys(names: Sequence[str]) -> dict[str, _Key]:
     prefix = _hex_prefix(names)
     if prefix is not None:
         return {name: (_text(prefix), _number(int(name[len(prefix) :], 16))) for name in names}
-    decimals = {Decimal(name) for name in {*names} if _DECIMAL.fullmatch(name)}
-    with_point = len(decimals) == sum(_DECIMAL.fullmatch(name) is not None for name in {*names})
-    return {name: (_number(name),) if with_point and _DECIMAL.fullmatch(name) else _parts(name) for name in names}
+    decimals = {name: Decimal(name) for name in {*names} if _DECIMAL.fullmatch(name)}
+    if len(set(decimals.values())) < len(decimals):
+        decimals = {}
+    return {name: ((0, decimals[name], ""),) if name in decimals else _parts(name) for name in names}
 
 
 def _parts(name: str) -> _Key:
-    parts = _PART.split(unicodedata.normalize("NFC", name))
+    parts = _PART.split(name if name.isascii() else unicodedata.normalize("NFC", name))
     return tuple(_number(part) if place % 2 else _text(part) for place, part in enumerate(parts) if part)
 
 
-def _number(digits: str | int) -> tuple[int, Decimal, str]:
-    return 0, Decimal(digits), ""  # exact for any number of digits
+def _number(digits: str | int) -> _Token:
+    # Both are exact for any number of digits; Python refuses to read very long whole numbers, and they are faster.
+    return 0, int(digits) if len(str(digits)) < 100 else Decimal(digits), ""
 
 
-def _text(text: str) -> tuple[int, Decimal, str]:
-    return 1, Decimal(0), text
+def _text(text: str) -> _Token:
+    return 1, 0, text
 
 
 def _hex_prefix(names: Sequence[str]) -> str | None:
@@ -146,7 +149,7 @@ def _count_in_hex(ends: Sequence[str]) -> bool:
     )
 
 
-def _is_position(token: tuple[int, Decimal, str]) -> bool:
+def _is_position(token: _Token) -> bool:
     kind, number, _ = token
     return kind == 0 and 0 <= number < _MAX_POSITION and number == int(number)
 

@@ -11,10 +11,11 @@ from collections.abc import Collection
 from pathlib import Path
 
 from pcdata.errors import CaptureError
+from pcdata.files import check_inside
 from pcdata.io.capture_camera import read_intrinsics
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
-from pcdata.io.listing import absolute, entries, has_file, unread_entries, visible_files
+from pcdata.io.listing import LinkTargets, absolute, entries, has_file, unread_entries, visible_files
 from pcdata.io.option_checks import check_invalid_values, check_name, check_pinhole
 from pcdata.io.sample_names import positions
 from pcdata.io.source import Source, check_partners
@@ -46,6 +47,7 @@ class SevenScenesSource(Source):
         metres_per_unit: float = 0.001,
         invalid_values: Collection[int] = (65535,),
         frame_id: str = "world",
+        links_to: LinkTargets = (),
     ) -> None:
         """Read the file names.
 
@@ -56,6 +58,7 @@ class SevenScenesSource(Source):
             metres_per_unit: length of one stored depth unit; the data set documents millimetres.
             invalid_values: stored depth values besides 0 that mean "no reading".
             frame_id: the frame that the poses lead to.
+            links_to: folders outside that links in the capture may lead to.
 
         Raises:
             CaptureError: the intrinsics are missing or given twice, or a frame lacks a file that others have.
@@ -84,7 +87,7 @@ class SevenScenesSource(Source):
                         f"{path}: {found[match['id']].name} and {file.name} are of one frame; remove one"
                     )
                 found[match["id"]] = file
-        super().__init__(path, self._files["depth"])
+        super().__init__(path, self._files["depth"], links_to)
         check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
         self._positions = positions(self._ids)
 
@@ -121,6 +124,7 @@ class SevenScenesSource(Source):
 
     def _camera(self, size: tuple[int, int]) -> Camera:
         if self.intrinsics is None:
+            check_inside(str(self), self.path / _INTRINSICS, [self.path, *self.links_to])
             return read_intrinsics(self.path / _INTRINSICS, size=size)
         fx, fy, cx, cy = self.intrinsics
         return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=size)

@@ -20,7 +20,8 @@ from pcdata.errors import (
     add_note,
     near_matches,
 )  # fmt: skip
-from pcdata.io.listing import absolute
+from pcdata.files import check_inside
+from pcdata.io.listing import LinkTargets, absolute, is_folder, link_targets
 from pcdata.io.sample_names import check_names, check_utf8, in_order, name_some, same_but_for_writing
 from pcdata.structures import DepthFrame, PointCloud
 
@@ -71,8 +72,20 @@ class Source(ABC):
     kind: ClassVar[str]  # how open_source(kind=...) calls the layout
     needs: ClassVar[str]  # the layout in words, for error messages
 
-    def __init__(self, path: Path, ids: Iterable[str]) -> None:
+    def __init__(self, path: Path, ids: Iterable[str], links_to: LinkTargets = ()) -> None:
+        """Take the ids.
+
+        Args:
+            path: the folder or file.
+            ids: of the samples, in any order.
+            links_to: folders outside, one or several, that links in the capture may lead to, such as the store of a
+                DataLad or DVC checkout.
+
+        Raises:
+            CaptureError: there is no sample, or two names cannot be told apart.
+        """
         self.path = absolute(path)
+        self.links_to = link_targets(links_to)
         self._ids = in_order(ids)
         self._known = frozenset(self._ids)
         self.skipped: dict[str, str] = {}  # id -> why it was left out; see without
@@ -93,6 +106,16 @@ class Source(ABC):
         """Return the depth images of one sample, one for each view; none where depth is no file of its own."""
         files = self.files(sample_id)
         return [files["depth"]] if "depth" in files else []
+
+    def check_links(self, sample_id: str) -> None:
+        """Require that the files of a sample lie in the capture, or in a folder of ``links_to``, links followed.
+
+        Raises:
+            CaptureError: one leads elsewhere.
+        """
+        if is_folder(self.path):  # a file that the user named may be a link to anywhere
+            for file in self.files(sample_id).values():
+                check_inside(str(self), file, [self.path, *self.links_to])
 
     @abstractmethod
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
@@ -121,6 +144,7 @@ class Source(ABC):
         if sample_id not in self._known:
             raise CaptureError(f"{self}: no sample {sample_id!r}{near_matches(str(sample_id), self._ids)}")
         try:
+            self.check_links(sample_id)
             return self._load(sample_id)
         except PcdataError as error:
             add_note(error, f"while loading sample {sample_id!r} of {self}")

@@ -117,6 +117,7 @@ class _Series:
         checks: list[Check] = []
         try:
             if isinstance(source, Source):
+                source.check_links(sample_id)
                 checks += raw_value_checks(source.depth_files(sample_id))
             capture = source.load(sample_id)
         except PcdataError as error:

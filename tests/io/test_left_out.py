@@ -225,3 +225,15 @@ def test_an_empty_list_of_captures_to_leave_out_is_an_error(tmp_path: Path) -> N
     (tmp_path / "bad.txt").write_text("# none\n")
     with pytest.raises(CaptureError, match="lists no id"):
         read_skip_file(tmp_path / "bad.txt")
+
+
+def test_an_export_of_captures_leaves_out_and_a_built_dataset_refuses_the_flags(
+    capture: Path, config: Path, tmp_path: Path, capsys
+) -> None:
+    export = ["export", str(capture), "--to", "ggcnn", "--out", str(tmp_path / "out"), "--skip-refused"]
+    main(export)
+    assert "left out 2: PoseError" in capsys.readouterr().err
+    assert main(["build", str(config), "--source", str(capture), "--out", str(tmp_path / "a"), "--skip-refused"]) == 0
+    built = ["export", str(tmp_path / "a"), "--to", "dp3", "--out", str(tmp_path / "out2"), "--skip", "1"]
+    assert main([*built, "--invalid-values", "65535", "--set", "episodes=x"]) == 2
+    assert "--invalid-values, --skip cannot change" in capsys.readouterr().err

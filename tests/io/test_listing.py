@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from scipy.io import savemat
 
-from pcdata import open_source, write_ply
+from pcdata import open_source, validate_source, write_ply
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.exports.episodes import episode_names
 from pcdata.io import AveragedSource, TemporallyFilteredSource
@@ -187,11 +187,55 @@ def test_a_lost_capture_and_a_circle_of_links_are_told(tmp_path: Path) -> None:
         open_source(tmp_path / "loop")
 
 
-def test_links_that_lead_to_files_are_read_as_files(tmp_path: Path) -> None:
+def test_links_within_the_capture_are_followed(tmp_path: Path) -> None:
     root = folder(tmp_path / "c", ["1", "2"])
-    (root / "depth" / "2.png").rename(tmp_path / "stored")
-    (root / "depth" / "2.png").symlink_to(tmp_path / "stored")
-    assert open_source(root).load("2").depth.max() == pytest.approx(0.796)
+    (root / ".store").mkdir()
+    (root / "depth" / "2.png").rename(root / ".store" / "stored")
+    (root / "depth" / "2.png").symlink_to("../.store/stored")
+    (tmp_path / "by_another_name").symlink_to(root)
+    for path in (root, tmp_path / "by_another_name"):
+        assert open_source(path).load("2").depth.max() == pytest.approx(0.796)
+
+
+OUTSIDE = [
+    (lambda root: folder(root, ["9", "10"]), place)
+    for place in ("depth/10.png", "color/10.png", "poses/10.txt", "depth", "intrinsics.json")
+]
+OUTSIDE += [(rig, "left/depth/1.png"), (rig, "right"), (scenes, "frame-10.depth.png"), (scenes, "frame-10.pose.txt")]
+OUTSIDE += [(scenes, "camera-intrinsics.txt"), (graspnet, "10/meta.mat"), (graspnet, "10"), (clouds, "10.ply")]
+
+
+@pytest.mark.parametrize(("layout", "place"), OUTSIDE)
+def test_links_that_lead_out_of_the_capture_are_followed_only_where_that_is_allowed(
+    layout, place: str, tmp_path: Path
+) -> None:
+    root = layout(tmp_path / "c")
+    (tmp_path / "store").mkdir()
+    (root / place).rename(tmp_path / "store" / Path(place).name)
+    (root / place).symlink_to(tmp_path / "store" / Path(place).name)
+
+    def load_all(**options: object) -> list[object]:
+        source = open_source(root, **options)
+        return [source.load(sample_id) for sample_id in source.ids]
+
+    with pytest.raises(CaptureError, match=r"leads out of .*links_to="):
+        load_all()
+    assert len(load_all(links_to=tmp_path / "store")) == 2
+    assert len(load_all(links_to=["/nowhere", str(tmp_path / "store")])) == 2
+
+
+def test_validate_reads_nothing_outside(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "depth" / "1.png").rename(tmp_path / "stored.png")
+    (root / "depth" / "1.png").symlink_to(tmp_path / "stored.png")
+    (report,) = validate_source(open_source(root))
+    assert [check.name for check in report.checks] == ["readable"]
+    assert "leads out of" in report.checks[0].found
+
+
+def test_a_named_file_may_be_a_link_to_anywhere(tmp_path: Path) -> None:
+    (tmp_path / "here.ply").symlink_to(clouds(tmp_path / "c") / "9.ply")
+    assert open_source(tmp_path / "here.ply").load("here").num_points == 5
 
 
 # -- what exists and is not read ---------------------------------------------------------------------------------------
