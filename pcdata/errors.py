@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import difflib
 import errno
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+_LINES = 50  # faults of one file, of which nearly every line is wrong
 
 
 class PcdataError(Exception):
@@ -125,3 +127,9 @@ def near_matches(word: str, known: Iterable[str]) -> str:
     folded = {name.lower(): name for name in known}
     close = [folded[match] for match in difflib.get_close_matches(word.lower(), folded, n=3, cutoff=0.6)]
     return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def first_lines(lines: Sequence[str]) -> str:
+    """Return faults one to a line, the first of them where there are very many."""
+    more = [f"and {len(lines) - _LINES} more"] if len(lines) > _LINES else []
+    return "\n".join([*lines[:_LINES], *more])

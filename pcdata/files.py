@@ -57,6 +57,8 @@ def open_input(
         # Examined before it is opened too: opening alone can set off a device. O_NONBLOCK: a FIFO would wait for ever.
         _check_kind(where, file, os.stat(file), error)
         descriptor = os.open(file, os.O_RDONLY | _FLAGS)
+    except PcdataError:  # some of which are an OSError or a ValueError as well
+        raise
     except FileNotFoundError as cause:
         raise error(_missing(where, file)) from cause
     except (OSError, ValueError) as cause:  # ValueError: a NUL in the name
@@ -78,11 +80,10 @@ def open_input(
                 f"{where}: {file}: claims {status.st_size} bytes but is nearly all holes (a sparse file); was the copy "
                 "or download interrupted?"
             )
-    except OSError as cause:
+    except BaseException as cause:
         stream.close()
-        raise error(f"{where}: {file}: cannot be examined: {cause}") from cause
-    except BaseException:
-        stream.close()
+        if isinstance(cause, OSError) and not isinstance(cause, PcdataError):
+            raise error(f"{where}: {file}: cannot be examined: {cause}") from cause
         raise
     return stream
 
@@ -193,6 +194,8 @@ def check_inside(
     try:
         _check_inside(where, Path(path), None, inside, error)
     except OSError as cause:
+        if isinstance(cause, PcdataError):
+            raise
         raise error(f"{where}: {path}: cannot be examined: {cause}") from cause
 
 

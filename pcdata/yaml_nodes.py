@@ -9,14 +9,52 @@ from typing import Any
 
 import yaml
 
-from pcdata.errors import ConfigError, PcdataError
+from pcdata.errors import ConfigError, PcdataError, first_lines
 from pcdata.sensors import SensorProfile
 
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
+_MAX_NODES = 100_000  # 5,000 poses; PyYAML takes some 50 microseconds for each
+_MAX_DEPTH = 50  # pipelines nest a few levels deep
+_MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
+_LONGEST_NAME = 60  # characters of a name that a message repeats
+
+
+class _Refused(yaml.MarkedYAMLError):
+    """Valid YAML that no configuration needs and that costs without bound."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 5e-3 as a number, as YAML 1.2 and everybody else does; YAML 1.1 wants 5.0e-3."""
+    """Reads 5e-3 as a number, as YAML 1.2 and everybody else does; YAML 1.1 wants 5.0e-3.
+
+    Refuses aliases, which let a small file expand without bound, tags, which put types on values they do not fit, and
+    deep nesting, before any of it is built.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._nodes = self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node that is allowed."""
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent):
+            raise _refused(event, "YAML aliases (*name) are not allowed; write the value out")
+        if (tag := getattr(event, "tag", None)) not in (None, "!"):
+            raise _refused(event, f"YAML tags ({tag:.60}) are not allowed; write the plain value")
+        self._nodes += 1
+        if self._nodes > _MAX_NODES:
+            raise _refused(event, f"holds more than {_MAX_NODES} values, as no file of this kind does")
+        if self._depth >= _MAX_DEPTH:
+            raise _refused(event, f"nested too deeply, more than {_MAX_DEPTH} levels")
+        self._depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+
+def _refused(event: yaml.Event, problem: str) -> _Refused:
+    return _Refused(None, None, problem, event.start_mark)  # type: ignore[arg-type]
 
 
 _Loader.yaml_implicit_resolvers = {**yaml.SafeLoader.yaml_implicit_resolvers}
@@ -66,19 +104,21 @@ class YamlDocument:
         if len(text) > _MAX_CHARACTERS:
             raise error(f"{name}: {len(text)} characters are no file of this kind; the limit is {_MAX_CHARACTERS}")
         try:
-            # Aliases let a small file expand without bound, and no configuration needs them.
-            alias = next((token for token in yaml.scan(text, _Loader) if isinstance(token, yaml.AliasToken)), None)
-            self.root: yaml.Node | None = None if alias else yaml.compose(text, _Loader)
+            self.root: yaml.Node | None = yaml.compose(text, _Loader)
+        except _Refused as fault:
+            self.fault_at(fault.problem_mark, str(fault.problem))
+            self.raise_faults()
         except yaml.MarkedYAMLError as fault:
-            self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem}")
+            self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem:.200}")
             self.raise_faults()
         except yaml.YAMLError as fault:
             raise error(f"{name}: not valid YAML: {fault}") from fault
         except RecursionError as fault:
             raise error(f"{name}: cannot be read: nested too deeply") from fault
-        if alias is not None:
-            self.fault_at(alias.start_mark, "YAML aliases (*name) are not allowed; write the value out")
-            self.raise_faults()
+        except (ValueError, IndexError, OverflowError) as fault:  # escapes and versions that are no numbers
+            raise error(f"{name}: not valid YAML: {fault!s:.200}") from fault
+        if self.root is None or _is_null(self.root):
+            raise error(f"{name}: is empty: it holds no value; was it saved, or is it the wrong file?")
 
     def fault(self, node: yaml.Node | None, message: str) -> None:
         """Note a fault at a node."""
@@ -93,7 +133,7 @@ class YamlDocument:
         if not self.faults:
             return
         ordered = sorted(self.faults, key=lambda fault: (fault[0].line, fault[0].column) if fault[0] else (-1, -1))
-        raise self.error("\n".join(f"{self._place(mark)}: {message}" for mark, message in ordered))
+        raise self.error(first_lines([f"{self._place(mark)}: {message}" for mark, message in ordered]))
 
     def _place(self, mark: yaml.Mark | None) -> str:
         return f"{self.name}:{mark.line + 1}:{mark.column + 1}" if mark else self.name
@@ -107,9 +147,12 @@ class YamlDocument:
             return {}
         found: dict[str, tuple[yaml.Node, yaml.Node]] = {}
         for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                self.fault(key, f"{what}: a name must be a single word, not {_kind(key)}")
+                continue
             name = str(key.value)
             if name in found:
-                self.fault(key, f"{what}: {name!r} is given twice")
+                self.fault(key, f"{what}: {name[:_LONGEST_NAME]!r} is given twice")
             found[name] = (key, value)
         return found
 
@@ -124,19 +167,20 @@ class YamlDocument:
 
     def plain(self, node: yaml.Node) -> Any:
         """Return the node's value as plain Python data; duplicate keys are noted as faults."""
-        for mapping in _mappings(node):
-            self.mapping(mapping, "mapping")
+        before = len(self.faults)
+        for part in _parts(node):
+            if isinstance(part, yaml.MappingNode):
+                self.mapping(part, "mapping")
+            elif isinstance(part, yaml.ScalarNode) and len(part.value) > _MAX_DIGITS and part.tag in _NUMBERS:
+                self.fault(part, f"a number of {len(part.value)} digits is none that can be meant")
+        if len(self.faults) > before:
+            return None
         try:
             return _Loader("").construct_object(node, deep=True)
         except yaml.MarkedYAMLError as error:
-            self.fault_at(error.problem_mark, f"cannot read this value: {error.problem}")
-        except (
-            ValueError,
-            TypeError,
-            OverflowError,
-            RecursionError,
-        ) as error:  # dates and tagged numbers that are none
-            self.fault(node, f"cannot read this value: {error}")
+            self.fault_at(error.problem_mark, f"cannot read this value: {error.problem:.200}")
+        except Exception as error:  # PyYAML trusts that words fit their types
+            self.fault(node, f"cannot read this value: {str(error) or type(error).__name__:.200}")
         return None
 
 
@@ -161,15 +205,20 @@ def _is_null(node: yaml.Node) -> bool:
 
 def _kind(node: yaml.Node) -> str:
     if isinstance(node, yaml.ScalarNode):
-        return f"the single value {node.value!r}"
+        return f"the single value {node.value[:_LONGEST_NAME]!r}"
     return "a list" if isinstance(node, yaml.SequenceNode) else "a mapping"
 
 
-def _mappings(node: yaml.Node) -> Iterator[yaml.MappingNode]:
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float", "tag:yaml.org,2002:timestamp")
+
+
+def _parts(node: yaml.Node) -> Iterator[yaml.Node]:
+    """Return a node and all within it, names of mappings too."""
+    yield node
     if isinstance(node, yaml.MappingNode):
-        yield node
-        for _, value in node.value:
-            yield from _mappings(value)
+        for key, value in node.value:
+            yield from _parts(key)
+            yield from _parts(value)
     elif isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            yield from _mappings(item)
+            yield from _parts(item)

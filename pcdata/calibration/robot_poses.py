@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +16,12 @@ import torch
 import yaml
 from torch import Tensor
 
-from pcdata.errors import CalibrationError, ShapeError, near_matches
+from pcdata.errors import CalibrationError, ShapeError, first_lines, near_matches
 from pcdata.files import read_text
 from pcdata.functional import rigid
 from pcdata.io.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
 from pcdata.io.pose_nodes import POSE_KEYS, known_entries, matrix_from_node, pose_from_entries
+from pcdata.io.sample_names import name_some
 from pcdata.yaml_nodes import YamlDocument
 
 ROBOT, TARGET, IMAGE = "base_from_gripper", "camera_from_target", "image"
@@ -120,7 +122,10 @@ def _check_pose(what: str, pose: Tensor) -> None:
 
 def _from_csv(text: str, name: str) -> RobotPoses:
     """Read a header and one line per pose: positions in metres and quaternions in x y z w order."""
-    lines = list(csv.reader(io.StringIO(text)))
+    try:
+        lines = list(csv.reader(io.StringIO(text), strict=True))
+    except csv.Error as error:
+        raise CalibrationError(f"{name}: not a table of comma-separated values: {error}") from error
     header = [column.strip() for column in lines[0]] if lines else []
     wanted = [f"{pose}.{part}" for pose in (ROBOT, TARGET) for part in _PARTS]
     faults = [f"{name}:1: column {column!r} is missing" for column in wanted if column not in header]
@@ -128,7 +133,7 @@ def _from_csv(text: str, name: str) -> RobotPoses:
     faults += [f"{name}:1: no such column {c!r}{near_matches(c, known)}" for c in header if c not in known]
     faults += [f"{name}:1: column {c!r} is given twice" for c in sorted(set(header)) if header.count(c) > 1]
     if faults:
-        raise CalibrationError("\n".join(faults))
+        raise CalibrationError(first_lines(faults))
     names: list[str] = []
     robot: list[Tensor] = []
     target: list[Tensor] = []
@@ -146,7 +151,7 @@ def _from_csv(text: str, name: str) -> RobotPoses:
             except ValueError as error:
                 faults.append(str(error))
     if faults:
-        raise CalibrationError("\n".join(faults))
+        raise CalibrationError(first_lines(faults))
     return _joined(name, names, robot, target)
 
 
@@ -167,6 +172,6 @@ def _joined(name: str, names: list[str], robot: list[Tensor], target: list[Tenso
     if not names:
         raise CalibrationError(f"{name}: holds no pose")
     if len(set(names)) != len(names):
-        twice = sorted({one for one in names if names.count(one) > 1})
-        raise CalibrationError(f"{name}: every pose needs a name of its own; {', '.join(twice)} comes more than once")
+        twice = {one for one, count in Counter(names).items() if count > 1}
+        raise CalibrationError(f"{name}: every pose needs a name of its own; {name_some(twice)} comes more than once")
     return RobotPoses(names=tuple(names), base_from_gripper=torch.stack(robot), camera_from_target=torch.stack(target))

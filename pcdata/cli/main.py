@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from pcdata import __version__
 from pcdata.cli import signals
+from pcdata.cli.printable import printable_output
 from pcdata.cli.signals import signals_interrupt
 from pcdata.cli.threads import wait_asleep
 from pcdata.errors import ConfigError, PcdataError
@@ -20,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     128 and the number of the signal where one ended it. Without ``argv`` this is the whole life of the process.
     """
-    with signals_interrupt(until_exit=argv is None) as heard:
+    with printable_output(), signals_interrupt(until_exit=argv is None) as heard:
         try:
             return _run(argv)
         except KeyboardInterrupt:
@@ -50,10 +51,10 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:  # "pcdata inspect ... | head" has read enough
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the flush at exit
         return 0
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         if arguments.debug or signals.current.first is not None:
             raise
-        print(f"pcdata: {error}", file=sys.stderr)
+        print(f"pcdata: {error if str(error) else 'not enough memory'}", file=sys.stderr)
         return 1
     return verdict or 0
 

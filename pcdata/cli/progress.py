@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 from pcdata.cli import signals
+from pcdata.cli.printable import printable, terminal
 
 
 class Progress:
@@ -34,6 +35,6 @@ class Progress:
         if self.bar is None:
             from tqdm import tqdm
 
-            self.bar = tqdm(total=total, desc=self.what, unit="sample", file=sys.stderr)
-        self.bar.set_postfix_str(sample_id)
+            self.bar = tqdm(total=total, desc=printable(self.what), unit="sample", file=terminal(sys.stderr))
+        self.bar.set_postfix_str(printable(sample_id))
         self.bar.update(done - self.bar.n)

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CacheError
-from pcdata.files import replacing
+from pcdata.files import read_bytes, replacing
 from pcdata.io.record import parse_info
 
+_MAX_BYTES = 1 << 28  # about a million samples
 FILE_NAME = "pcdata_export.json"
 SCHEMA = "pcdata.export/1"
 
@@ -48,7 +49,7 @@ class ExportRecord:
                 f"{folder} is not a pcdata export (it has no {FILE_NAME}), so it is left alone; choose another"
             )
         try:
-            content = parse_info(path.read_bytes())
+            content = parse_info(read_bytes("export", path, max_bytes=_MAX_BYTES, error=CacheError))
             if content.get("schema") != SCHEMA:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}")
             return cls(**content)

@@ -15,6 +15,7 @@ from torch import Tensor
 from pcdata.errors import CalibrationError, FrameError, PoseError, near_matches
 from pcdata.files import read_text, replacing
 from pcdata.functional import rigid
+from pcdata.io.sample_names import name_some
 from pcdata.structures import Camera
 
 # An inverse by transposition is off by as much as the rotation is from orthonormal: 0.1 mm at 1 m.
@@ -89,7 +90,9 @@ class Calibration:
         for name in self.evidence:
             if name not in self.cameras and name not in self.transforms:
                 raise CalibrationError(f"Calibration: there is evidence for {name!r}, which is no camera or transform")
-        check_no_loop([FramePair.parse(name) for name in self.transforms])
+        tree = FrameTree()
+        for name in self.transforms:
+            tree.join(FramePair.parse(name))
         for name in ("cameras", "transforms", "evidence"):  # the class is frozen: what the caller does later is his own
             object.__setattr__(self, name, dict(getattr(self, name)))
 
@@ -154,22 +157,24 @@ class Calibration:
         Raises:
             FrameError: a frame is unknown, or nothing joins the two.
         """
+        frames = self.frames
         for frame in (to, from_):
-            if frame not in self.frames:
-                hint = near_matches(frame, self.frames) or f"; known: {', '.join(self.frames) or 'none'}"
+            if frame not in frames:
+                hint = near_matches(frame, frames) or f"; known: {name_some(frames) or 'none'}"
                 raise FrameError(f"Calibration: no frame {frame!r}{hint}")
+        steps = self._steps()
         reached = {from_: torch.eye(4, dtype=torch.float64, device="cpu")}
         waiting = deque([from_])
         while waiting and to not in reached:
             frame = waiting.popleft()
-            for neighbour, step in self._steps_from(frame):
+            for neighbour, matrix, forward in steps.get(frame, ()):
                 if neighbour not in reached:
-                    reached[neighbour] = step @ reached[frame]
+                    reached[neighbour] = (matrix if forward else rigid.invert_rigid(matrix)) @ reached[frame]
                     waiting.append(neighbour)
         if to not in reached:
             raise FrameError(
                 f"Calibration: nothing joins {to!r} and {from_!r}; from {from_!r} one gets to "
-                f"{', '.join(sorted(set(reached) - {from_})) or 'no other frame'}; add a transform between them"
+                f"{name_some(set(reached) - {from_}) or 'no other frame'}; add a transform between them"
             )
         return reached[to]
 
@@ -189,15 +194,13 @@ class Calibration:
         kept = {key: value for key, value in self.evidence.items() if key != name}
         return kept if evidence is None else {**kept, name: evidence}
 
-    def _steps_from(self, frame: str) -> list[tuple[str, Tensor]]:
-        """Return the neighbours of a frame, each with ``neighbour_from_frame``."""
-        steps = []
+    def _steps(self) -> dict[str, list[tuple[str, Tensor, bool]]]:
+        """Return for each frame its neighbours, the entry between the two, and whether it leads to the neighbour."""
+        steps: dict[str, list[tuple[str, Tensor, bool]]] = {}
         for name, matrix in self.transforms.items():
             to, from_ = FramePair.parse(name)
-            if from_ == frame:
-                steps.append((to, matrix))
-            elif to == frame:
-                steps.append((from_, rigid.invert_rigid(matrix)))
+            steps.setdefault(from_, []).append((to, matrix, True))
+            steps.setdefault(to, []).append((from_, matrix, False))
         return steps
 
     def __repr__(self) -> str:
@@ -233,23 +236,29 @@ def check_transform(name: str, matrix: Tensor) -> None:
         raise PoseError(f"{name}: the translation is {length:g} m long; is it in millimetres? Write metres")
 
 
-def check_no_loop(pairs: list[FramePair]) -> None:
-    """Require that no transform joins frames that are joined already.
+class FrameTree:
+    """Frames that transforms join; between two there may be one way at most."""
 
-    Raises:
-        CalibrationError: with the first that does.
-    """
-    root: dict[str, str] = {}
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
 
-    def find(frame: str) -> str:
-        while root.setdefault(frame, frame) != frame:
-            frame = root[frame]
-        return frame
+    def join(self, pair: FramePair) -> None:
+        """Add a transform.
 
-    for pair in pairs:
-        if find(pair.to) == find(pair.from_):
+        Raises:
+            CalibrationError: its frames are joined already.
+        """
+        to, from_ = self._root(pair.to), self._root(pair.from_)
+        if to == from_:
             raise CalibrationError(
                 f"{pair.name}: {pair.to!r} and {pair.from_!r} are joined by other transforms already, and two ways "
                 "would give two answers; remove one"
             )
-        root[find(pair.to)] = find(pair.from_)
+        self._parent[to] = from_
+
+    def _root(self, frame: str) -> str:
+        parent = self._parent
+        while parent.setdefault(frame, frame) != frame:
+            parent[frame] = parent[parent[frame]]  # halves the way for the next, so that long chains stay linear
+            frame = parent[frame]
+        return frame

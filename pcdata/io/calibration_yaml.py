@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.errors import CalibrationError, CaptureError, PcdataError
 from pcdata.functional.lens import COEFFICIENT_COUNTS
-from pcdata.io.calibration import Calibration, Evidence, FramePair, check_camera, check_no_loop, check_transform
+from pcdata.io.calibration import Calibration, Evidence, FramePair, FrameTree, check_camera, check_transform
 from pcdata.io.pose_nodes import POSE_KEYS, Entries, known_entries, number, numbers, pose_from_entries, whole
 from pcdata.structures import Camera
 from pcdata.yaml_nodes import YamlDocument, yaml_text
@@ -191,12 +191,10 @@ def _text(document: YamlDocument, node: yaml.Node, what: str) -> str:
 
 
 def _check_loops(document: YamlDocument, transforms: Entries) -> None:
-    pairs: list[FramePair] = []
+    tree = FrameTree()
     for name, (key, _) in transforms.items():
         try:
-            check_no_loop([*pairs, FramePair.parse(name)])
+            tree.join(FramePair.parse(name))
         except CalibrationError as error:
             document.fault(key, str(error))
-        else:
-            pairs.append(FramePair.parse(name))
     document.raise_faults()

@@ -17,9 +17,11 @@ from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataErro
 from pcdata.files import map_npy, read_text, replacing
 from pcdata.functional import rigid
 from pcdata.io.option_checks import check_invalid_values
+from pcdata.io.strict_json import json_object
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera
 
+_SHOWN = 8  # faults of a file in one message
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
 _OPTIONAL = ("distortion", "metres_per_unit", "frame_id", "background_label", "invalid_values")
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
@@ -63,17 +65,17 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         UnitError: ``metres_per_unit`` is not a number above 0 and at most 1.
     """
     where = f"read_capture_camera: {path}"
-    data = _json_object(where, read_text(where, path))
+    data = json_object(where, read_text(where, path))
     _check_keys(where, data)
     width, height = (_whole(where, data, key) for key in ("width", "height"))
     fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
     unit = data.get("metres_per_unit")
     frame_id = data.get("frame_id")
     if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
-        raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r}")
+        raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r:.80}")
     background = data.get("background_label")
     if background is not None and not (type(background) is int and 0 <= background <= 65535):
-        raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r}")
+        raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r:.80}")
     invalid = data.get("invalid_values")
     if invalid is not None:
         try:
@@ -175,39 +177,21 @@ def _camera(where: str, **values: Any) -> Camera:
         raise IntrinsicsError(f"{where}: {error}") from error
 
 
-def _json_object(where: str, text: str) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        if len(set(keys)) != len(keys):
-            raise ValueError(f"a key is repeated in {keys}")
-        return dict(pairs)
-
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is not a number a camera can have")
-
-    try:
-        data = json.loads(text, object_pairs_hook=unique, parse_constant=refuse)
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{where}: not valid JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise CaptureError(f"{where}: must be a JSON object with {', '.join(_REQUIRED)}, got a {type(data).__name__}")
-    return data
-
-
 def _check_keys(where: str, data: dict[str, Any]) -> None:
     known = (*_REQUIRED, *_OPTIONAL, *_REMARKS)
     faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
     for key in data:
         if key not in known:
             hint = _HINTS.get(key.lower())
-            faults.append(f"{key!r} is not known{'; ' + hint if hint else near_matches(key, known)}")
+            faults.append(f"{key[:60]!r} is not known{'; ' + hint if hint else near_matches(key, known)}")
     if faults:
-        raise CaptureError(f"{where}: {', '.join(faults)}")
+        more = f" and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
+        raise CaptureError(f"{where}: {', '.join(faults[:_SHOWN])}{more}")
 
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise CaptureError(f"{where}: {key!r} must be a number, got {value!r}")
+        raise CaptureError(f"{where}: {key!r} must be a number, got {value!r:.80}")
     try:
         number = float(value)
     except OverflowError:
@@ -220,7 +204,7 @@ def _number(where: str, key: str, value: Any) -> float:
 def _whole(where: str, data: dict[str, Any], key: str) -> int:
     number = _number(where, key, data[key])
     if number != int(number) or not 1 <= number <= 1 << 16:
-        raise CaptureError(f"{where}: {key!r} must be a whole number of pixels, got {data[key]!r}")
+        raise CaptureError(f"{where}: {key!r} must be a whole number of pixels, got {data[key]!r:.80}")
     return int(number)
 
 
@@ -238,6 +222,12 @@ def _distortion(where: str, value: Any) -> list[float] | None:
 def _numbers(where: str, text: str) -> list[float]:
     words = text.replace(",", " ").split()
     try:
-        return [float(word) for word in words[:100]]
+        return [_plain_number(word) for word in words[:100]]
     except ValueError as error:
-        raise CaptureError(f"{where}: must hold numbers only: {error}") from error
+        raise CaptureError(f"{where}: must hold numbers only: {str(error)[:200]}") from error
+
+
+def _plain_number(word: str) -> float:
+    if "_" in word or not word.isascii():  # float() takes 1_000 and the digits of other scripts
+        raise ValueError(f"{word[:60]!r} is no number")
+    return float(word)

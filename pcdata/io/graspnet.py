@@ -14,12 +14,13 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
-from pcdata.files import existing_file
+from pcdata.files import read_bytes
 from pcdata.functional import rigid
 from pcdata.io.frame_files import make_frame
 from pcdata.io.images import read_depth
 from pcdata.io.listing import LinkTargets, absolute, check_links, entries, has_file, is_folder, unread_entries
-from pcdata.io.sample_names import positions
+from pcdata.io.matlab import numeric_arrays
+from pcdata.io.sample_names import name_some, positions
 from pcdata.io.source import Source, check_partners
 from pcdata.lengths import check_metres_per_unit
 from pcdata.structures import Camera, DepthFrame
@@ -125,14 +126,10 @@ def _known_files(folder: Path) -> dict[str, Path]:
 
 def _read_meta(path: Path) -> dict[str, Any]:
     """Return intrinsics, unit, object ids and object poses of a MATLAB 5 file; the last two are optional."""
-    from scipy.io import loadmat  # 0.1 s to import, and only this layout needs it
-
-    where = str(existing_file("GraspNetSource", path, max_bytes=_MAX_META_BYTES))
+    where = str(path)
     names = ["intrinsic_matrix", "factor_depth", "cls_indexes", "poses"]
-    try:
-        raw = loadmat(path, variable_names=names)
-    except Exception as error:  # SciPy's parser raises many types on damaged files
-        raise CaptureError(f"{where}: not a readable MATLAB 5 file: {error}") from error
+    data = read_bytes("GraspNetSource", path, max_bytes=_MAX_META_BYTES)
+    raw = numeric_arrays(where, data, names, max_bytes=_MAX_META_BYTES)
     matrix = _numbers(where, raw, "intrinsic_matrix", (3, 3))
     factor = float(_numbers(where, raw, "factor_depth", (1, 1))[0, 0])
     if not factor >= 1:
@@ -164,7 +161,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _numbers(where: str, raw: dict[str, Any], name: str, shape: tuple[int, ...] | None) -> NDArray[np.float64]:
     if name not in raw:
-        raise CaptureError(f"{where}: must have {name}, but has {', '.join(k for k in raw if not k.startswith('__'))}")
+        raise CaptureError(f"{where}: must have {name}, but has {name_some(raw) or 'no variable that is used here'}")
     values = np.asarray(raw[name])
     if values.dtype.kind not in "iuf" or (shape is not None and values.shape != shape) or not np.isfinite(values).all():
         raise CaptureError(

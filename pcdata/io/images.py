@@ -5,6 +5,7 @@ Nothing is guessed: the unit of depth is an argument, and an image whose type co
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zlib
@@ -19,7 +20,8 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.errors import CaptureError, NoReadingError, UnitError
-from pcdata.files import existing_file, map_npy
+from pcdata.files import map_npy, read_bytes
+from pcdata.io.image_structure import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
 from pcdata.lengths import check_metres_per_unit
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
@@ -199,24 +201,34 @@ def _check_pixels(where: str, width: int, height: int) -> None:
 
 
 def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDArray[Any], tuple[int, int]]:
-    """Return Pillow's mode, the pixels, and (bit depth, colour type) as a PNG's own header states them, else 0, 0."""
-    existing_file(where, path, max_bytes=_MAX_BYTES)
+    """Return Pillow's mode, the pixels, and (bit depth, colour type) as a PNG's own header states them, else 0, 0.
+
+    Pillow gets a file whose structure was checked first: it shows what it can of a damaged one.
+    """
+    data = read_bytes(where, path, max_bytes=_MAX_BYTES)
     try:
-        with path.open("rb") as stream:
-            head = stream.read(26)
-        with Image.open(path, formats=formats) as image:
+        # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
+        depth = (0, 0)
+        if _PNG in formats and (data[:8] == PNG_SIGNATURE or formats == (_PNG,)):
+            data, *depth_and_type = checked_png(data, MAX_PIXELS)
+            depth = (depth_and_type[0], depth_and_type[1])
+            formats = (_PNG,)
+        elif _TIFF in formats:
+            check_tiff(data, MAX_PIXELS)
+        else:
+            check_jpeg(data, MAX_PIXELS)
+        with Image.open(io.BytesIO(data), formats=formats) as image:
             _check_pixels(where, *image.size)
             if (number := getattr(image, "n_frames", 1)) != 1:
                 raise CaptureError(f"{where}: must hold one image, but holds {number}; save one file each")
             image.load()
-            pixels = np.asarray(image)
-            mode, is_png = image.mode, image.format == _PNG
+            return image.mode, np.asarray(image), depth
     except CaptureError:
         raise
     except (
         OSError, ValueError, SyntaxError, EOFError, TypeError, IndexError, KeyError, OverflowError, MemoryError,
-        struct.error, zlib.error, Image.DecompressionBombError, Warning,
+        AttributeError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError, Warning,
     ) as error:  # fmt: skip  # what Pillow's parsers raise on damaged files; warnings too where a user made them errors
-        raise CaptureError(f"{where}: not a readable {' or '.join(formats)} image: {error}") from error
-    # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
-    return mode, pixels, (head[24], head[25]) if is_png else (0, 0)
+        raise CaptureError(
+            f"{where}: not a readable {' or '.join(formats)} image: {str(error) or type(error).__name__}"
+        ) from error

@@ -43,7 +43,10 @@ def known_entries(
 
 def number(document: YamlDocument, node: yaml.Node, what: str) -> float | None:
     """Read a finite number; None, with the fault noted, when it is none."""
+    before = len(document.faults)
     value = document.plain(node)
+    if len(document.faults) > before:
+        return None
     # Whole numbers may have any length in YAML: the largest float is the limit for them too.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
         document.fault(node, f"{what} must be a finite number, got {value!r:.80}")
@@ -53,9 +56,12 @@ def number(document: YamlDocument, node: yaml.Node, what: str) -> float | None:
 
 def whole(document: YamlDocument, node: yaml.Node, what: str, *, at_most: int) -> int | None:
     """Read a whole number from 1 to ``at_most``; None, with the fault noted, when it is none."""
+    before = len(document.faults)
     value = document.plain(node)
+    if len(document.faults) > before:
+        return None
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= at_most:
-        document.fault(node, f"{what} must be a whole number from 1 to {at_most}, got {value!r}")
+        document.fault(node, f"{what} must be a whole number from 1 to {at_most}, got {value!r:.80}")
         return None
     return value
 

@@ -19,10 +19,11 @@ from torch import Tensor
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files import check_inside
 from pcdata.functional import rigid
+from pcdata.io.bag_index import MAGIC
 from pcdata.io.images import check_plausible, metres_of_value
 from pcdata.io.listing import LinkTargets, absolute, check_links, entries, is_file, is_folder, link_targets
 from pcdata.io.option_checks import check_seconds, check_switch
-from pcdata.io.rosbag import MAGIC, Bag, depth_units, opened_bag, rgb_pixels
+from pcdata.io.rosbag import Bag, depth_units, opened_bag, rgb_pixels
 from pcdata.io.sample_names import name_some
 from pcdata.io.source import Source
 from pcdata.lengths import check_metres_per_unit

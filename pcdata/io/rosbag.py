@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,11 +17,10 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError, PcdataError, add_note
 from pcdata.extras import require
-from pcdata.files import existing_file
+from pcdata.files import MAX_STREAMED_BYTES, open_input
+from pcdata.io.bag_index import checked_chunks
 from pcdata.io.images import MAX_PIXELS
 
-MAGIC = b"#ROSBAG V2.0\n"
-_MAX_BYTES = 1 << 42  # a recording is read image by image, so it may be long
 _CHANNELS = {"rgb8": ((0, 1, 2), 3), "bgr8": ((2, 1, 0), 3), "rgba8": ((0, 1, 2), 4), "bgra8": ((2, 1, 0), 4)}
 _DEPTH = ("mono16", "16UC1")
 
@@ -69,18 +67,18 @@ def opened_bag(where: str, path: str | os.PathLike[str]) -> Iterator[Bag]:
     """
     require("rosbags")
     rosbag1 = importlib.import_module("rosbags.rosbag1")
-    existing_file(where, path, max_bytes=_MAX_BYTES)
     try:
+        with open_input(where, path, max_bytes=MAX_STREAMED_BYTES) as stream:
+            packed = checked_chunks(stream, os.fstat(stream.fileno()).st_size)
         with rosbag1.Reader(Path(path)) as reader:
+            for place, chunk in reader.chunks.items():  # rosbags unpacks whatever comes out of a chunk
+                reader.chunks[place] = chunk._replace(decompressor=packed[place].unpacked)
             yield Bag(reader)
     except PcdataError as error:
         add_note(error, f"while reading {where}")
         raise
-    except (
-        rosbag1.ReaderError, OSError, ValueError, KeyError, IndexError, AssertionError, EOFError, TypeError,
-        OverflowError, MemoryError, RuntimeError, struct.error,
-    ) as error:  # fmt: skip  # what its parsers raise on damaged files
-        raise CaptureError(f"{where}: not a readable ROS 1 bag: {type(error).__name__}: {error}") from error
+    except Exception as error:  # its parsers raise many types on damaged files, SerdeError and struct.error among them
+        raise CaptureError(f"{where}: not a readable ROS 1 bag: {type(error).__name__}: {str(error)[:300]}") from error
 
 
 def depth_units(message: Any) -> NDArray[np.uint16]:  # (H, W)

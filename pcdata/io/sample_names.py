@@ -12,6 +12,7 @@ from decimal import Decimal
 from pcdata.errors import CaptureError
 
 _SHOWN = 5  # names in a message before "and n more"
+_LONGEST = 200  # characters of a name in a message
 # A minus belongs to a number at the start of a name and after one of "_ =": "t_-5"; elsewhere a dash divides, as in
 # "frame-000840" and "2024-01-02". A point is a decimal one only where the number is the whole name, "1305031102.175",
 # and no two names are one number then: "1.1" and "1.10" are counted, as in scene 1, frames 1 and 10.
@@ -91,7 +92,9 @@ def check_utf8(where: str, names: Iterable[str]) -> None:
 def name_some(names: Iterable[str]) -> str:
     """Return the first few names in order and how many more there are."""
     listed = in_order(names)
-    return ", ".join(listed[:_SHOWN]) + _more(listed)
+    return ", ".join(name if len(name) <= _LONGEST else f"{name[:_LONGEST]}..." for name in listed[:_SHOWN]) + _more(
+        listed
+    )
 
 
 def same_but_for_writing(missing: Iterable[str], spare: Iterable[str]) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 
 from pcdata.errors import CaptureError
 from pcdata.files import read_text
 from pcdata.io.source import check_partners
+from pcdata.io.strict_json import json_object
 
+_MAX_BYTES = 1 << 26  # two million names
 _LONGEST = 1e12  # seconds, 30,000 years: more are microseconds or nanoseconds
 
 
@@ -22,11 +23,8 @@ def read_timestamps(path: Path, ids: Iterable[str]) -> dict[str, float]:
         CaptureError: the file is no such JSON object, or names other samples than there are.
     """
     where = f"read_timestamps: {path}"
-    try:
-        times = json.loads(read_text(where, path))
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{where}: not valid JSON: {error}") from error
-    if not isinstance(times, dict) or not all(_is_time(time) for time in times.values()):
+    times = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES))
+    if not all(_is_time(time) for time in times.values()):
         raise CaptureError(f'{where}: must be a JSON object of seconds by name, such as {{"0001": 12.033}}')
     check_partners(where, ids, {"timestamp": times})
     return {name: float(time) for name, time in times.items()}

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from pcdata.errors import ConfigError, near_matches
+from pcdata.files import read_text
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
 from pcdata.transforms.sensor_words import is_sensor_word, sensor_hint, sensor_value
@@ -55,10 +56,7 @@ def read_config(path: str | Path) -> str:
     Raises:
         ConfigError: the file is missing, not a file, or not UTF-8.
     """
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot read this configuration: {error}") from error
+    return read_text("configuration", path, error=ConfigError)
 
 
 def steps_from_node(document: YamlDocument, node: yaml.Node | None, what: str) -> list[Transform]:

@@ -14,8 +14,8 @@ def faults(text: str) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_an_empty_file_has_the_documented_defaults():
-    config = config_from_yaml("")
+def test_a_file_that_says_nothing_has_the_documented_defaults():
+    config = config_from_yaml("{}")
     assert (config.output.format, config.output.compression, config.output.keep_raw) == ("hdf5", "none", False)
     assert (config.loader.batch_size, config.loader.num_workers, config.loader.collate) == (8, 2, "packed")
 
@@ -65,7 +65,7 @@ def test_a_file_that_cannot_be_read_is_a_config_error_that_names_it(tmp_path, co
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"my\.yaml"):
         load_config(path)
-    with pytest.raises(ConfigError, match="cannot read"):
+    with pytest.raises(ConfigError, match="configuration: "):
         load_config(tmp_path)
 
 

@@ -126,8 +126,8 @@ def test_a_quaternion_and_a_rotation_vector_say_the_same_rotation(tmp_path: Path
         ("residuals", "residual", r"no such key 'residual'; did you mean 'residuals'"),
         ("transforms:", "  wrist: {}\ntransforms:", r"6:3: cameras: 'wrist' is given twice"),
         ("by hand", "*alias", r"aliases .* are not allowed"),
-        ("by hand", "!<tag:yaml.org,2002:python/name:os.system> ''", r"evidence: method must be words"),
-        ("fx: 600.5", "fx: !<tag:yaml.org,2002:python/name:os.system> ''", r"cannot read this value"),
+        ("by hand", "!<tag:yaml.org,2002:python/name:os.system> ''", r"YAML tags .* are not allowed"),
+        ("fx: 600.5", "fx: !<tag:yaml.org,2002:python/name:os.system> ''", r"YAML tags .* are not allowed"),
     ],
 )
 def test_a_fault_is_named_with_its_place(tmp_path: Path, old: str, new: str, message: str) -> None:

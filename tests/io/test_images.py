@@ -184,7 +184,7 @@ def test_missing_empty_foreign_and_misnamed_files_are_named(tmp_path: Path) -> N
 def test_several_pages_in_a_tiff_are_refused(tmp_path: Path) -> None:
     page = Image.fromarray(MILLIMETRES)
     page.save(tmp_path / "d.tiff", save_all=True, append_images=[page])
-    with pytest.raises(CaptureError, match="one image, but holds 2"):
+    with pytest.raises(CaptureError, match="one image, but holds"):
         read_depth(tmp_path / "d.tiff", metres_per_unit=0.001)
 
 
