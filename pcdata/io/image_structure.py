@@ -28,11 +28,11 @@ class StructureError(ValueError):
 
 
 def checked_png(data: bytes, max_pixels: int) -> tuple[bytes, int, int]:
-    """Check every chunk and checksum and unpack the rows, no further than the header says they go.
+    """Check every chunk and checksum, and that the rows unpack to what the header says, no further.
 
     Returns:
-        The same picture as a PNG of its critical chunks alone with its rows not packed, so that nothing is unpacked
-        twice and no other chunk is parsed; the bits per channel; the colour type.
+        The same picture as a PNG of its critical chunks alone, so that no other chunk is parsed; the bits per channel;
+        the colour type.
 
     Raises:
         StructureError: damaged, cut short, more than one picture, or with bytes that belong to nothing.
@@ -57,10 +57,11 @@ def checked_png(data: bytes, max_pixels: int) -> tuple[bytes, int, int]:
     if kinds[first : first + count] != [b"IDAT"] * count or not count:
         raise StructureError("its image data are missing or not in one row")
     size = _png_bytes(width, height, bits * _CHANNELS[color], bool(interlaced))
-    rows = _inflated(b"".join(content for kind, content in chunks if kind == b"IDAT"), size)
+    packed = b"".join(content for kind, content in chunks if kind == b"IDAT")
+    _check_inflated(packed, size)
     parts: list[tuple[bytes, bytes | memoryview]] = [(b"IHDR", chunks[0][1])]
     parts += [(b"PLTE", palette) for palette in palettes]
-    parts += [(b"IDAT", zlib.compress(rows, 0)), (b"IEND", b"")]
+    parts += [(b"IDAT", packed), (b"IEND", b"")]
     return PNG_SIGNATURE + b"".join(_png_chunk(kind, content) for kind, content in parts), bits, color
 
 
@@ -101,8 +102,8 @@ def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
     return total
 
 
-def _inflated(packed: bytes | memoryview, size: int) -> bytes:
-    """Unpack a zlib stream that must give exactly so many bytes and end with the right checksum."""
+def _check_inflated(packed: bytes | memoryview, size: int) -> None:
+    """Require that a zlib stream unpacks to exactly so many bytes and ends with the right checksum."""
     stream = zlib.decompressobj()
     try:
         content = stream.decompress(packed, size + 1)
@@ -117,7 +118,6 @@ def _inflated(packed: bytes | memoryview, size: int) -> bytes:
         raise StructureError("its packed image data have no end and no checksum")
     if stream.unused_data.strip(b"\0"):
         raise StructureError(f"{len(stream.unused_data)} bytes follow its packed image data")
-    return content
 
 
 def check_jpeg(data: bytes, max_pixels: int) -> None:
@@ -225,7 +225,7 @@ def check_tiff(data: bytes, max_pixels: int) -> None:
         if packing == _TIFF_PLAIN and count != size:
             raise StructureError(f"a strip has {count} bytes where the image size asks for {size}")
         if packing in _TIFF_DEFLATE:
-            _inflated(data[offset : offset + count], size)
+            _check_inflated(data[offset : offset + count], size)
         if size > _TIFF_UNPACKED_PER_BYTE * count:
             raise StructureError(f"a strip of {count} bytes cannot hold the {size} that the image size asks for")
 

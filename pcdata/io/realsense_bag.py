@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
-from pcdata.files import check_inside
+from pcdata.files import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.functional import rigid
 from pcdata.io.bag_index import MAGIC
 from pcdata.io.images import check_plausible, metres_of_value
-from pcdata.io.listing import LinkTargets, absolute, check_links, entries, is_file, is_folder, link_targets
+from pcdata.io.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
 from pcdata.io.option_checks import check_seconds, check_switch
 from pcdata.io.rosbag import Bag, depth_units, opened_bag, rgb_pixels
 from pcdata.io.sample_names import name_some
@@ -142,11 +142,9 @@ class RealSenseBagSource(Source):
 
 def _is_bag(path: Path) -> bool:
     try:
-        if not is_file(path):  # opening a pipe would wait for ever
-            return False
-        with path.open("rb") as stream:
+        with open_input("recognises", path, max_bytes=MAX_STREAMED_BYTES) as stream:
             return stream.read(len(MAGIC)) == MAGIC
-    except OSError:
+    except (CaptureError, OSError):
         return False
 
 

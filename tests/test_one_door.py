@@ -1,0 +1,62 @@
+"""Files are read through pcdata.files alone: nothing else opens a path."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import pcdata
+
+ROOT = Path(pcdata.__file__).parent
+MODULES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py"))
+
+# Methods and functions that open a path for reading, whatever they are called on.
+OPENS = {
+    "open", "read_bytes", "read_text", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "open_memmap", "loadmat",
+    "imread", "File", "ZipFile", "Reader",
+}  # fmt: skip
+# What looks like it and is none: the call, and why.
+ALLOWED = {
+    "files.py": {"os.open": "the door"},
+    "demo.py": {"(files('pcdata') / 'demo.yaml').read_text": "a file of the package"},
+    "sensors/catalogue.py": {"files('pcdata.sensors').joinpath('profiles.yaml').read_text": "a file of the package"},
+    "io/images.py": {"Image.open": "of bytes"},
+    "io/rosbag.py": {"rosbag1.Reader": "after open_input"},
+    "io/hdf5_arrays.py": {"h5py.File": "after the door"},
+    "io/stores.py": {"h5py.File": "to write"},
+    "io/scratch.py": {"os.open": "to write", "Path(f'/proc/{pid}/stat').read_bytes": "of the system, not of a user"},
+    "io/whole_folders.py": {"os.open": "a folder, to force it to disk"},
+    "cli/datasets.py": {"config.source.open": "a capture, not a file"},
+}
+
+
+def reads(module: str) -> set[str]:
+    """Calls that open a path and do not say that they write."""
+    found = set()
+    for node in ast.walk(ast.parse((ROOT / module).read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        name = called.rsplit(".", 1)[-1]
+        if name not in OPENS or (name == "load" and not called.startswith(("np.", "numpy.", "torch."))):
+            continue
+        if name in ("read_bytes", "read_text") and "." not in called:
+            continue  # those of pcdata.files
+        modes = [argument.value for argument in node.args if isinstance(argument, ast.Constant)]
+        if any(isinstance(mode, str) and mode[:1] in ("w", "x", "a", "r") and "r" not in mode[:1] for mode in modes):
+            continue
+        found.add(called)
+    return found
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_opens_a_file_by_itself(module):
+    others = reads(module) - set(ALLOWED.get(module, ()))
+    assert not others, f"{module}: open files through pcdata.files, not with {sorted(others)}"
+
+
+def test_what_is_allowed_is_there():
+    for module, calls in ALLOWED.items():
+        assert set(calls) <= reads(module)
