@@ -3,7 +3,8 @@
 ``@op`` marks the public function: its own body is the reference, plain torch on any device. ``@kernel`` registers a
 faster body beside it under a backend name; it receives arguments that already passed the contract, and must give the
 same result. ``backend="auto"`` takes the fastest live backend for the device, and the reference where a gradient is
-wanted; naming an absent backend raises with the reason.
+wanted and the operation gives one; naming an absent backend raises with the reason. Where the body that ``auto`` would
+take is absent, and a slow one serves, a :class:`~pcdata.errors.SlowBackendWarning` says so once.
 
 ``@inner`` marks what only pcdata itself calls, with tensors that it has checked already (picking rows, moving points):
 kernels register beside it in the same way, but there is no contract to check and no ``backend`` to choose.
@@ -14,6 +15,8 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import multiprocessing
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
@@ -22,7 +25,7 @@ import torch
 from torch import Tensor
 
 from pcdata.checks import check_tensors, parse_spec
-from pcdata.errors import BackendError, DTypeError, near_matches
+from pcdata.errors import BackendError, DTypeError, SlowBackendWarning, near_matches
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -44,6 +47,7 @@ class Operation:
     specs: dict[str, str]
     reference: Callable[..., Any]
     public: Callable[..., Any]
+    gradient: bool = True  # whether results carry one to the inputs
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
 
 
@@ -51,10 +55,15 @@ OPERATIONS: dict[str, Operation] = {}
 INNER: dict[str, Operation] = {}
 
 
-def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def op(*, gradient: bool = True, **specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register the decorated reference as a public operation with a tensor contract per argument.
 
-    Row pointers given as None mean "one cloud" and reach the body as ``[0, N]``; float inputs must be finite.
+    Row pointers given as None mean "one cloud" and reach the body as ``[0, N]``; float inputs must be finite. Kernels
+    get contiguous tensors without a gradient, whatever the caller's look like.
+
+    Args:
+        gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
+        specs: argument name -> contract, see :mod:`pcdata.checks`.
     """
 
     def decorate(reference: Callable[P, R]) -> Callable[P, R]:
@@ -81,12 +90,18 @@ def op(**specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             check_tensors(name, arguments, ordered)
             backend = arguments.pop("backend", "auto")
             device = next(arguments[key].device for key in ordered if isinstance(arguments.get(key), Tensor))
-            if backend == "auto" and _wants_gradient(arguments.values()):
+            wants_gradient = gradient and _wants_gradient(arguments.values())
+            if backend == "auto" and wants_gradient:
                 backend = REFERENCE  # kernels know no derivative
-            body = _choose(operation, backend, device)
-            return body(**arguments)
+            body: Callable[..., R] = _choose(operation, backend, device)
+            is_kernel = body is not operation.reference
+            if gradient and not is_kernel:
+                return body(**arguments)
+            tidy = _plain if is_kernel else _detached
+            with torch.no_grad():
+                return body(**{key: tidy(value) for key, value in arguments.items()})
 
-        operation = OPERATIONS[name] = Operation(name, ordered, reference, public)
+        operation = OPERATIONS[name] = Operation(name, ordered, reference, public, gradient)
         return public
 
     return decorate
@@ -167,16 +182,55 @@ def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
             yield from _tensors_in(one)
 
 
+def _detached(value: Any) -> Any:
+    return value.detach() if isinstance(value, Tensor) and value.requires_grad else value
+
+
+def _plain(value: Any) -> Any:
+    """Return a tensor as kernels read memory: row after row, without gaps, and no part of a graph."""
+    return _detached(value).contiguous() if isinstance(value, Tensor) else value
+
+
+def first_live(device: torch.device, has_kernel: Callable[[str], bool]) -> str:
+    """Return the backend that ``auto`` takes: the first for the device that is live and has a kernel.
+
+    Warns:
+        SlowBackendWarning: once, if a faster one has a kernel but is absent.
+    """
+    for name in AUTO_ORDER.get(device.type, (REFERENCE,)):
+        if name == REFERENCE:
+            break
+        reason = why_unavailable(name)  # loads the kernels, if any
+        if not has_kernel(name):
+            continue
+        if reason is None:
+            return name
+        _warn_of_slow_bodies(reason)
+    return REFERENCE
+
+
+@functools.cache
+def _warn_of_slow_bodies(reason: str) -> None:
+    # A process that another one started (a loader's worker, a build's) leaves the word to that one.
+    if multiprocessing.parent_process() is None:
+        warnings.warn(
+            f"operations on the CPU run in plain torch, many times slower than compiled: {reason}",
+            SlowBackendWarning,
+            stacklevel=2,
+        )
+
+
+def warn_if_slow() -> None:
+    """Give the warning of :func:`first_live` now, where worker processes that stay silent are about to be started."""
+    if (reason := why_unavailable("cpu")) is not None:
+        _warn_of_slow_bodies(reason)
+
+
 def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:
     if backend == "auto":
-        candidates = AUTO_ORDER.get(device.type, (REFERENCE,))
-        backend = next(
-            name
-            for name in candidates
-            if name == REFERENCE or (why_unavailable(name) is None and name in operation.kernels)
-        )
+        backend = first_live(device, operation.kernels.__contains__)
     if backend == REFERENCE:
-        return functools.partial(_call_reference, operation.reference)
+        return operation.reference
     if backend not in BACKEND_MODULES:
         raise BackendError(
             f"{operation.name}: unknown backend {backend!r}; known: 'auto', {', '.join(map(repr, backends()))}"
@@ -188,7 +242,3 @@ def _choose(operation: Operation, backend: str, device: torch.device) -> Callabl
     if backend not in operation.kernels:
         raise BackendError(f"{operation.name}: backend {backend!r} has no kernel for it; use backend='auto'")
     return operation.kernels[backend]
-
-
-def _call_reference(reference: Callable[..., Any], *args: Any, **arguments: Any) -> Any:
-    return reference(*args, **arguments)

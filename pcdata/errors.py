@@ -88,6 +88,10 @@ class BackendError(PcdataError, RuntimeError):
     """A named backend is absent or cannot keep the contract for this call."""
 
 
+class SlowBackendWarning(UserWarning):
+    """A slow body serves because a fast one is absent; the message says why and what to do."""
+
+
 class MissingExtraError(PcdataError, ImportError):
     """An optional dependency is not installed, or cannot be loaded."""
 

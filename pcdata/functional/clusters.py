@@ -24,8 +24,7 @@ _PAIRS_PER_CHUNK = 1 << 15
 _ROWS_PER_CHUNK = 1 << 18
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def dbscan(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud

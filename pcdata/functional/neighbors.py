@@ -18,8 +18,7 @@ from pcdata.functional.nearest import nearest_chunks
 from pcdata.functional.parameters import check_grid, require_count, require_length
 
 
-@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", gradient=False)
 def knn(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -58,8 +57,7 @@ def knn(
     return index, distance
 
 
-@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", gradient=False)
 def ball_query(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud

@@ -18,8 +18,7 @@ from pcdata.functional.nearest import nearest_chunks
 from pcdata.functional.parameters import check_grid, require_count, require_length
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def estimate_normals(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud

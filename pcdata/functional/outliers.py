@@ -17,8 +17,7 @@ from pcdata.functional.parameters import check_grid, require_count, require_leng
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def statistical_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -74,8 +73,7 @@ def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
     return total
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def radius_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud

@@ -12,6 +12,9 @@ from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.ragged import counts_from_ptr
 
+# Kernels number the pixels of an image, with a margin around it, in 63 bits.
+_MOST_PIXELS = 2**31 - 1
+
 
 def require_count(where: str, name: str, value: int, *, minimum: int = 1) -> None:
     """Require a whole number of at least ``minimum``."""
@@ -42,13 +45,20 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
 
     Raises:
         ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
-            intrinsics or motions are not one per cloud.
+            intrinsics or motions are not one per cloud, or the image is no image.
+        DTypeError: its pixels are not int64.
         ConfigError: ``camera_from_points`` is not rigid.
         DeviceError: it is on another device.
     """
     if grid is None:
         return
     pixel, (height, width) = grid.pixel_index, grid.size
+    if pixel.dtype is not torch.int64:
+        raise DTypeError(f"{where}: grid.pixel_index must be int64, not {pixel.dtype}; convert it with .long()")
+    if not (height >= 0 and width >= 0 and height * width <= _MOST_PIXELS):
+        raise ShapeError(
+            f"{where}: grid.size must be (height, width) of at most {_MOST_PIXELS} pixels in all, got {grid.size}"
+        )
     if pixel.device != points.device:
         raise DeviceError(f"{where}: grid is on {pixel.device} but points is on {points.device}; move one with .to()")
     if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (len(ptr) - 1, 3, 3):

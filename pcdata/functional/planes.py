@@ -10,10 +10,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from pcdata.checks import count_true, equal_values
 from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional.parameters import require_count, require_length
+from pcdata.functional.ragged import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.functional.rigid import angle_between
 from pcdata.rng import seeded
 
@@ -21,12 +21,13 @@ from pcdata.rng import seeded
 _MAX_REFINEMENTS = 20
 # Hypotheses x points scored at once: 1 MB of distances stays in a CPU core's cache; a GPU wants fewer launches.
 _BLOCK = {"cpu": (64, 4096), "cuda": (64, 262144)}
-# A triangle this flat, in float32 steps of its largest coordinate, cannot be told from a line.
-_FLAT_STEPS = 8.0
+# A triangle this flat, 8 float32 steps of its largest coordinate, cannot be told from a line.
+FLAT = 8.0 * torch.finfo(torch.float32).eps
+# Planes drawn at a time, over all clouds: 32 MB.
+_MOST_HYPOTHESES = 1 << 20
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def ransac_plane(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -72,11 +73,17 @@ def ransac_plane(
 
 @dataclass(frozen=True)
 class PlaneWork:
-    """The parts of :func:`ransac_plane` that touch every point; a kernel brings its own."""
+    """The parts of :func:`ransac_plane` that touch every point, for all clouds at once; a kernel brings its own."""
 
-    count_inliers: Callable[[Tensor, Tensor, float], Tensor]  # points (N, 3), planes (P, 4), distance -> (P,) int64
-    inlier_mask: Callable[[Tensor, Tensor, float], Tensor]  # points (N, 3), plane (4,), distance -> (N,) bool
-    fit: Callable[[Tensor, Tensor], Tensor | None]  # points (N, 3), chosen (N,) bool -> plane (4,), as fit_plane
+    # points (N, 3), ptr (B+1,), triples (T, P, 3) of rows within a cloud, which of the T each cloud takes (B,) ->
+    # planes (B, P, 4) float64 on the CPU, as planes_through
+    draw: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+    # points, ptr, planes (B, P, 4), distance -> (B, P) int64 on the CPU; planes of NaN are near nothing
+    count_inliers: Callable[[Tensor, Tensor, Tensor, float], Tensor]
+    # points, ptr, planes (B, 4), distance -> (N,) bool
+    inlier_mask: Callable[[Tensor, Tensor, Tensor, float], Tensor]
+    # points, ptr, chosen (N,) bool -> planes (B, 4) on the CPU; NaN where the chosen lie on a line, as plane_of_moments
+    fit: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def search_planes(
@@ -94,21 +101,23 @@ def search_planes(
     _check_parameters(distance, num_hypotheses, max_tilt, up)
     seeds = _seed_per_cloud(seed, num_clouds)
     ups = _up_per_cloud(up, num_clouds)
-    planes = torch.zeros((num_clouds, 4), dtype=torch.float64, device="cpu")
-    inlier_masks = []
-    bounds = ptr.tolist()
-    for cloud, (start, stop) in enumerate(pairwise(bounds)):
-        if stop - start < 3:
-            raise TooFewPointsError(f"ransac_plane: a plane needs 3 points, cloud {cloud} has {stop - start}")
-        allowed = _tilt_test(ups[cloud], max_tilt)
-        own = points[start:stop]
-        hypotheses = _draw_planes(own, num_hypotheses, seeds[cloud])
-        where = f"ransac_plane: cloud {cloud}"
-        winner = _best_plane(own, hypotheses, allowed(hypotheses), distance, where, work)
-        plane, inlier_mask = _refine(own, winner, distance, allowed, work)
-        planes[cloud] = _face(plane, ups[cloud], distance)
-        inlier_masks.append(inlier_mask)
-    return planes.to(points.device), inlier_masks[0] if num_clouds == 1 else torch.cat(inlier_masks)
+    counts = counts_from_ptr(ptr).tolist()
+    for cloud, count in enumerate(counts):
+        if count < 3:
+            raise TooFewPointsError(f"ransac_plane: a plane needs 3 points, cloud {cloud} has {count}")
+    # Hypotheses of many clouds at a time, so that memory does not grow with their number.
+    at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
+    winners = []
+    for first in range(0, num_clouds, at_once):
+        some = slice(first, min(first + at_once, num_clouds))
+        own, own_ptr = _clouds_between(points, ptr, some.start, some.stop)
+        triples, which = _draw_triples(counts[some], num_hypotheses, seeds[some])
+        hypotheses = work.draw(own, own_ptr, triples, which)
+        allowed = _within_tilt(hypotheses, None if ups is None else ups[some, None], max_tilt)
+        near = work.count_inliers(own, own_ptr, hypotheses, distance)
+        winners.append(_best_planes(hypotheses, allowed, near, distance, first))
+    planes, inliers = _refine(points, ptr, torch.cat(winners), distance, ups, max_tilt, work)
+    return _face(planes, ups, distance).to(points.device), inliers
 
 
 def plane_distance(
@@ -141,37 +150,47 @@ def fit_plane(points: Tensor) -> Tensor | None:
     wide = points.double()
     centre = wide.mean(dim=0)
     centred = wide - centre
-    return plane_of_moments(centre.cpu(), ((centred.T @ centred) / len(points)).cpu(), wide.abs().max().cpu())
+    moments = centre.cpu(), ((centred.T @ centred) / len(points)).cpu(), wide.abs().max().cpu()
+    plane = plane_of_moments(*(moment[None] for moment in moments))[0]
+    return None if bool(plane[0].isnan()) else plane
 
 
 def plane_of_moments(
-    centre: Tensor,  # (3,) float64
-    covariance: Tensor,  # (3, 3) float64
-    largest: Tensor,  # () absolute coordinate
-) -> Tensor | None:  # (4,) float64
-    """Return the plane of :func:`fit_plane` from the moments of the points, all on the CPU."""
+    centre: Tensor,  # (B, 3) float64
+    covariance: Tensor,  # (B, 3, 3) float64
+    largest: Tensor,  # (B,) absolute coordinate
+) -> Tensor:  # (B, 4) float64
+    """Return the planes of :func:`fit_plane` from the moments of the points, all on the CPU; NaN for a line."""
     variance, directions = torch.linalg.eigh(covariance)
-    if float(variance[1].clamp(min=0).sqrt()) <= _flat_height(largest):
-        return None
-    normal = directions[:, 0]
-    return torch.cat([normal, -(normal @ centre)[None]])
+    on_line = variance[:, 1].clamp(min=0).sqrt() <= _flat_height(largest)
+    normal = directions[:, :, 0]
+    # Three products added in one order, whatever library multiplies matrices here.
+    x, y, z = (normal * centre).unbind(1)
+    planes = torch.cat([normal, -((x + z) + y)[:, None]], dim=1)
+    return planes.masked_fill(on_line[:, None], torch.nan)
 
 
-def _draw_planes(points: Tensor, count: int, seed: int) -> Tensor:
-    """Return (count, 4) float64 planes on the CPU through random triples; rows of a collinear triple are NaN."""
-    triples = _draw_triples(len(points), count, seed)
-    corners = points[triples.to(points.device)].cpu().double()
-    a, b, c = corners.unbind(1)
+def planes_through(corners: Tensor) -> Tensor:
+    """Return the (..., 4) float64 planes through (..., 3, 3) points on the CPU; NaN for those on a line."""
+    a, b, c = corners.double().unbind(-2)
     normal = torch.linalg.cross(b - a, c - a)
     length = normal.norm(dim=-1)
     longest = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)]).amax(0)
-    collinear = ~(length > longest * _flat_height(corners.abs().amax(dim=(1, 2))))
-    normal = normal / length[:, None]
-    planes = torch.cat([normal, -(normal * a).sum(-1, keepdim=True)], dim=1)
-    return planes.masked_fill(collinear[:, None], torch.nan)
+    collinear = ~(length > longest * _flat_height(corners.abs().amax(dim=(-1, -2)).double()))
+    normal = normal / length[..., None]
+    planes = torch.cat([normal, -(normal * a).sum(-1, keepdim=True)], dim=-1)
+    return planes.masked_fill(collinear[..., None], torch.nan)
 
 
-def _draw_triples(num_points: int, count: int, seed: int) -> Tensor:
+def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
+    """Draw the triples of every cloud, (T, P, 3) int64, and say which each takes, (B,): equal clouds share a draw."""
+    number: dict[tuple[int, int], int] = {}
+    which = [number.setdefault(draw, len(number)) for draw in zip(counts, seeds)]
+    drawn = [_triples_of(count, num_hypotheses, seed) for count, seed in number]
+    return torch.stack(drawn), torch.tensor(which, dtype=torch.int64, device="cpu")
+
+
+def _triples_of(num_points: int, count: int, seed: int) -> Tensor:
     """Draw (count, 3) indices, distinct within a row and uniform: each skips over those before it."""
     generator = seeded(seed)
     first, second, third = (
@@ -183,30 +202,39 @@ def _draw_triples(num_points: int, count: int, seed: int) -> Tensor:
     return torch.stack([first, second, third], dim=1)
 
 
-def _best_plane(
-    points: Tensor, planes: Tensor, allowed: Tensor, distance: float, where: str, work: PlaneWork
-) -> Tensor:
-    """Return the allowed plane with the most inliers, the earliest among equals."""
-    is_plane = ~planes[:, 0].isnan()
+def _draw(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
+    rows = triples[which] + ptr[:-1].cpu()[:, None, None]
+    return planes_through(points[rows.to(points.device)].cpu())
+
+
+def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: float, first_cloud: int) -> Tensor:
+    """Return each cloud's allowed plane with the most inliers, the earliest among equals, (B, 4)."""
+    is_plane = ~planes[..., 0].isnan()
     competes = is_plane & allowed
-    if not bool(competes.any()):
+    for cloud in (~competes.any(1)).nonzero().squeeze(1).tolist():
         reason = (
-            f"none of the {int(is_plane.sum())} planes found is within max_tilt of up; is up in the frame of the cloud?"
-            if bool(is_plane.any())
-            else f"all {len(planes)} triples drawn lie on a line"
+            f"none of the {int(is_plane[cloud].sum())} planes found is within max_tilt of up; is up in the frame of "
+            "the cloud?"
+            if bool(is_plane[cloud].any())
+            else f"all {planes.shape[1]} triples drawn lie on a line"
         )
-        raise NoPlaneError(f"{where}: {reason}")
-    candidates = planes[competes]
-    counts = work.count_inliers(points, candidates, distance)
-    best = int(counts.argmax())  # the first of equals, as torch documents
-    if int(counts[best]) < 3:
+        raise NoPlaneError(f"ransac_plane: cloud {first_cloud + cloud}: {reason}")
+    scores = counts.masked_fill(~competes, -1)
+    best = scores.argmax(1)  # the first of equals, as torch documents
+    for cloud in (scores.gather(1, best[:, None]) < 3).squeeze(1).nonzero().squeeze(1).tolist():
         raise NoPlaneError(
-            f"{where}: no plane has 3 points nearer than distance={distance:g}; is it in the right unit?"
+            f"ransac_plane: cloud {first_cloud + cloud}: no plane has 3 points nearer than distance={distance:g}; "
+            "is it in the right unit?"
         )
-    return candidates[best]
+    return planes[torch.arange(len(planes), device="cpu"), best]
 
 
-def _count_inliers(points: Tensor, planes: Tensor, distance: float) -> Tensor:
+def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    bounds = pairwise(ptr.tolist())
+    return torch.stack([_count_near(points[start:stop], own, distance) for (start, stop), own in zip(bounds, planes)])
+
+
+def _count_near(points: Tensor, planes: Tensor, distance: float) -> Tensor:
     """Count the points nearer than ``distance`` to each plane, in blocks: memory does not grow with the product."""
     counts = torch.zeros(len(planes), dtype=torch.float64, device=points.device)
     planes_per_block, points_per_block = _BLOCK.get(points.device.type, _BLOCK["cuda"])
@@ -225,55 +253,93 @@ def _count_inliers(points: Tensor, planes: Tensor, distance: float) -> Tensor:
 
 
 def _refine(
-    points: Tensor, plane: Tensor, distance: float, allowed: Callable[[Tensor], Tensor], work: PlaneWork
-) -> tuple[Tensor, Tensor]:
-    """Refit to the inliers until they no longer change; return the last allowed plane and its inliers."""
-    inliers = work.inlier_mask(points, plane, distance)
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,  # (B, 4)
+    distance: float,
+    ups: Tensor | None,
+    max_tilt: float | None,
+    work: PlaneWork,
+) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
+    """Refit to the inliers until they no longer change; return the last allowed planes and their inliers."""
+    inliers = work.inlier_mask(points, ptr, planes, distance)
+    unsettled = torch.arange(len(planes), device="cpu")  # clouds
+    rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(_MAX_REFINEMENTS):
-        refitted = work.fit(points, inliers)
-        if refitted is None or not bool(allowed(refitted)):
+        if len(unsettled) == 0:
             break
-        refitted_inliers = work.inlier_mask(points, refitted, distance)
-        if count_true(refitted_inliers) < 3:
-            break
-        settled = equal_values(refitted_inliers, inliers)
-        plane, inliers = refitted, refitted_inliers
-        if settled:
-            break
-    return plane, inliers
+        refitted = work.fit(own, own_ptr, before)
+        fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
+        after = work.inlier_mask(own, own_ptr, refitted, distance)
+        fits &= count_per_cloud(after, own_ptr) >= 3
+        settled = fits & (count_per_cloud(after != before, own_ptr) == 0)
+        planes[unsettled[fits]] = refitted[fits]
+        taken = fits.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
+        chosen = torch.where(taken, after, before)
+        if rows is None:
+            inliers = chosen
+        else:
+            inliers[rows] = chosen
+        open_ = fits & ~settled
+        if not bool(open_.all()):
+            kept = open_.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
+            rows = kept.nonzero().squeeze(1) if rows is None else rows[kept]
+            own, own_ptr = own[kept], ptr_from_counts(counts_from_ptr(own_ptr)[open_.to(own_ptr.device)])
+            chosen, unsettled = chosen[kept], unsettled[open_]
+        before = chosen
+    return planes, inliers
 
 
-def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
-    return plane_distance(points, plane[None])[0].abs_() < distance
+def _inlier_mask(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    bounds = pairwise(ptr.tolist())
+    near = [
+        plane_distance(points[start:stop], plane[None])[0].abs_() < distance
+        for (start, stop), plane in zip(bounds, planes)
+    ]
+    return torch.cat(near)
 
 
-def _face(plane: Tensor, up: Tensor | None, distance: float) -> Tensor:
-    """Turn the normal along ``up``, else towards an origin off the plane, else its largest component is positive."""
-    along_up = 0.0 if up is None else float(plane[:3] @ up)
-    towards_origin = 0.0 if through_origin(plane, distance) else float(plane[3])
-    deciding = [along_up, towards_origin, float(plane[:3][plane[:3].abs().argmax()])]
-    return -plane if next(value for value in deciding if value != 0.0) < 0 else plane
+def _fit(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
+    none = torch.full((4,), torch.nan, dtype=torch.float64, device="cpu")
+    fitted = (fit_plane(points[start:stop][chosen[start:stop]]) for start, stop in pairwise(ptr.tolist()))
+    return torch.stack([none if plane is None else plane for plane in fitted])
 
 
-def through_origin(plane: Tensor, distance: float) -> bool:
-    """Whether the origin is an inlier of a plane (4,): then no side of it can be told by where the origin lies."""
-    return abs(float(plane[3])) < distance
+def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple[Tensor, Tensor]:
+    """Return the clouds [first, stop) of a batch."""
+    own = ptr[first : stop + 1]
+    if stop - first == len(ptr) - 1:
+        return points, ptr
+    return points[int(own[0]) : int(own[-1])], own - own[0]
 
 
-def _tilt_test(up: Tensor | None, max_tilt: float | None) -> Callable[[Tensor], Tensor]:
-    """Return the test that (..., 4) planes must pass to compete."""
-    if up is None or max_tilt is None:
-        return lambda planes: torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")
+def _face(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
+    """Turn the normals along ``up``, else towards an origin off the plane, else the largest component is positive."""
+    normals, offset = planes[:, :3], planes[:, 3]
+    along_up = torch.zeros_like(offset) if ups is None else torch.linalg.vecdot(normals, ups)
+    towards_origin = torch.where(through_origin(planes, distance), 0.0, offset)
+    largest = normals.gather(1, normals.abs().argmax(1, keepdim=True)).squeeze(1)
+    sign = torch.zeros_like(offset)
+    for deciding in (along_up, towards_origin, largest):
+        sign = torch.where(sign == 0, deciding.sign(), sign)
+    return torch.where((sign < 0)[:, None], -planes, planes)
 
-    def within_tilt(planes: Tensor) -> Tensor:
-        angle = angle_between(planes[..., :3], up)
-        return torch.minimum(angle, math.pi - angle) <= max_tilt
 
-    return within_tilt
+def through_origin(planes: Tensor, distance: float) -> Tensor:
+    """Whether the origin is an inlier of planes (..., 4): then no side of it can be told by where the origin lies."""
+    return planes[..., 3].abs() < distance
+
+
+def _within_tilt(planes: Tensor, ups: Tensor | None, max_tilt: float | None) -> Tensor:
+    """Say which (..., 4) planes may compete."""
+    if ups is None or max_tilt is None:
+        return torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")
+    angle = angle_between(planes[..., :3], ups)
+    return torch.minimum(angle, math.pi - angle) <= max_tilt
 
 
 def _flat_height(largest: Tensor) -> Tensor:
-    return _FLAT_STEPS * torch.finfo(torch.float32).eps * largest
+    return FLAT * largest
 
 
 def _check_parameters(
@@ -299,9 +365,10 @@ def _seed_per_cloud(seed: int | Sequence[int] | Tensor, num_clouds: int) -> list
     return seeds
 
 
-def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> list[Tensor | None]:
+def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> Tensor | None:
+    """Return the (B, 3) float64 unit vectors that are up, on the CPU."""
     if up is None:
-        return [None] * num_clouds
+        return None
     directions = torch.as_tensor(up, dtype=torch.float64, device="cpu")
     if directions.shape == (3,):
         directions = directions.expand(num_clouds, 3)
@@ -310,7 +377,7 @@ def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> list[
     lengths = directions.norm(dim=1)
     if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
         raise ConfigError("ransac_plane: up must be finite and not zero")
-    return list((directions / lengths[:, None]).unbind(0))
+    return directions / lengths[:, None]
 
 
-_TORCH_WORK = PlaneWork(_count_inliers, _inlier_mask, lambda points, inliers: fit_plane(points[inliers]))
+_TORCH_WORK = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)

@@ -14,6 +14,9 @@ from torch import Tensor
 from pcdata.checks import count_true
 from pcdata.dispatch import inner
 
+# Up to here a look at each cloud by itself costs less than running totals of all rows.
+_FEW_CLOUDS = 64
+
 
 def counts_from_ptr(ptr: Tensor) -> Tensor:
     """Return the (B,) number of rows of every cloud."""
@@ -36,10 +39,16 @@ def cloud_of_rows(ptr: Tensor) -> Tensor:
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
-    if mask.device.type == "cpu":
-        return ptr_from_counts([count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())])
-    kept = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
-    return kept[ptr]
+    return ptr_from_counts(count_per_cloud(mask, ptr))
+
+
+def count_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
+    """Return the (B,) number of true rows of every cloud for a (N,) bool mask."""
+    if mask.device.type == "cpu" and len(ptr) <= _FEW_CLOUDS:
+        counts = [count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())]
+        return torch.tensor(counts, dtype=torch.int64, device="cpu")
+    before = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
+    return counts_from_ptr(before[ptr])
 
 
 @inner
@@ -72,6 +81,18 @@ def padding_of(dtype: torch.dtype) -> int:
     return -1 if dtype in (torch.int16, torch.int32, torch.int64) else 0
 
 
+def first_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
+    """Return the (B,) first true row of every cloud for a (N,) bool mask; its first row where none is true."""
+    if mask.device.type == "cpu" and len(ptr) <= _FEW_CLOUDS:
+        flags = mask.numpy()
+        first = [start + int(flags[start:stop].argmax()) for start, stop in pairwise(ptr.tolist())]
+        return torch.tensor(first, dtype=torch.int64, device="cpu")
+    rows = mask.nonzero().squeeze(1)
+    place = torch.searchsorted(rows, ptr[:-1])
+    found = rows[place.clamp(max=len(rows) - 1)] if len(rows) else ptr[:-1]
+    return torch.where((place < len(rows)) & (found < ptr[1:]), found, ptr[:-1])
+
+
 def segment_sum(values: Tensor, ptr: Tensor) -> Tensor:
     """Sum (N, ...) rows per cloud into (B, ...), in float64 for floats; an empty cloud sums to 0."""
     wide = values.double() if values.dtype.is_floating_point else values
@@ -86,7 +107,23 @@ def segment_mean(values: Tensor, ptr: Tensor) -> Tensor:
 
 
 def segment_max(values: Tensor, ptr: Tensor) -> Tensor:
-    """Take the maximum of (N,) values per cloud; an empty cloud gives the dtype's lowest value."""
+    """Take the maximum of (N, ...) values per cloud; an empty cloud gives the dtype's lowest value."""
     info = torch.finfo(values.dtype) if values.dtype.is_floating_point else torch.iinfo(values.dtype)
-    lowest = torch.full((len(ptr) - 1,), info.min, dtype=values.dtype, device=values.device)
-    return lowest.scatter_reduce_(0, cloud_of_rows(ptr), values, "amax")
+    return _segment_extreme(values, ptr, "amax", info.min)
+
+
+def segment_min(values: Tensor, ptr: Tensor) -> Tensor:
+    """Take the minimum of (N, ...) values per cloud; an empty cloud gives the dtype's highest value."""
+    info = torch.finfo(values.dtype) if values.dtype.is_floating_point else torch.iinfo(values.dtype)
+    return _segment_extreme(values, ptr, "amin", info.max)
+
+
+def _segment_extreme(values: Tensor, ptr: Tensor, reduce: str, empty: float) -> Tensor:
+    found = torch.full((len(ptr) - 1, *values.shape[1:]), empty, dtype=values.dtype, device=values.device)
+    if len(ptr) <= _FEW_CLOUDS:  # each at the speed of memory
+        for row, start, stop in zip(found, ptr.tolist(), ptr[1:].tolist()):
+            if stop > start:
+                row.copy_(values[start:stop].amax(0) if reduce == "amax" else values[start:stop].amin(0))
+        return found
+    cloud = cloud_of_rows(ptr).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
+    return found.scatter_reduce_(0, cloud, values, reduce)

@@ -95,7 +95,7 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
     """
     if pose.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: a pose must be (..., 4, 4), got {tuple(pose.shape)}")
-    flat = pose.double().reshape(-1, 4, 4)
+    flat = pose.detach().double().reshape(-1, 4, 4)
     for index, matrix in enumerate(flat):
         name = f"{where}: pose {index}" if len(flat) > 1 else f"{where}: the pose"
         if not bool(torch.isfinite(matrix).all()):

@@ -16,8 +16,7 @@ from pcdata.rng import seeded
 _TILE = 1024
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def farthest_point_sample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)

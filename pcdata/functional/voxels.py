@@ -7,9 +7,9 @@ The grid is Open3D's: per cloud, it starts half a voxel below the lowest corner,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +17,7 @@ from pcdata.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
 from pcdata.functional.groups import group_count, group_first, group_sum
 from pcdata.functional.parameters import require_count
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts, segment_max, segment_min
 
 # Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
 # A sum fits 63 bits for up to 2^32 points.
@@ -25,7 +25,7 @@ _FIXED_POINT = 2.0**31
 # Beyond this, float64 no longer tells neighbouring voxels apart.
 _MAX_VOXELS_PER_AXIS = 2.0**53
 # find_voxel_size stops when the bracket is this tight; 25 halvings away from a bracket of one octave.
-_SIZE_TOLERANCE = 1e-6
+SIZE_TOLERANCE = 1e-6
 
 
 @op(points="N 3", ptr="ptr N B")
@@ -69,8 +69,7 @@ def voxel_downsample(
     return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
 
 
-@op(points="N 3", ptr="ptr N B")
-@torch.no_grad()
+@op(points="N 3", ptr="ptr N B", gradient=False)
 def find_voxel_size(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -89,35 +88,31 @@ def find_voxel_size(
     """
     assert ptr is not None
     require_count("find_voxel_size", "num_points", num_points)
-    return search_voxel_sizes(points, ptr, num_points, count_voxels, count_distinct)
-
-
-def search_voxel_sizes(
-    points: Tensor,
-    ptr: Tensor,
-    num_points: int,
-    voxels: Callable[[Tensor, float], int],  # count_voxels or its kernel
-    distinct: Callable[[Tensor], int],  # count_distinct or its kernel
-) -> Tensor:  # (B,) float64
-    """Run :func:`find_voxel_size` with the given ways to count: the search is the same for all kernels."""
-    sizes = [
-        _search_size(points[start:stop], num_points, cloud, voxels, distinct)
-        for cloud, (start, stop) in enumerate(pairwise(ptr.tolist()))
-    ]
-    return torch.tensor(sizes, dtype=torch.float64, device=points.device)
-
-
-def count_voxels(points: Tensor, voxel_size: float) -> int:
-    """Return how many points :func:`voxel_downsample` leaves of one cloud."""
-    ptr = torch.tensor([0, len(points)], dtype=torch.int64, device=points.device)
-    cloud, _, scaled = _scale_to_grid(points, ptr, sizes_per_cloud("count_voxels", voxel_size, ptr))
-    return _rank(_voxel_keys(cloud, scaled.floor(), 1))[1]
-
-
-def count_distinct(points: Tensor) -> int:
-    """Return the number of different points of one cloud."""
-    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
-    return _rank(_voxel_keys(torch.zeros_like(ranks[:, 0]), ranks, 1))[1]
+    _require_distinct(points, ptr, num_points)
+    extent = (segment_max(points, ptr).double() - segment_min(points, ptr)).amax(1)
+    too_large = torch.where(extent > 0, 3.0 * extent, 1.0)  # everything lies in one voxel
+    if num_points == 1:
+        return too_large
+    # Bisect, all clouds at once, on a logarithmic scale between a size that leaves enough points and one that leaves
+    # too few.
+    # Right for a surface, up to a factor. (Torch multiplies by the reciprocal of a number, which rounds twice.)
+    enough = extent / torch.full_like(extent, math.sqrt(num_points))
+    count = torch.zeros_like(ptr[1:])
+    open_ = torch.ones_like(count, dtype=torch.bool)
+    while bool(open_.any()):
+        count[open_] = _count_voxels(points, ptr, enough, open_)
+        open_ &= count < num_points
+        too_large = torch.where(open_, enough, too_large)
+        enough = torch.where(open_, enough / 2, enough)
+    while bool((open_ := (count > num_points) & (too_large > enough * (1 + SIZE_TOLERANCE))).any()):
+        middle = _square_root(enough * too_large)
+        found = count.clone()
+        found[open_] = _count_voxels(points, ptr, middle, open_)
+        leaves_enough = open_ & (found >= num_points)
+        enough = torch.where(leaves_enough, middle, enough)
+        count = torch.where(leaves_enough, found, count)
+        too_large = torch.where(open_ & ~leaves_enough, middle, too_large)
+    return enough
 
 
 def voxel_mean(
@@ -181,35 +176,34 @@ def voxel_minimum(
     return lowest.scatter_reduce_(0, inverse, values.long(), "amin", include_self=False).to(values.dtype)
 
 
-def _search_size(
-    points: Tensor,
-    num_points: int,
-    cloud: int,
-    voxels: Callable[[Tensor, float], int],
-    distinct: Callable[[Tensor], int],
-) -> float:
-    """Bisect on a logarithmic scale between a size that leaves enough points and one that leaves too few."""
-    available = distinct(points) if len(points) >= num_points else len(points)
-    if available < num_points:
+def _square_root(values: Tensor) -> Tensor:
+    """Return float64 square roots, correctly rounded: torch's own may be one unit off."""
+    return torch.from_numpy(np.sqrt(values.cpu().numpy())).to(values.device)
+
+
+def _count_voxels(points: Tensor, ptr: Tensor, sizes: Tensor, open_: Tensor) -> Tensor:
+    """Return how many points :func:`voxel_downsample` leaves of each open cloud, for (B,) sizes, open_ (B,) bool."""
+    if not bool(open_.all()):
+        counts = torch.where(open_, counts_from_ptr(ptr), 0)
+        points, ptr = points[open_[cloud_of_rows(ptr)]], ptr_from_counts(counts)
+    cloud, _, scaled = _scale_to_grid(points, ptr, sizes)
+    return _distinct_per_cloud(cloud, scaled.floor(), len(sizes))[open_]
+
+
+def _require_distinct(points: Tensor, ptr: Tensor, num_points: int) -> None:
+    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
+    available = _distinct_per_cloud(cloud_of_rows(ptr), ranks, len(ptr) - 1)
+    for cloud in (available < num_points).nonzero().squeeze(1).tolist():
         raise TooFewPointsError(
-            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {available} distinct ones; "
-            "ask for fewer (num_points), or give it more points, as by a wider crop"
+            f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {int(available[cloud])} "
+            "distinct ones; ask for fewer (num_points), or give it more points, as by a wider crop"
         )
-    extent = float((points.amax(0).double() - points.amin(0)).max())
-    too_large = 3.0 * extent or 1.0  # everything lies in one voxel
-    if num_points == 1:
-        return too_large
-    enough = extent / math.sqrt(num_points)  # right for a surface, up to a factor
-    while (count := voxels(points, enough)) < num_points:
-        enough, too_large = enough / 2, enough
-    while count > num_points and too_large > enough * (1 + _SIZE_TOLERANCE):
-        middle = math.sqrt(enough * too_large)
-        middle_count = voxels(points, middle)
-        if middle_count >= num_points:
-            enough, count = middle, middle_count
-        else:
-            too_large = middle
-    return enough
+
+
+def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
+    """Count the different rows of voxel (N, 3, not negative) in each cloud, (B,) int64."""
+    rank, distinct = _rank(_voxel_keys(cloud, voxel, num_clouds))
+    return group_count(cloud[group_first(rank, distinct)], num_clouds)
 
 
 def sizes_per_cloud(where: str, voxel_size: float | Sequence[float] | Tensor, ptr: Tensor) -> Tensor:
@@ -234,12 +228,7 @@ def _scale_to_grid(points: Tensor, ptr: Tensor, sizes: Tensor) -> tuple[Tensor, 
     """Return each row's cloud (N,), the grids' origins (B, 3), and the points in voxels from there (N, 3); float64."""
     cloud = cloud_of_rows(ptr)
     wide = points.double()
-    lowest = wide.new_zeros((len(ptr) - 1, 3))
-    bounds = ptr.tolist()
-    for one, (start, stop) in enumerate(pairwise(bounds)):
-        if stop > start:
-            lowest[one] = wide[start:stop].amin(0)
-    origin = lowest - sizes[:, None] / 2
+    origin = segment_min(wide, ptr) - sizes[:, None] / 2
     scaled = (wide - origin[cloud]) / sizes[cloud, None]
     if len(points) and float(scaled.max()) >= _MAX_VOXELS_PER_AXIS:
         worst = int(cloud[scaled.amax(1).argmax()])

@@ -13,9 +13,10 @@ from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView
-from pcdata.kernels.native import call, room_for
+from pcdata.kernels.native import address, addresses, call, room, room_for
 
 _FEWEST_SLOTS = 1 << 12  # of a table of rows
+_MOST_PIXELS = 2**31 - 1  # of an image: the core numbers them with an int32
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
@@ -23,8 +24,8 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     """Collect keys in one hash table per thread; sorted, they do not depend on the threads."""
     height, width = view.depth.shape
     offsets = integrate.band(grid)
-    found = torch.empty(height * width * len(offsets), dtype=torch.int64)  # what is not written never becomes memory
-    count = torch.empty(1, dtype=torch.int64)
+    found = room(height * width * len(offsets), torch.int64)  # what is not written never becomes memory
+    count = room(1, torch.int64)
     turn, fraction, camera = integrate.camera_in_blocks(view, grid)
     images = (view.depth.contiguous(), view.rays.contiguous(), height, width)
     call("pc_tsdf_touched", *images, turn, fraction, camera, offsets, len(offsets), found, count)
@@ -35,7 +36,7 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
 
 def pack_colors(colors: Tensor) -> Tensor:
     """Pack pixels on this thread: torch's threads would spin where the next steps want to work."""
-    packed = torch.empty(colors.shape[:-1], dtype=torch.int32)
+    packed = room(colors.shape[:-1], torch.int32)
     call("pc_tsdf_pack_colors", colors.contiguous(), packed.numel(), packed)
     return packed
 
@@ -45,7 +46,7 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
     if blocks.table is None or 2 * len(blocks) > len(blocks.table):
         slots = max(_FEWEST_SLOTS, 1 << (4 * len(blocks) - 1).bit_length())
         blocks.table, blocks.in_table = torch.from_numpy(np.full(slots, -1, np.int32)), 0
-    rows, missing, count = torch.empty_like(keys), torch.empty_like(keys), torch.empty(1, dtype=torch.int64)
+    rows, missing, count = room(keys.shape, torch.int64), room(keys.shape, torch.int64), room(1, torch.int64)
     table = (blocks.keys, len(blocks), blocks.table, len(blocks.table), blocks.in_table)
     call("pc_tsdf_find", *table, keys.contiguous(), len(keys), rows, missing, count)
     blocks.in_table = len(blocks)
@@ -54,9 +55,11 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
 
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
     """Update every block on its own, 4, 8 or 16 voxels at a time."""
+    if view.depth.numel() > _MOST_PIXELS:
+        return integrate.integrate_view(blocks, rows, view, grid, carve=carve)
     lens = None
     if view.distortion is not None:
-        lens = torch.cat([view.distortion.float(), torch.tensor([view.fold], dtype=torch.float32)])
+        lens = torch.cat([view.distortion.float(), view.depth.new_tensor([view.fold])])
     height, width = view.depth.shape
     planes, kept = plane_addresses(blocks)
     images = [None if one is None else one.contiguous() for one in (view.weight, view.color, view.label)]
@@ -69,9 +72,9 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
         integrate.image_from_world(view).contiguous(),
         grid.block_size,
         integrate.voxel_steps(view, grid).contiguous(),
-        torch.tensor(view.pinhole, dtype=torch.float32),
+        view.depth.new_tensor(view.pinhole),
         lens,
-        float(torch.tensor(TSDF_SCALE / grid.truncation, dtype=torch.float32)),
+        float(np.float32(TSDF_SCALE / grid.truncation)),
         int(carve),
         rows,
         len(rows),
@@ -86,7 +89,7 @@ def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1,
     count = len(blocks)
     planes, kept = plane_addresses(blocks)
     field = (blocks.sorted_keys, blocks.sorted_rows, count, planes, min(min_weight - 1, MAX_WEIGHT))
-    counts, dropped = torch.empty(count, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
+    counts, dropped = room(count, torch.int64), room(1, torch.int64)
     call("pc_tsdf_count_crossings", *field, counts, dropped)
     starts = ptr_from_counts(counts)
     found = _room_for_crossings(int(starts[-1]), int(dropped), blocks, edges)
@@ -125,13 +128,13 @@ def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) ->
     """Pack the signs of every block into words, count its triangles, write them, and number the vertices in use."""
     count, keys = len(blocks), blocks.sorted_keys
     planes, kept = plane_addresses(blocks)
-    signs, edges = torch.empty((count, 16), dtype=torch.int64), torch.empty((count, 32), dtype=torch.int64)
+    signs, edges = room((count, 16), torch.int64), room((count, 32), torch.int64)
     bound = min(min_weight - 1, MAX_WEIGHT)
     call("pc_tsdf_index_mesh", keys, blocks.sorted_rows, count, planes, bound, edge, len(edge), signs, edges)
     del kept  # until here the addresses are good
     first, corner, axis = marching.tensor_tables(edge.device)
     mesh = (keys, count, signs, edges, first, 3 * corner + axis)
-    counts, is_used = torch.empty(count, dtype=torch.int64), torch.zeros(len(edge), dtype=torch.bool)
+    counts, is_used = room(count, torch.int64), torch.zeros(len(edge), dtype=torch.bool, device="cpu")
     call("pc_tsdf_count_triangles", *mesh, counts)
     starts = ptr_from_counts(counts)
     (triangles,) = room_for(((int(starts[-1]), 3), torch.int64))
@@ -143,12 +146,12 @@ def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) ->
 def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
     """Return the core's table of planes, (6,) addresses of arrays of chunk addresses, and what keeps these alive."""
     kept = []
-    table = torch.zeros(len(_PLANES), dtype=torch.int64)
+    table = torch.zeros(len(_PLANES), dtype=torch.int64, device="cpu")
     for place, name in enumerate(_PLANES):
         chunks = [getattr(chunk, name) for chunk in blocks.chunks]
         if chunks and chunks[0] is not None:
-            kept.append(torch.tensor([plane.data_ptr() for plane in chunks], dtype=torch.int64))
-            table[place] = kept[-1].data_ptr()
+            kept.append(addresses(chunks))
+            table[place] = address(kept[-1])
     return table, kept
 
 

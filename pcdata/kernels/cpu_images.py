@@ -15,14 +15,14 @@ from torch import Tensor
 
 from pcdata.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth import Deprojected, check_intrinsics
-from pcdata.kernels.native import addresses, call, room_for
+from pcdata.kernels.native import addresses, call, numbers, room, room_for
 from pcdata.kernels.rays import Rays, rays_of_cameras
 
 
 @kernel("mask_depth", "cpu")
 def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tensor | None) -> Tensor:
     """Decide and write in one pass."""
-    if mask is not None and mask.shape != depth.shape:
+    if mask is not None and (mask.shape != depth.shape or mask.dtype is not torch.bool):
         return INNER["mask_depth"].reference(depth, near, far, mask)
     masked = torch.empty_like(depth, memory_format=torch.contiguous_format)
     limits = _limits(near, far)
@@ -50,6 +50,8 @@ def deproject_images(
     images: Mapping[str, Tensor],
 ) -> Deprojected:
     """Write the points and all that goes along with them."""
+    if not _fit(depth, intrinsics, distortion, colors, images):
+        return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
     cameras = _Cameras.of(depth, intrinsics, distortion)
     chosen = cameras.choose()
     if chosen is None:
@@ -73,10 +75,16 @@ def deproject_into_box(
     mask: Tensor | None,
 ) -> tuple[Deprojected, Tensor] | None:
     """Write only what is inside the box."""
-    cameras = _Cameras.of(depth, intrinsics, distortion)
-    matrix = None if matrix is None else matrix.double().contiguous()
-    corners = depth.new_tensor(lower), depth.new_tensor(upper)
-    chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
+    chosen = None
+    if (
+        _fit(depth, intrinsics, distortion, colors, images)
+        and (mask is None or (mask.shape == depth.shape and mask.dtype is torch.bool))
+        and (matrix is None or matrix.shape == (len(depth), 4, 4))
+    ):
+        cameras = _Cameras.of(depth, intrinsics, distortion)
+        matrix = None if matrix is None else matrix.double().contiguous()
+        corners = depth.new_tensor(lower), depth.new_tensor(upper)
+        chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
     if chosen is None:
         region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
         return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
@@ -116,9 +124,9 @@ class _Cameras:
         if self.depth.numel() == 0:
             return None
         views, height, width = self.depth.shape
-        keep = torch.empty(self.depth.shape, dtype=torch.bool)
-        readings, possible = torch.empty(views, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
-        starts = torch.empty(views * height + 1, dtype=torch.int64)
+        keep = room(self.depth.shape, torch.bool)
+        readings, possible = room(views, torch.int64), room(1, torch.int64)
+        starts = room(views * height + 1, torch.int64)
         call(
             "pc_choose_pixels",
             *(self.depth, views, height, width, *self.rays),
@@ -147,17 +155,29 @@ class _Cameras:
         ]
         copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
         points, pixel_index, rgb, *rows = room_for(*core, *copied)
-        pixel_bytes = torch.tensor(
-            [image.nbytes // self.depth.numel() for image in sources.values()], dtype=torch.int64
-        )
+        pixel_bytes = numbers(image.nbytes // self.depth.numel() for image in sources.values())
         call(
             "pc_deproject",
             *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
             *(points, pixel_index, over_all_views, _contiguous(colors), rgb),
             *(len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)),
         )
-        ptr = chosen.starts[torch.arange(views + 1) * height]
+        ptr = chosen.starts[::height].clone()
         return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+
+
+def _fit(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+) -> bool:
+    """Whether the core may read as many cameras and pixels as there are depths: the callers are not all checked."""
+    views = len(depth)
+    cameras = intrinsics.shape == (views, 3, 3) and (distortion is None or len(distortion) == views)
+    rgb = colors is None or (colors.shape == (*depth.shape, 3) and colors.dtype is torch.uint8)
+    return cameras and rgb and all(image.shape[:3] == depth.shape for image in images.values())
 
 
 def _limits(near: float | None, far: float | None) -> tuple[float, float]:

@@ -6,23 +6,25 @@ first. Results are those of the references: the same neighbours in the same orde
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import kernel
+from pcdata.dispatch import OPERATIONS, kernel
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud, require_points
 from pcdata.functional.nearest import largest_squared
 from pcdata.functional.neighbors import check_ball_query, check_neighbors
 from pcdata.functional.parameters import check_grid, require_count, require_length, require_positive
-from pcdata.kernels.native import call
+from pcdata.kernels.cpu_grid import grid_arguments
+from pcdata.kernels.native import call, room
 
-# The core keeps rows in 31 bits.
+# The core keeps rows, and numbers of neighbours, in 31 bits.
 _MAX_ROWS = 2**31 - 1
 
 
 @kernel("knn", "cpu")
-@torch.no_grad()
 def knn(
     *,
     points: Tensor,
@@ -35,12 +37,13 @@ def knn(
     """Run the reference's contract in the core."""
     check_neighbors("knn", points, ptr, queries, queries_ptr, grid)
     require_count("knn", "k", k)
+    if k > _MAX_ROWS:
+        return _reference("knn", points, ptr, k=k, queries=queries, queries_ptr=queries_ptr, grid=grid)
     index, distance, _ = _neighbors(points, ptr, k, None, queries, queries_ptr, grid, counted=False)
     return index, distance
 
 
 @kernel("ball_query", "cpu")
-@torch.no_grad()
 def ball_query(
     *,
     points: Tensor,
@@ -53,6 +56,9 @@ def ball_query(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run the reference's contract in the core."""
     check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
+    if max_neighbors > _MAX_ROWS:
+        limits = {"radius": radius, "max_neighbors": max_neighbors}
+        return _reference("ball_query", points, ptr, **limits, queries=queries, queries_ptr=queries_ptr, grid=grid)
     index, distance, count = _neighbors(
         points, ptr, max_neighbors, float(radius), queries, queries_ptr, grid, counted=True
     )
@@ -61,7 +67,6 @@ def ball_query(
 
 
 @kernel("chamfer_distance", "cpu")
-@torch.no_grad()
 def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
     """Run the reference's contract in the core, without gradients."""
     require_points(ptr_a, ptr_b)
@@ -70,7 +75,6 @@ def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b
 
 
 @kernel("statistical_outlier_mask", "cpu")
-@torch.no_grad()
 def statistical_outlier_mask(
     *, points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None
 ) -> Tensor:
@@ -80,18 +84,17 @@ def statistical_outlier_mask(
     require_positive(where, "std_ratio", std_ratio)
     check_grid(where, grid, points, ptr)
     points, ptr = _rows(points, ptr)
-    mean = torch.empty(len(points), dtype=torch.float64)
-    outlier = torch.empty(len(points), dtype=torch.bool)
+    mean = room(len(points), torch.float64)
+    outlier = room(len(points), torch.bool)
     call(
         "pc_statistical_outliers",
-        *(points, ptr, len(ptr) - 1, num_neighbors, float(std_ratio)),
-        *(*_grid(grid), mean, outlier),
+        *(points, ptr, len(ptr) - 1, _reachable(num_neighbors, points), float(std_ratio)),
+        *(*grid_arguments(grid), mean, outlier),
     )
     return outlier
 
 
 @kernel("estimate_normals", "cpu")
-@torch.no_grad()
 def estimate_normals(
     *, points: Tensor, ptr: Tensor, radius: float, max_neighbors: int, grid: ImageGrid | None
 ) -> Tensor:
@@ -100,8 +103,9 @@ def estimate_normals(
     require_count("estimate_normals", "max_neighbors", max_neighbors)
     check_grid("estimate_normals", grid, points, ptr)
     points, ptr = _rows(points, ptr)
-    normals = torch.empty_like(points)
-    call("pc_normals", points, ptr, len(ptr) - 1, max_neighbors, _limit(float(radius)), *_grid(grid), normals)
+    normals = room(points.shape, points.dtype)
+    most = _reachable(max_neighbors, points)
+    call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(float(radius)), *grid_arguments(grid), normals)
     return normals
 
 
@@ -122,13 +126,13 @@ def _neighbors(
         assert queries_ptr is not None
         queries, queries_ptr = _rows(queries, queries_ptr)
         num_queries = len(queries)
-    index = torch.empty((num_queries, k), dtype=torch.int64)
-    distance = torch.empty((num_queries, k), dtype=torch.float32)
-    count = torch.empty(num_queries, dtype=torch.int64) if counted else None
+    index = room((num_queries, k), torch.int64)
+    distance = room((num_queries, k), torch.float32)
+    count = room(num_queries, torch.int64) if counted else None
     call(
         "pc_neighbors",
         *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, _limit(radius)),
-        *(*_grid(grid), index, distance, count),
+        *(*grid_arguments(grid), index, distance, count),
     )
     return index, distance, count
 
@@ -137,7 +141,7 @@ def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: 
     """Return (B,) float64: the mean (squared) distance from every query to the nearest point of its cloud."""
     points, ptr = _rows(points, ptr)
     queries, queries_ptr = _rows(queries, queries_ptr)
-    distance = torch.empty(len(queries), dtype=torch.float32)
+    distance = room(len(queries), torch.float32)
     call("pc_nearest_squared", points, ptr, len(ptr) - 1, queries, queries_ptr, distance)
     return mean_per_cloud(distance if squared else distance.sqrt_(), queries_ptr)
 
@@ -148,13 +152,14 @@ def _rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
     return points.detach().contiguous(), ptr.contiguous()
 
 
+def _reachable(count: int, points: Tensor) -> int:
+    """Return a number of neighbours that gives the same answer and fits the 31 bits of the core."""
+    return min(count, max(1, len(points)))
+
+
+def _reference(operation: str, *args: Any, **kwargs: Any) -> Any:
+    return OPERATIONS[operation].reference(*args, **kwargs)
+
+
 def _limit(radius: float | None) -> float:
     return float(largest_squared(radius, torch.device("cpu")))
-
-
-def _grid(grid: ImageGrid | None) -> tuple[Tensor | None, int, Tensor | None]:
-    """Return what the core wants of a grid: pixels, width, motions into the cameras' frames."""
-    if grid is None:
-        return None, 0, None
-    motion = grid.camera_from_points
-    return grid.pixel_index.long().contiguous(), grid.size[1], None if motion is None else motion.double().contiguous()

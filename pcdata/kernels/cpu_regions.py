@@ -12,11 +12,11 @@ from pcdata.dispatch import kernel
 from pcdata.functional.cells import require_cells
 from pcdata.functional.grid import ImageGrid
 from pcdata.functional.parameters import check_grid, require_count, require_length
-from pcdata.kernels import native
+from pcdata.kernels.cpu_grid import grid_arguments
+from pcdata.kernels.native import call, room
 
 
 @kernel("radius_outlier_mask", "cpu")
-@torch.no_grad()
 def radius_outlier_mask(
     points: Tensor, ptr: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
 ) -> Tensor:
@@ -25,18 +25,17 @@ def radius_outlier_mask(
     require_count(where, "min_neighbors", min_neighbors)
     require_length(where, "radius", radius)
     check_grid(where, grid, points, ptr)
-    outlier = torch.empty(len(points), dtype=torch.bool)
-    largest = torch.zeros(1, dtype=torch.float64)
+    outlier = room(len(points), torch.bool)
+    largest = room(1, torch.float64)
     enough = min(min_neighbors, len(points))  # as unreachable as any larger number, and fits an int64
-    native.call(
+    call(
         "pc_radius_outlier_mask",
         points.contiguous(),
         ptr.contiguous(),
         len(ptr) - 1,
         float(radius),
         enough,
-        None if grid is None else grid.pixel_index.contiguous(),
-        0 if grid is None else grid.size[1],
+        *grid_arguments(grid)[:2],
         outlier,
         largest,
     )
@@ -45,15 +44,14 @@ def radius_outlier_mask(
 
 
 @kernel("dbscan", "cpu")
-@torch.no_grad()
 def dbscan(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
     """Join cells that hold core points, then number the clusters and label their borders."""
     require_count("dbscan", "min_points", min_points)
     require_length("dbscan", "eps", eps)
     check_grid("dbscan", grid, points, ptr)
-    label = torch.empty(len(points), dtype=torch.int64)
-    largest = torch.zeros(1, dtype=torch.float64)
+    label = room(len(points), torch.int64)
+    largest = room(1, torch.float64)
     enough = min(min_points, len(points) + 1)
-    native.call("pc_dbscan", points.contiguous(), ptr.contiguous(), len(ptr) - 1, float(eps), enough, label, largest)
+    call("pc_dbscan", points.contiguous(), ptr.contiguous(), len(ptr) - 1, float(eps), enough, label, largest)
     require_cells("dbscan", eps, largest.item())
     return label

@@ -8,8 +8,11 @@ from torch import Tensor
 from pcdata.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth_registration import RegisteredDepth, check_registration, half_pixels
 from pcdata.functional.lens import fold_radius
-from pcdata.kernels.native import call, room_for
+from pcdata.kernels.native import call, room, room_for
 from pcdata.kernels.rays import rays_of_cameras
+
+# The core numbers the pixels of an image with 32 bits.
+_MOST_PIXELS = 2**32 - 1
 
 
 @kernel("register_depth", "cpu")
@@ -30,7 +33,7 @@ def register_depth(
     )
     views, height, width = depth.shape
     color_shape = (views, *color_size)
-    if depth.numel() > 0:
+    if 0 < height * width <= _MOST_PIXELS and views > 0:
         rays = rays_of_cameras(intrinsics, (height, width), distortion)
         results = room_for(
             (color_shape, torch.float32),
@@ -38,7 +41,7 @@ def register_depth(
             (color_shape, torch.bool),
             (depth.shape, torch.bool),
         )
-        possible = torch.empty(1, dtype=torch.int64)
+        possible = room(1, torch.int64)
         call(
             "pc_register_depth",
             *(depth.contiguous(), views, height, width, *rays),

@@ -18,7 +18,7 @@ import pcdata.functional.boxes
 import pcdata.functional.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.dispatch import INNER, kernel
 from pcdata.functional.ragged import padding_of
-from pcdata.kernels.native import addresses, call, room_for
+from pcdata.kernels.native import addresses, call, numbers, room, room_for
 
 _ROWS_PER_PIECE = 16384  # as in rows.cpp
 _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
@@ -41,7 +41,7 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
 
 def _keep_rows(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
-    starts = torch.empty(-(-len(mask) // _ROWS_PER_PIECE) + 1, dtype=torch.int64)
+    starts = room(-(-len(mask) // _ROWS_PER_PIECE) + 1, torch.int64)
     call("pc_count_kept", mask, len(mask), starts)
     sources, picked, sizes = _sources_and_picked(fields, int(starts[-1]))
     call("pc_keep_rows", mask, len(mask), starts, len(fields), addresses(sources), sizes, addresses(picked))
@@ -51,7 +51,7 @@ def _keep_rows(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
 def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
     """Return the rows of all fields; None if an index is negative, which counts from the end, or out of range."""
     sources, picked, sizes = _sources_and_picked(fields, len(index))
-    possible = torch.empty(1, dtype=torch.int64)
+    possible = room(1, torch.int64)
     of_all = len(fields), addresses(sources), sizes, addresses(picked)
     call("pc_take_rows", index, len(index), len(fields[0]), *of_all, possible)
     return picked if possible else None
@@ -61,7 +61,7 @@ def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tens
     """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
     sources = [field.contiguous() for field in fields]
     picked = room_for(*(((count, *field.shape[1:]), field.dtype) for field in fields))
-    return sources, picked, torch.tensor([field.nbytes // len(field) for field in sources])
+    return sources, picked, numbers(field.nbytes // len(field) for field in sources)
 
 
 def _is_plain(field: Tensor) -> bool:
@@ -112,8 +112,8 @@ def _placed(parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: li
     fillers = [padding_of(first.dtype) & 0xFF for first in firsts]  # -1 is a row of such bytes
     call(
         "pc_place_rows",
-        *(len(counts), torch.tensor(counts), torch.tensor(starts), len(firsts), addresses(sources)),
-        *(torch.tensor(row_bytes), torch.tensor(fillers), addresses(blocks)),
+        *(len(counts), numbers(counts), numbers(starts), len(firsts), addresses(sources)),
+        *(numbers(row_bytes), numbers(fillers), addresses(blocks)),
     )
     return dict(zip(parts, blocks))
 
@@ -154,7 +154,7 @@ def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -
     """Look at every point once."""
     if points.dtype is not torch.float32:
         return _reference("inside_box", points, lower, upper)
-    inside, finite = torch.empty(len(points), dtype=torch.bool), torch.empty(1, dtype=torch.int64)
+    inside, finite = room(len(points), torch.bool), room(1, torch.int64)
     corners = points.new_tensor(lower), points.new_tensor(upper)
     call("pc_inside_box", points.contiguous(), len(points), *corners, inside, finite)
     return inside if finite else None

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from pcdata.dispatch import OPERATIONS, kernel
 from pcdata.functional.parameters import require_count
-from pcdata.functional.planes import PlaneWork, plane_of_moments, search_planes
-from pcdata.functional.ragged import counts_from_ptr, ptr_from_counts
+from pcdata.functional.planes import FLAT, PlaneWork, plane_of_moments, search_planes
+from pcdata.functional.ragged import counts_from_ptr, first_per_cloud, ptr_from_counts
 from pcdata.functional.sampling import check_available, counts_per_cloud
-from pcdata.functional.voxels import count_voxels, search_voxel_sizes, sizes_per_cloud
-from pcdata.kernels.native import call
+from pcdata.functional.voxels import SIZE_TOLERANCE, sizes_per_cloud
+from pcdata.kernels.native import call, numbers, room
 
 # The core numbers the rows of one cloud, and voxels, with 32 bits.
 _MAX_ROWS = 2**31 - 1
@@ -29,7 +29,7 @@ def farthest_point_sample(
     check_available("farthest_point_sample", wanted, ptr)
     if _too_long(ptr):
         return _reference("farthest_point_sample", points, ptr, num_samples=num_samples)
-    picks, counts = torch.empty(sum(wanted), dtype=torch.int64), torch.tensor(wanted)
+    picks, counts = room(sum(wanted), torch.int64), numbers(wanted)
     call("pc_farthest_points", points.contiguous(), ptr.contiguous(), len(wanted), counts, picks)
     return picks.add_(torch.repeat_interleave(ptr[:-1], counts)), ptr_from_counts(counts)
 
@@ -43,8 +43,8 @@ def voxel_downsample(
     if _too_long(ptr):
         return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)
     # As many rows as there could be: those not written never become memory.
-    means, inverse = torch.empty_like(points), torch.empty(len(points), dtype=torch.int64)
-    counts, spans_too_many = torch.empty(len(ptr) - 1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
+    means, inverse = room(points.shape, points.dtype), room(len(points), torch.int64)
+    counts, spans_too_many = room(len(ptr) - 1, torch.int64), room(1, torch.int64)
     arrays = points.contiguous(), ptr.contiguous(), len(ptr) - 1, sizes, means, inverse, counts, spans_too_many
     call("pc_voxel_downsample", *arrays)
     if spans_too_many:
@@ -56,24 +56,14 @@ def voxel_downsample(
 
 @kernel("find_voxel_size", "cpu")
 def find_voxel_size(points: Tensor, ptr: Tensor, *, num_points: int) -> Tensor:
-    """Bisect like the reference; only counting is different."""
+    """Bisect like the reference: small clouds side by side, large ones with all threads."""
     require_count("find_voxel_size", "num_points", num_points)
-    if _too_long(ptr):
-        return _reference("find_voxel_size", points, ptr, num_points=num_points)
-    return search_voxel_sizes(points.contiguous(), ptr, num_points, _count_voxels, _count_distinct)
-
-
-def _count_voxels(points: Tensor, voxel_size: float) -> int:
-    ptr, size = torch.tensor([0, len(points)]), torch.tensor([voxel_size], dtype=torch.float64)
-    counts, spans_too_many = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
-    call("pc_count_voxels", points, ptr, 1, size, counts, spans_too_many)
-    return count_voxels(points, voxel_size) if spans_too_many else int(counts)
-
-
-def _count_distinct(points: Tensor) -> int:
-    distinct = torch.empty(1, dtype=torch.int64)
-    call("pc_count_distinct", points, len(points), distinct)
-    return int(distinct)
+    sizes, possible = room(len(ptr) - 1, torch.float64), room(1, torch.int64)
+    if not _too_long(ptr) and num_points <= _MAX_ROWS:
+        call("pc_find_voxel_sizes", points, ptr, len(sizes), num_points, SIZE_TOLERANCE, sizes, possible)
+        if possible:
+            return sizes
+    return _reference("find_voxel_size", points, ptr, num_points=num_points)  # knows what to say
 
 
 @kernel("ransac_plane", "cpu")
@@ -87,34 +77,40 @@ def ransac_plane(
     up: Tensor | Sequence[float] | None,
     max_tilt: float | None,
 ) -> tuple[Tensor, Tensor]:
-    """Score all hypotheses in one pass over the points; draws and refinement are the reference's."""
-    work = PlaneWork(_count_inliers, _inlier_mask, _fit)
-    return search_planes(points.contiguous(), ptr, work, distance, num_hypotheses, seed, up, max_tilt)
+    """Make and score all hypotheses of all clouds in one pass over the points; decisions are the reference's."""
+    work = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)
+    return search_planes(points, ptr, work, distance, num_hypotheses, seed, up, max_tilt)
 
 
-def _count_inliers(points: Tensor, planes: Tensor, distance: float) -> Tensor:
-    counts = torch.empty(len(planes), dtype=torch.int64)
-    call("pc_count_near_planes", points, len(points), planes.float().contiguous(), len(planes), float(distance), counts)
+def _draw(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
+    planes = room((len(which), triples.shape[1], 4), torch.float64)
+    call("pc_planes_of_triples", points, ptr, len(which), triples, triples.shape[1], which, FLAT, planes)
+    return planes
+
+
+def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    counts = room(planes.shape[:2], torch.int64)
+    call("pc_count_near_planes", points, ptr, len(planes), planes.float(), planes.shape[1], float(distance), counts)
     return counts
 
 
-def _inlier_mask(points: Tensor, plane: Tensor, distance: float) -> Tensor:
-    near = torch.empty(len(points), dtype=torch.bool)
-    call("pc_near_plane", points, len(points), plane.float().contiguous(), float(distance), near)
+def _inlier_mask(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    near = room(len(points), torch.bool)
+    call("pc_near_planes", points, ptr, len(planes), planes.float(), float(distance), near)
     return near
 
 
-def _fit(points: Tensor, chosen: Tensor) -> Tensor | None:
+def _fit(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
     # Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
-    sums, origin = torch.empty(11, dtype=torch.float64), points[int(chosen.numpy().argmax())].double()
-    call("pc_moments", points, chosen, len(points), origin, sums)
-    count, largest = float(sums[0]), sums[1]
-    if count < 3:
-        return None
-    mean = sums[2:5] / count
-    xx, xy, xz, yy, yz, zz = (sums[5:] / count).unbind()
-    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3) - torch.outer(mean, mean)
-    return plane_of_moments(origin + mean, covariance, largest)
+    origin = points[first_per_cloud(chosen, ptr)].double()
+    sums = room((len(origin), 11), torch.float64)
+    call("pc_moments", points, ptr, len(origin), chosen, origin, sums)
+    count = sums[:, :1].clamp(min=1)
+    mean = sums[:, 2:5] / count
+    xx, xy, xz, yy, yz, zz = (sums[:, 5:] / count).unbind(1)
+    second = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).reshape(-1, 3, 3)
+    planes = plane_of_moments(origin + mean, second - mean[:, :, None] * mean[:, None, :], sums[:, 1])
+    return planes.masked_fill(sums[:, :1] < 3, torch.nan)
 
 
 def _too_long(ptr: Tensor) -> bool:

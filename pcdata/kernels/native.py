@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pcdata.threads import core_threads
 
-INTERFACE_VERSION = 5
+INTERFACE_VERSION = 6
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.
@@ -68,7 +68,11 @@ def library() -> ctypes.CDLL:
 def call(function: str, *arguments: Any) -> None:
     """Call ``function(context, *arguments)``; tensors go as pointers, ints as int64, floats as double.
 
+    None goes as the null pointer and means "not given". No tensor does, not even an empty one, whose own pointer is
+    null: the core may tell the two apart.
+
     Raises:
+        ValueError: a tensor is not contiguous or not in the memory of the CPU.
         MemoryError: the core could not get memory.
         KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
     """
@@ -89,17 +93,43 @@ def call(function: str, *arguments: Any) -> None:
 
 def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
     """Return uninitialised memory for results of these shapes; if large, in huge pages where the system has them."""
-    room = [torch.empty(tuple(shape), dtype=dtype) for shape, dtype in results]
-    if sum(one.nbytes for one in room) >= _LARGE:
-        call("pc_advise_huge_pages", len(room), addresses(room), torch.tensor([one.nbytes for one in room]))
-    return room
+    rooms = [room(shape, dtype) for shape, dtype in results]
+    if sum(one.nbytes for one in rooms) >= _LARGE:
+        call("pc_advise_huge_pages", len(rooms), addresses(rooms), numbers(one.nbytes for one in rooms))
+    return rooms
+
+
+def room(shape: int | Sequence[int], dtype: torch.dtype) -> Tensor:
+    """Return uninitialised memory for a result: contiguous and on the CPU, whatever torch's defaults are."""
+    return torch.empty((shape,) if isinstance(shape, int) else tuple(shape), dtype=dtype, device="cpu")
+
+
+def numbers(values: Iterable[int]) -> Tensor:
+    """Return whole numbers as the core reads them, int64."""
+    return torch.tensor(list(values), dtype=torch.int64, device="cpu")
 
 
 def addresses(tensors: Iterable[Tensor]) -> Tensor:
     """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
-    given = list(tensors)
-    assert all(one.is_contiguous() and one.device.type == "cpu" for one in given)
-    return torch.tensor([one.data_ptr() for one in given], dtype=torch.int64)
+    return numbers(address(one) for one in tensors)
+
+
+# Where an empty tensor "lies": no tensor may look like one that was not given, and nothing is read or written here.
+_EMPTY = ctypes.create_string_buffer(64)
+
+
+def address(tensor: Tensor) -> int:
+    """Return where the tensor lies in memory, never 0.
+
+    Raises:
+        ValueError: it is not contiguous or not in the memory of the CPU; the core would read or write astray.
+    """
+    if not tensor.is_contiguous() or tensor.device.type != "cpu":
+        raise ValueError(
+            f"the compiled core takes contiguous tensors in the memory of the CPU, not one of shape "
+            f"{tuple(tensor.shape)} with strides {tensor.stride()} on {tensor.device}; please report this"
+        )
+    return tensor.data_ptr() or ctypes.addressof(_EMPTY)
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:
@@ -121,9 +151,7 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
 
 def _argument(value: Any) -> Any:
     if isinstance(value, Tensor):
-        assert value.is_contiguous()
-        assert value.device.type == "cpu"
-        return ctypes.c_void_p(value.data_ptr())
+        return ctypes.c_void_p(address(value))
     if isinstance(value, float):
         return ctypes.c_double(value)
     if value is None:

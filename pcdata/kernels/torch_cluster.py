@@ -37,7 +37,6 @@ def unavailable() -> str | None:
 
 
 @kernel("farthest_point_sample", "torch_cluster")
-@torch.no_grad()
 def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: int | list[int] | Tensor) -> tuple[Tensor, Tensor]:
     """Sample with ``torch_cluster.fps``, cloud by cloud: it takes a ratio, and writes out of bounds for empty samples.
 
@@ -56,7 +55,6 @@ def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: int | list[i
 
 
 @kernel("ball_query", "torch_cluster")
-@torch.no_grad()
 def ball_query(
     points: Tensor,
     ptr: Tensor,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -320,6 +323,105 @@ def test_it_runs_in_inference_mode_and_on_slices(example):
         for key, value in arguments.items()
     }
     assert_equal(expected, call(example, strided))
+
+
+def is_rows(example: Example, key: str) -> bool:
+    return not parse_spec(OPERATIONS[example.name].specs[key]).is_ptr
+
+
+@each_example
+@pytest.mark.parametrize("layout", ["column_major", "expanded", "every_other"])
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_any_strides_give_the_same_answer(example, layout, backend):
+    arguments = packed(example, clouds_of(example))
+    if layout == "expanded":  # all rows are one row in memory
+        arguments = {
+            key: value[:1].repeat_interleave(len(value), 0) if is_rows(example, key) else value
+            for key, value in arguments.items()
+        }
+
+    def laid_out(value: Tensor) -> Tensor:
+        if layout == "expanded" and value.ndim > 1:
+            return value[:1].expand(value.shape)
+        if layout == "every_other" or value.ndim < 2:
+            return torch.stack([value, value], dim=-1)[..., 0]
+        return value.mT.contiguous().mT
+
+    strange = {key: laid_out(value) for key, value in arguments.items()}
+    try:
+        expected = call(example, arguments, backend=backend)
+    except PcdataError as error:
+        with pytest.raises(type(error)):
+            call(example, strange, backend=backend)
+    else:
+        assert_equal(expected, call(example, strange, backend=backend))
+
+
+@each_example
+def test_an_operation_without_a_gradient_runs_its_kernel_on_inputs_that_require_one(example, monkeypatch):
+    operation = OPERATIONS[example.name]
+    arguments = packed(example, clouds_of(example))
+    expected = call(example, arguments)
+    leaves = {
+        key: value.clone().requires_grad_() if value.dtype.is_floating_point else value
+        for key, value in arguments.items()
+    }
+    if not operation.gradient and "cpu" in operation.kernels and why_unavailable("cpu") is None:
+        monkeypatch.setattr(operation, "reference", None)  # the slow body is not called
+    found = call(example, leaves)
+    if operation.gradient:
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one.detach(), other, rtol=1e-5, atol=1e-6)
+    else:
+        assert_equal(found, expected)
+        assert not any(one.requires_grad for one in found)
+
+
+@each_example
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_torchs_default_device_and_dtype_change_nothing(example, backend):
+    arguments = packed(example, clouds_of(example))
+    expected = call(example, arguments, backend=backend)
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert_equal(expected, call(example, arguments, backend=backend))
+        with torch.device("meta"):
+            assert_equal(expected, call(example, arguments, backend=backend))
+    finally:
+        torch.set_default_dtype(before)
+
+
+OPTIMIZED = """
+import sys
+if __debug__:
+    sys.exit("asserts are on")
+sys.path.insert(0, {root!r})
+import torch
+from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
+for example in EXAMPLES:
+    arguments = packed(example, clouds_of(example))
+    strange = {{
+        key: value.mT.contiguous().mT if value.ndim > 1 else torch.stack([value, value], 1)[:, 0]
+        for key, value in arguments.items()
+    }}
+    for one, other in zip(call(example, arguments), call(example, strange)):
+        if not torch.equal(one, other):
+            sys.exit(example.name + " differs")
+    empty = {{key: value[:0] for key, value in arguments.items() if "ptr" not in key}}
+    try:
+        call(example, empty)
+    except (ValueError, TypeError, RuntimeError):
+        pass
+print("fine")
+"""
+
+
+def test_without_asserts_nothing_reads_or_writes_astray():
+    code = OPTIMIZED.format(root=str(Path(__file__).parents[2]))
+    done = subprocess.run([sys.executable, "-O", "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip().endswith("fine")
 
 
 @each_example

@@ -99,8 +99,8 @@ def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
 def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
     monkeypatch.setitem(planes_module._BLOCK, "cpu", (3, 7))
     points = scene()
-    hypotheses = planes_module._draw_planes(points, 50, seed=0)
-    counts = planes_module._count_inliers(points, hypotheses, 0.01)
+    hypotheses = planes_module.planes_through(points[planes_module._triples_of(len(points), 50, seed=0)])
+    counts = planes_module._count_near(points, hypotheses, 0.01)
     expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
     assert torch.equal(counts, expected)
 
@@ -108,19 +108,19 @@ def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
 def test_scoring_is_strict_too():
     points = torch.tensor([[0.0, 0, 0.25], [0, 0, -0.25], [0, 0, 0.125]])
     level = torch.tensor([[0.0, 0, 1, 0]], dtype=torch.float64)
-    assert planes_module._count_inliers(points, level, 0.25).tolist() == [1]
+    assert planes_module._count_near(points, level, 0.25).tolist() == [1]
 
 
 def test_among_equal_hypotheses_the_earliest_wins():
     points = slab(50, [0.0, 0.0, 1.0], 0.5, noise=0.0)
     hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
-    allowed = torch.ones(3, dtype=torch.bool)
-    best = planes_module._best_plane(points, hypotheses, allowed, 0.01, "test", planes_module._TORCH_WORK)
-    assert torch.equal(best, hypotheses[1])
+    allowed = torch.ones(1, 3, dtype=torch.bool)
+    near = planes_module._count_near(points, hypotheses, 0.01)[None]
+    assert torch.equal(planes_module._best_planes(hypotheses[None], allowed, near, 0.01, 0), hypotheses[1:2])
 
 
 def test_triples_are_distinct_and_uniform():
-    triples = planes_module._draw_triples(4, 24_000, seed=1)
+    triples = planes_module._triples_of(4, 24_000, seed=1)
     assert bool((triples.sort(dim=1).values.diff(dim=1) > 0).all())
     ordered = torch.bincount(triples @ torch.tensor([16, 4, 1]), minlength=64)
     assert int((ordered > 0).sum()) == 24  # every ordered triple of 4 points

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import AUTO_ORDER, BACKEND_MODULES, REFERENCE, backends, why_unavailable
+from pcdata.dispatch import BACKEND_MODULES, REFERENCE, backends, first_live, why_unavailable
 from pcdata.errors import BackendError, near_matches
 from pcdata.functional.tsdf import integrate, marching, surface, views
 from pcdata.functional.tsdf.blocks import VoxelBlocks
@@ -74,9 +74,7 @@ def find_triangles(
 
 def _body(step: str, backend: str, device: torch.device) -> Callable[..., Any]:
     if backend == "auto":
-        for name in AUTO_ORDER.get(device.type, (REFERENCE,)):
-            if why_unavailable(name) is None and (step, name) in BODIES:
-                return BODIES[step, name]
+        backend = first_live(device, lambda name: (step, name) in BODIES)
     if backend != REFERENCE and backend not in BACKEND_MODULES:
         raise BackendError(f"{step}: unknown backend {backend!r}{near_matches(str(backend), ['auto', *backends()])}")
     reason = why_unavailable(backend)

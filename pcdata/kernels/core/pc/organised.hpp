@@ -324,7 +324,9 @@ class WindowSearch {
       }
   }
   uint32_t row(uint32_t id) const { return cloud_.row(id); }
-  uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(int64_t{id} + lane); }
+  // The pixel of lane 0 may lie in the margin before the image, so that its number is negative and its id has wrapped:
+  // the lane is added in 32 bits, where it wraps back.
+  uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(id + static_cast<uint32_t>(lane)); }
 
  private:
   // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each

@@ -2,7 +2,7 @@
 #include "pc/common.hpp"
 
 // Raised whenever a signature below or in another source changes: Python refuses a library of another number.
-PC_EXPORT int32_t pc_interface_version() { return 5; }
+PC_EXPORT int32_t pc_interface_version() { return 6; }
 
 // Only meaningful in the baseline library, which runs everywhere: 0 baseline, 1 avx2, 2 avx512.
 PC_EXPORT int32_t pc_best_instruction_set() {

@@ -64,7 +64,7 @@ int64_t choose_row(const Images& images, int64_t row, const Choice& choice, uint
   for (int64_t u = 0; u < width; ++u) keep[u] = (depth[u] > 0) & (depth[u] >= near) & (depth[u] <= far);
   if (choice.mask != nullptr) {
     const uint8_t* __restrict mask = choice.mask + row * width;
-    for (int64_t u = 0; u < width; ++u) keep[u] &= mask[u];
+    for (int64_t u = 0; u < width; ++u) keep[u] &= mask[u] != 0;
   }
   for (int64_t u = 0; u < width; ++u) readings += keep[u];
   if (images.rays != nullptr) {

@@ -1,4 +1,5 @@
 // Sums over chosen points, for the least-squares plane through them.
+#include "pc/pieces.hpp"
 #include "pc/plane_sums.hpp"
 
 namespace pc {
@@ -50,30 +51,33 @@ void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t 
 }  // namespace
 }  // namespace pc
 
-// points (N, 3), mask (N,) of 0 and 1, centre (3,) -> sums (11,) over the chosen points, with p their offsets from the
-// centre: count, largest absolute coordinate, x, y, z, xx, xy, xz, yy, yz, zz. The same bits for any number of threads
-// and any instruction set: eight lanes each add every eighth point of a piece, and pieces are added in order.
-PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const uint8_t* mask, int64_t count,
-                             const double* centre, double* sums) {
+// points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centres (num_clouds, 3) -> sums (num_clouds, 11) over the
+// chosen points of each cloud, with p their offsets from its centre: count, largest absolute coordinate, x, y, z, xx, xy,
+// xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every eighth
+// point of a piece, and pieces are added in order.
+PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                             const uint8_t* mask, const double* centres, double* sums) {
   return pc::guarded([&] {
-    const int64_t pieces = (count + pc::kPiece - 1) / pc::kPiece;
-    std::vector<pc::Sums> found(static_cast<size_t>(pieces));
-    pc::parallel_for(*context, count, pc::kPiece, [&](int64_t begin, int64_t end, int64_t) {
+    const auto pieces = pc::cut_clouds(ptr, num_clouds, pc::kPiece);
+    std::vector<pc::Sums> found(pieces.size());
+    pc::for_each_piece(*context, pieces, pc::kPiece, [&](const pc::CloudPiece& piece, int64_t number) {
       pc::Sums own;
-      for (int64_t first = begin; first < end; first += pc::kBlock)
-        pc::add_block(points, mask, first, std::min<int64_t>(end, first + pc::kBlock), centre, own);
-      found[static_cast<size_t>(begin / pc::kPiece)] = own;
+      for (int64_t first = piece.begin; first < piece.end; first += pc::kBlock)
+        pc::add_block(points, mask, first, std::min<int64_t>(piece.end, first + pc::kBlock), centres + 3 * piece.cloud,
+                      own);
+      found[static_cast<size_t>(number)] = own;
     });
-    std::fill_n(sums, 11, 0.0);
-    for (const pc::Sums& piece : found) {
-      const pc::PlaneMoments& m = piece.moments;
+    std::fill_n(sums, 11 * num_clouds, 0.0);
+    for (size_t p = 0; p < pieces.size(); ++p) {
+      const pc::PlaneMoments& m = found[p].moments;
       const pc::Double8 lanes[9] = {m.x, m.y, m.z, m.xx, m.xy, m.xz, m.yy, m.yz, m.zz};
+      double* to = sums + 11 * pieces[p].cloud;
       float largest;
-      std::memcpy(&largest, &piece.largest, 4);
-      sums[0] += static_cast<double>(piece.count);
-      sums[1] = std::max(sums[1], static_cast<double>(largest));
+      std::memcpy(&largest, &found[p].largest, 4);
+      to[0] += static_cast<double>(found[p].count);
+      to[1] = std::max(to[1], static_cast<double>(largest));
       for (int k = 0; k < 9; ++k)
-        for (int lane = 0; lane < 8; ++lane) sums[2 + k] += lanes[k][lane];
+        for (int lane = 0; lane < 8; ++lane) to[2 + k] += lanes[k][lane];
     }
   });
 }

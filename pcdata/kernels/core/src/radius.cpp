@@ -38,11 +38,11 @@ struct Window {
     };
     clear(0, begin);
     clear(end, kSize);
-    const float* point = points + 3 * first;
     for (int i = begin; i < end; ++i) {
-      x[i] = point[3 * i];
-      y[i] = point[3 * i + 1];
-      z[i] = point[3 * i + 2];
+      const float* point = points + 3 * (first + i);
+      x[i] = point[0];
+      y[i] = point[1];
+      z[i] = point[2];
     }
   }
   bool near(int a, int b, float limit) const {
@@ -75,10 +75,11 @@ class PixelSearch {
 };
 
 // Whether point i has enough neighbours in the image rows around its own, near rows first. `seekers` has one search for
-// each row.
+// each row. Looks at kColumnsAround pixels to both sides; in a narrower image the looks would overlap, and count points
+// twice and point i itself.
 constexpr int kRowsAround = 8;
+constexpr int64_t kColumnsAround = 4, kNarrowest = 2 * kColumnsAround + 1;
 bool enough_in_rows(const Search& search, PixelSearch* seekers, int64_t i) {
-  constexpr int64_t kColumnsAround = 4;
   const float* q = search.points + 3 * i;
   int64_t found = 1;
   for (int r = 0; r < 2 * kRowsAround; ++r) {
@@ -113,13 +114,14 @@ int64_t search_sequence(const Search& search, int64_t begin, int64_t end, int cl
   for (int i = 0; i < count; ++i) left += outlier[i] = near[i] < search.enough;
   // A piece whose points have few neighbours so close by in memory is in no order, and a wider look would be wasted.
   if (2 * left > count) return left;
-  std::vector<PixelSearch> seekers(search.pixel ? 2 * kRowsAround : 0, PixelSearch(search));
+  const bool has_rows = search.pixel != nullptr && search.width >= kNarrowest;
+  std::vector<PixelSearch> seekers(has_rows ? 2 * kRowsAround : 0, PixelSearch(search));
   for (int i = 0; i < count; ++i) {
     if (!outlier[i]) continue;
     const int slot = i + kMostAround;
     int32_t found = 0;  // counts the point itself
     for (int other = slot - wide; other <= slot + wide; ++other) found += window.near(slot, other, limit);
-    outlier[i] = found < search.enough && !(search.pixel && enough_in_rows(search, seekers.data(), begin + i));
+    outlier[i] = found < search.enough && !(has_rows && enough_in_rows(search, seekers.data(), begin + i));
     left -= !outlier[i];
   }
   return left;

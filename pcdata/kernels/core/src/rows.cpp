@@ -53,13 +53,13 @@ void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_run
 }  // namespace
 }  // namespace pc
 
-// mask (rows,) of zeros and ones -> starts (pieces + 1,): the ones before each piece of 16384 rows, and their number.
+// mask (rows,) -> starts (pieces + 1,): the true rows before each piece of 16384 rows, and their number.
 PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts) {
   return pc::guarded([&] {
     starts[0] = 0;
     pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       int64_t kept = 0;
-      for (int64_t row = first; row < last; ++row) kept += mask[row];
+      for (int64_t row = first; row < last; ++row) kept += mask[row] != 0;
       starts[first / pc::kRowsPerPiece + 1] = kept;
     });
     const int64_t pieces = (rows + pc::kRowsPerPiece - 1) / pc::kRowsPerPiece;
@@ -67,7 +67,7 @@ PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, 
   });
 }
 
-// Copy the rows where the mask is one; starts are those of pc_count_kept.
+// Copy the rows where the mask is true; starts are those of pc_count_kept.
 PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked) {

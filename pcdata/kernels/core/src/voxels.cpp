@@ -1,5 +1,6 @@
 // Voxel down-sampling, and counting voxels.
 #include <numeric>
+#include <optional>
 
 #include "pc/lanes.hpp"
 #include "pc/voxel_table.hpp"
@@ -305,6 +306,94 @@ int64_t count_distinct(const pc_context& context, const float* points, int64_t c
   return table.count();
 }
 
+// -- the size that leaves a number of voxels ----------------------------------------------------------------------
+
+// Bisect, with the float64 operations of the reference; `count(size, voxels)` is false if the cloud spans too many.
+template <class Count>
+bool search_size(const Bounds& bounds, int64_t num_points, double tolerance, const Count& count, double& size) {
+  double extent = 0;
+  for (int axis = 0; axis < 3; ++axis)
+    extent = std::max(extent, static_cast<double>(bounds.high[axis]) - static_cast<double>(bounds.low[axis]));
+  double too_large = extent > 0 ? 3.0 * extent : 1.0;
+  size = too_large;
+  if (num_points == 1) return true;
+  double enough = extent / std::sqrt(static_cast<double>(num_points));
+  int64_t voxels = 0;
+  for (;;) {
+    if (!count(enough, voxels)) return false;
+    if (voxels >= num_points) break;
+    too_large = enough;
+    enough /= 2;
+  }
+  while (voxels > num_points && too_large > enough * (1 + tolerance)) {
+    const double middle = std::sqrt(enough * too_large);
+    int64_t some = 0;
+    if (!count(middle, some)) return false;
+    if (some >= num_points) {
+      enough = middle;
+      voxels = some;
+    } else {
+      too_large = middle;
+    }
+  }
+  size = enough;
+  return true;
+}
+
+// Counts the voxels of one cloud again and again, on this thread.
+template <class Voxel>
+class VoxelCount {
+ public:
+  VoxelCount(ScratchFrame& scratch, int64_t rows) : table_(scratch, rows), voxels_(scratch.take<Voxel>(rows)) {}
+
+  int64_t of(const float* points, int64_t rows, const VoxelGrid& grid) {
+    Piece all{0, 0, rows};
+    list_piece(points, all, grid, table_, Found<Voxel>{voxels_, nullptr, nullptr});
+    return all.num_voxels;
+  }
+
+ private:
+  VoxelTable<Voxel> table_;
+  Voxel* voxels_;
+};
+
+// The size of a cloud, found on this thread; false if it has too few distinct points or spans too many voxels.
+bool find_size_alone(const float* points, int64_t rows, int64_t num_points, double tolerance, double& size) {
+  if (rows < num_points || count_distinct({1, nullptr}, points, rows) < num_points) return false;
+  ScratchFrame scratch;
+  VoxelCount<PackedVoxel> packed(scratch, rows);
+  std::optional<VoxelCount<WideVoxel>> wide;
+  const Bounds bounds = bounds_of(points, 0, rows);
+  return search_size(
+      bounds, num_points, tolerance,
+      [&](double at, int64_t& voxels) {
+        VoxelGrid grid{};
+        if (!measure(bounds, at, grid)) return false;
+        if (!grid.packs() && !wide) wide.emplace(scratch, rows);
+        voxels = grid.packs() ? packed.of(points, rows, grid) : wide->of(points, rows, grid);
+        return true;
+      },
+      size);
+}
+
+// The same with all threads.
+bool find_size_together(const pc_context& context, const float* points, int64_t rows, int64_t num_points,
+                        double tolerance, double& size) {
+  if (rows < num_points || count_distinct(context, points, rows) < num_points) return false;
+  const int64_t ptr[2] = {0, rows};
+  Pieces pieces(ptr, 1);
+  return search_size(
+      bounds_of(points, 0, rows), num_points, tolerance,
+      [&](double at, int64_t& voxels) {
+        ScratchFrame scratch;
+        const Clouds cloud{points, ptr, 1, &at};
+        return with_grids(context, scratch, cloud, pieces, [&](auto voxel, const VoxelGrid* grids) {
+          count<decltype(voxel)>(context, scratch, cloud, pieces, grids, &voxels);
+        });
+      },
+      size);
+}
+
 }  // namespace
 }  // namespace pc
 
@@ -324,20 +413,28 @@ PC_EXPORT int32_t pc_voxel_downsample(const pc_context* context, const float* po
   });
 }
 
-// How many voxels pc_voxel_downsample() would leave of each cloud.
-PC_EXPORT int32_t pc_count_voxels(const pc_context* context, const float* points, const int64_t* ptr,
-                                  int64_t num_clouds, const double* sizes, int64_t* counts, int64_t* spans_too_many) {
+// sizes (num_clouds,): the voxel size that leaves num_points of each cloud, or as few more as possible, found to the
+// relative tolerance. *possible becomes 0, and nothing is certain, if a cloud has fewer distinct points or spans 2^53
+// voxels of the size that would be needed.
+PC_EXPORT int32_t pc_find_voxel_sizes(const pc_context* context, const float* points, const int64_t* ptr,
+                                      int64_t num_clouds, int64_t num_points, double tolerance, double* sizes,
+                                      int64_t* possible) {
   return pc::guarded([&] {
-    pc::ScratchFrame scratch;
-    pc::Pieces pieces(ptr, num_clouds);
-    const pc::Clouds clouds{points, ptr, num_clouds, sizes};
-    *spans_too_many = !pc::with_grids(*context, scratch, clouds, pieces, [&](auto voxel, const pc::VoxelGrid* grids) {
-      pc::count<decltype(voxel)>(*context, scratch, clouds, pieces, grids, counts);
+    std::atomic<bool> all_possible{true};
+    std::vector<int64_t> small;
+    for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
+      const int64_t rows = ptr[cloud + 1] - ptr[cloud];
+      if (rows <= pc::kPiece)
+        small.push_back(cloud);
+      else if (!pc::find_size_together(*context, points + 3 * ptr[cloud], rows, num_points, tolerance, sizes[cloud]))
+        all_possible = false;
+    }
+    pc::parallel_for(*context, static_cast<int64_t>(small.size()), 1, [&](int64_t i, int64_t, int64_t) {
+      const int64_t cloud = small[static_cast<size_t>(i)], rows = ptr[cloud + 1] - ptr[cloud];
+      if (all_possible.load(std::memory_order_relaxed) &&
+          !pc::find_size_alone(points + 3 * ptr[cloud], rows, num_points, tolerance, sizes[cloud]))
+        all_possible.store(false, std::memory_order_relaxed);
     });
+    *possible = all_possible;
   });
-}
-
-// points (count, 3) -> how many different ones.
-PC_EXPORT int32_t pc_count_distinct(const pc_context* context, const float* points, int64_t count, int64_t* distinct) {
-  return pc::guarded([&] { *distinct = pc::count_distinct(*context, points, count); });
 }
