@@ -21,7 +21,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError
+from pcdata.errors import CaptureError, PcdataError, write_fault
+from pcdata.inputs import note_input
+from pcdata.interrupts import shielded
 
 MAX_TEXT_BYTES = 1 << 20  # a calibration or pose file holds a few hundred bytes
 MAX_STREAMED_BYTES = 1 << 42  # 4 TB: a file that is read in parts, whose claims are checked before each part is read
@@ -85,6 +87,7 @@ def open_input(
         if isinstance(cause, OSError) and not isinstance(cause, PcdataError):
             raise error(f"{where}: {file}: cannot be examined: {cause}") from cause
         raise
+    note_input(file, status)
     return stream
 
 
@@ -200,19 +203,31 @@ def check_inside(
 
 
 @contextmanager
-def replacing(where: str, path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary name beside ``path`` to write to; on success it becomes ``path`` at once, else it is removed."""
-    target = Path(path)
+def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataError] = CaptureError) -> Iterator[Path]:
+    """Give a temporary name beside ``path`` to write to; on success it becomes ``path`` at once, else it is removed.
+
+    A link is followed: it stays, and its file is replaced.
+
+    Raises:
+        PcdataError: of the type ``error``: the folder is missing, ``path`` is no regular file, or it cannot be written.
+    """
+    target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
-        raise CaptureError(f"{where}: {target}: the folder {target.parent} does not exist; create it first")
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex}.part")
+        raise error(f"{where}: {path}: the folder {target.parent} does not exist; create it first")
+    # Of fixed length: a name may use up the 255 bytes that file systems allow.
+    temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix if len(target.suffix) < 8 else ''}")
     try:
+        with suppress(FileNotFoundError):
+            _check_kind(where, target, os.stat(target), error)  # a rename would put a file where a device was
         yield temporary
-        os.replace(temporary, target)
-    except OSError as error:
-        raise CaptureError(f"{where}: {target}: cannot be written: {error}") from error
+        with shielded():
+            os.replace(temporary, target)
+    except OSError as cause:
+        if isinstance(cause, PcdataError):
+            raise
+        raise error(f"{where}: {path}: cannot be written: {write_fault(cause)}") from cause
     finally:
-        with suppress(OSError):
+        with shielded(), suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 

@@ -16,7 +16,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "threads", "extras", "interrupts", "array_files"},
+    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "array_files"},
     {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -40,6 +40,7 @@ OUTSIDE = {
     "extras": set(),
     "array_files": {"numpy"},
     "files": {"numpy"},
+    "inputs": set(),
     "interrupts": set(),
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},

@@ -18,10 +18,11 @@ from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note, write_fault
+from pcdata.inputs import recording
 from pcdata.io.manifest import Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
 from pcdata.io.record import record_from_cloud
-from pcdata.io.source import REFUSALS, CaptureSource, checked_ids, reason_of, skipped_of
+from pcdata.io.source import REFUSALS, CaptureSource, checked_ids, inputs_of, reason_of, skipped_of
 from pcdata.io.stores import STORES
 from pcdata.io.whole_folders import complete_or_nothing
 from pcdata.structures import DepthFrame, PointCloud
@@ -76,6 +77,7 @@ def build_dataset(
     Raises:
         ConfigError: the pipeline has nothing deterministic to store.
         CacheError: the folder exists, another process writes it, or it cannot be written (a full disk).
+        CaptureError: a file of the captures, or of their calibration, changed since it was first read.
         PcdataError: a capture or a step failed; the note names the sample, the step and its input.
     """
     _check_arguments(config, source)
@@ -122,12 +124,14 @@ def _write_samples(
     prefix = config.pipeline.deterministic_prefix()
     ids = list(source.ids)
     written = []
+    inputs = inputs_of(source)
     try:
         for position, sample_id in enumerate(ids):
             started = time.perf_counter()
             try:
                 try:
-                    capture = source.load(sample_id)
+                    with recording(inputs):
+                        capture = source.load(sample_id)
                     made = prefix(capture)
                 except REFUSALS as error:
                     if not skip_refused:
@@ -145,10 +149,12 @@ def _write_samples(
                 hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
                 add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}")
                 raise
+            inputs.check_latest("build_dataset")
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
             report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))
             if progress is not None:
                 progress(position + 1, len(ids), sample_id)
+        inputs.check("build_dataset")
     finally:
         store.close()
     if not written:

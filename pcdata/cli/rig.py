@@ -58,6 +58,7 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
 
 
 def _overlap(arguments: argparse.Namespace) -> int | None:
+    from pcdata.files import replacing
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
 
@@ -66,7 +67,8 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     result = verify_overlap(*captures, names=rig.names)
     print(result.text())
     if arguments.json:
-        Path(arguments.json).write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+        with replacing("overlap --json", arguments.json) as temporary:
+            temporary.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
     if arguments.figure:
         save_overlap_figure(arguments.figure, captures[0], result)
     return FAILED if result.verdict == "fail" else None

@@ -15,9 +15,10 @@ from pcdata.exports.record import FILE_NAME, ExportRecord, check_only_export, fi
 from pcdata.exports.registry import target_named
 from pcdata.exports.sources import identity_of, open_for
 from pcdata.exports.target import Item, Samples, Target
+from pcdata.inputs import recording
 from pcdata.interrupts import shielded
 from pcdata.io.scratch import scratch_beside
-from pcdata.io.source import CaptureSource
+from pcdata.io.source import CaptureSource, inputs_of
 from pcdata.io.whole_folders import complete_or_nothing, is_free, restore_retired
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
@@ -103,6 +104,7 @@ class _Run:
         progress: Progress | None,
     ) -> None:
         self.target, self.source, self.items, self.report, self.progress = target, source, items, report, progress
+        self.inputs = inputs_of(source)
         self.total = sum(len(item.ids) for item in items)
 
     def write(self, item: Item, folder: Path) -> None:
@@ -112,6 +114,7 @@ class _Run:
 
     def finish(self, folder: Path) -> None:
         """Write what goes over all items."""
+        self.inputs.check("export")
         with _writing(folder):
             self.target.finish(self.items, folder, self._note)
 
@@ -122,10 +125,13 @@ class _Run:
     def _samples(self, item: Item) -> Samples:
         for sample_id in item.ids:
             try:
-                yield sample_id, self.source.load(sample_id)
+                with recording(self.inputs):
+                    data = self.source.load(sample_id)
             except PcdataError as error:
                 add_note(error, f"sample {sample_id!r} of {self.source!r}")
                 raise
+            self.inputs.check_latest("export")
+            yield sample_id, data
             # Only when the writer asks for the next one is this one written.
             self.report.written += 1
             if self.progress is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
+from abc import ABC, ABCMeta, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -21,6 +21,7 @@ from pcdata.errors import (
     near_matches,
 )  # fmt: skip
 from pcdata.files import check_inside
+from pcdata.inputs import Inputs, recording
 from pcdata.io.listing import LinkTargets, absolute, is_folder, link_targets
 from pcdata.io.sample_names import check_names, check_utf8, in_order, name_some, same_but_for_writing
 from pcdata.structures import DepthFrame, PointCloud
@@ -62,7 +63,30 @@ def checked_ids(where: str, source: Any) -> list[str]:
     return ids
 
 
-class Source(ABC):
+class _Recorded(ABCMeta):
+    """Lets every source know which files were read to open it: its calibration, its lists."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        inputs = Inputs()
+        with recording(inputs):
+            source = super().__call__(*args, **kwargs)
+        source.inputs = inputs
+        return source
+
+
+def inputs_of(source: Any) -> Inputs:
+    """Return what was read to open a source, and the sources that it is made of."""
+    found = Inputs()
+    if isinstance(own := getattr(source, "inputs", None), Inputs):
+        found.add(own)
+    within = [getattr(source, "source", None), *getattr(source, "sources", ())]
+    for inner in within:
+        if inner is not None and inner is not source:
+            found.add(inputs_of(inner))
+    return found
+
+
+class Source(ABC, metaclass=_Recorded):
     """The samples of one capture: unique ids in the order that a person counts in, and a loader.
 
     A source holds paths and numbers only, no open file, so it can be pickled, sent to workers and used by many at once.
@@ -71,6 +95,7 @@ class Source(ABC):
 
     kind: ClassVar[str]  # how open_source(kind=...) calls the layout
     needs: ClassVar[str]  # the layout in words, for error messages
+    inputs: Inputs  # the files that were read to open it
 
     def __init__(self, path: Path, ids: Iterable[str], links_to: LinkTargets = ()) -> None:
         """Take the ids.

@@ -208,6 +208,11 @@ class Hdf5Store(Store):
             disk = FaultKeepingFile(self.path)
             self._file = h5py.File(disk, "w" if disk.is_new else "r+")
             self._disk, self._opened_by = disk, os.getpid()
+            # What was written is not read again: the library's own limit of 32 MB of tables is memory for nothing.
+            cache = self._file.id.get_mdc_config()
+            cache.set_initial_size, cache.initial_size = True, _TABLES
+            cache.min_size, cache.max_size = _TABLES, _TABLES
+            self._file.id.set_mdc_config(cache)
         return self._file, self._disk
 
     def _open(self, mode: str) -> Any:
@@ -230,6 +235,8 @@ COMPRESSIONS: dict[Format, tuple[Compression, ...]] = {
     "npz": ("none", "gzip"),
     "pt": ("none",),
 }
+
+_TABLES = 1 << 20  # bytes of HDF5's own tables kept in memory while a file is written
 
 _INHERITED: list[Any] = []
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pcdata import extras
+from pcdata.files import replacing
 from pcdata.structures import METRE, DepthFrame, PointCloud
 
 _PALETTE = (
@@ -55,7 +56,8 @@ def save_pipeline_figure(
     _draw_counts(next(axes), stages)
     for axis in axes:
         axis.set_axis_off()
-    figure.savefig(path, format="png")
+    with replacing("save_pipeline_figure", path) as temporary:
+        figure.savefig(temporary, format="png")
 
 
 def _draw_colors(axis: Any, capture: DepthFrame) -> None:

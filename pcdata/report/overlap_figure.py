@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pcdata import extras
+from pcdata.files import replacing
 from pcdata.functional import rigid
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.ragged import cloud_of_rows
@@ -57,7 +58,8 @@ def save_overlap_figure(
     thin = ((points[:, 1] - center[1]).abs() < _SLICE / 2) & ((points[:, 0] - center[0]).abs() < _REACH / 3)
     _draw(cut, points[thin], view[thin], (0, 2), f"cut of {1e3 * _SLICE:.0f} mm through the middle", names)
     _draw_gaps(gaps, result)
-    figure.savefig(path, format="png")
+    with replacing("save_overlap_figure", path) as temporary:
+        figure.savefig(temporary, format="png")
 
 
 def _points_of(capture: DepthFrame | PointCloud) -> tuple[torch.Tensor, torch.Tensor]:

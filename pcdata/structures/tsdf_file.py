@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import uuid
 import zipfile
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +14,7 @@ from pcdata.array_files.npy import NpyHeader
 from pcdata.array_files.npz import npy_header, read_array
 from pcdata.array_files.zip_archive import ZipArchive
 from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeError
-from pcdata.files import MAX_STREAMED_BYTES, open_input
+from pcdata.files import MAX_STREAMED_BYTES, open_input, replacing
 from pcdata.functional.tsdf.blocks import CHUNK, Chunk, Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS
 from pcdata.structures.confidence import Confidence
@@ -29,25 +26,25 @@ _FIELDS = ("voxel_size", "truncation", "weighting", "carve", "frame_id")
 
 
 def save_volume(volume: TSDFVolume, path: str | os.PathLike[str]) -> None:
-    """Write ``about`` (JSON as bytes), ``keys`` (B,) and every plane (B, 512), chunk by chunk."""
+    """Write ``about`` (JSON as bytes), ``keys`` (B,) and every plane (B, 512), chunk by chunk.
+
+    Raises:
+        CacheError: the file cannot be written; what was there before stays.
+    """
     if volume.blocks is None:
         raise ConfigError("TSDFVolume.save: nothing was integrated yet")
     blocks = volume.blocks
     about = {name: getattr(volume, name) for name in _FIELDS}
     about |= {"format": _FORMAT, "num_views": volume.num_views, "planes": vars(blocks.planes)}
     about["min_confidence"] = None if volume.min_confidence is None else int(volume.min_confidence)
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex}.part")
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            _write(archive, "about", np.frombuffer(json.dumps(about).encode(), np.uint8))
-            _write(archive, "keys", blocks.keys.cpu().numpy())
-            for name in _plane_dtypes(blocks.planes):
-                _write_plane(archive, name, blocks)
-        os.replace(temporary, target)
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    with (
+        replacing("TSDFVolume.save", path, error=CacheError) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        _write(archive, "about", np.frombuffer(json.dumps(about).encode(), np.uint8))
+        _write(archive, "keys", blocks.keys.cpu().numpy())
+        for name in _plane_dtypes(blocks.planes):
+            _write_plane(archive, name, blocks)
 
 
 def load_volume(path: str | os.PathLike[str], *, max_bytes: int, device: str) -> TSDFVolume:
