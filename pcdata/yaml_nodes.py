@@ -171,8 +171,11 @@ class YamlDocument:
         for part in _parts(node):
             if isinstance(part, yaml.MappingNode):
                 self.mapping(part, "mapping")
-            elif isinstance(part, yaml.ScalarNode) and len(part.value) > _MAX_DIGITS and part.tag in _NUMBERS:
-                self.fault(part, f"a number of {len(part.value)} digits is none that can be meant")
+            elif isinstance(part, yaml.ScalarNode) and part.tag in _NUMBERS:
+                if len(part.value) > _MAX_DIGITS:
+                    self.fault(part, f"a number of {len(part.value)} digits is none that can be meant")
+                elif part.tag in _NUMBERS[:2] and ":" in part.value:  # YAML 1.1 counts 1:30 in sixties
+                    self.fault(part, f"{part.value!r} would be read as a time in sixties; write a plain number")
         if len(self.faults) > before:
             return None
         try:
