@@ -174,6 +174,8 @@ def work(reader: str, seeds: list[Path], first: int, last: int, seed: int) -> No
             used = int(status.read().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if [digest(copy.read(copy.folder)) for copy in copies] != truths:
+            raise RuntimeError("a seed is read differently under the limit on memory")
         start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         print(json.dumps({"ready": True}), flush=True)
         for number in range(first, last):
@@ -187,7 +189,7 @@ def work(reader: str, seeds: list[Path], first: int, last: int, seed: int) -> No
             try:
                 outcome = "equal" if digest(form.read(form.folder)) == truths[which] else "different"
             except PcdataError as error:
-                outcome = "typed"
+                outcome = "memory" if isinstance(error.__cause__, MemoryError) else "typed"
                 if len(str(error)) > 20_000:
                     outcome, what = "foreign exception", f"a message of {len(str(error))} characters"
             except MemoryError as error:

@@ -115,13 +115,14 @@ def read_bytes(
     """Return the whole content of a file that passes :func:`open_input`."""
     try:
         with open_input(where, path, max_bytes=max_bytes, inside=inside, error=error) as stream:
-            content = stream.read(max_bytes + 1)  # it may have grown since it was examined
+            size = os.fstat(stream.fileno()).st_size
+            content = stream.read(size + 1)  # Python takes the memory for all that is asked for, before it reads
     except (OSError, MemoryError) as cause:
         if isinstance(cause, PcdataError):
             raise
         raise error(f"{where}: {path}: cannot be read: {str(cause) or type(cause).__name__}") from cause
-    if len(content) > max_bytes:
-        raise error(f"{where}: {path}: grew beyond the limit of {max_bytes} bytes while it was read")
+    if len(content) != size:
+        raise error(f"{where}: {path}: changed its size while it was read; is it still being written?")
     return content
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -173,3 +174,13 @@ def test_objects_and_structures_are_never_read(tmp_path):
     for name in ("o", "s", "t"):
         with pytest.raises(CaptureError, match="plain numbers"):
             files.map_npy("here", tmp_path / f"{name}.npy", max_bytes=1 << 20)
+
+
+def test_reading_a_small_file_takes_little_memory_whatever_its_kind_may_hold(tmp_path):
+    (tmp_path / "a").write_bytes(bytes(1000))
+    tracemalloc.start()
+    try:
+        files.read_bytes("here", tmp_path / "a", max_bytes=1 << 32)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
