@@ -13,7 +13,7 @@ from pcdata.errors import ConfigError, PcdataError, first_lines
 from pcdata.sensors import SensorProfile
 
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
-_MAX_NODES = 100_000  # 5,000 poses; PyYAML takes some 50 microseconds for each
+_MAX_NODES = 50_000  # 1,000 pairs of poses; PyYAML takes some 100 microseconds for each value
 _MAX_DEPTH = 50  # pipelines nest a few levels deep
 _MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
 _LONGEST_NAME = 60  # characters of a name that a message repeats
