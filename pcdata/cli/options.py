@@ -154,9 +154,11 @@ def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = 
 
 
 def tell_skipped(skipped: dict[str, str]) -> None:
-    """Say on stderr which captures were left out, and why."""
-    for sample_id, reason in skipped.items():
+    """Say on stderr how many captures were left out, and which and why for the first."""
+    for sample_id, reason in list(skipped.items())[:20]:
         print(f"left out {sample_id}: {reason}", file=sys.stderr)
+    if len(skipped) > 20:
+        print(f"left out {len(skipped)} captures in all", file=sys.stderr)
 
 
 def attribute_of(flag: str) -> str:

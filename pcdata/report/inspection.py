@@ -13,6 +13,8 @@ from pcdata.io.source import Source
 from pcdata.report.table import text_table
 from pcdata.structures import DepthFrame, PointCloud
 
+_SKIPPED_SHOWN = 20  # captures that were left out, in a summary
+
 
 def build_text(report: BuildReport) -> str:
     """Tell how many points every step left, over all captures of a build."""
@@ -35,10 +37,12 @@ def build_text(report: BuildReport) -> str:
 
 
 def skipped_text(skipped: Mapping[str, str]) -> str:
-    """Tell which captures were left out: how many for each kind of reason, and every one with its own."""
+    """Tell which captures were left out: how many for each kind of reason, and the first with their own."""
     kinds = Counter(reason.partition(":")[0] for reason in skipped.values())
     head = f"{len(skipped)} captures left out: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
-    return "\n".join([head, *(f"  {sample_id}: {reason}" for sample_id, reason in skipped.items())])
+    lines = [f"  {sample_id}: {reason}" for sample_id, reason in list(skipped.items())[:_SKIPPED_SHOWN]]
+    more = len(skipped) - len(lines)
+    return "\n".join([head, *lines, *([f"  and {more} more; dataset.json lists them all"] if more else [])])
 
 
 def dataset_text(folder: str | Path) -> str:

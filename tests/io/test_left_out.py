@@ -17,6 +17,7 @@ from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
 from pcdata.io.averaged import AveragedSource
 from pcdata.io.manifest import Manifest
 from pcdata.io.selection import open_selected, read_skip_file
+from pcdata.report.inspection import skipped_text
 
 SIZE = (24, 32)
 STEPS = "depth:\n- Deproject: {}\ncloud:\n- FarthestPointSample: {num_points: 16}\n"
@@ -106,6 +107,13 @@ def test_what_a_step_refuses_is_left_out_too(capture: Path, tmp_path: Path) -> N
     )
     assert "3" in report.skipped
     assert report.skipped["3"].startswith("NoPlaneError: ")
+
+
+def test_a_summary_of_thousands_stays_short() -> None:
+    told = skipped_text({str(number): "PoseError: lost" for number in range(5000)})
+    assert told.splitlines()[0] == "5000 captures left out: 5000 PoseError"
+    assert told.splitlines()[-1] == "  and 4980 more; dataset.json lists them all"
+    assert len(told.splitlines()) == 22
 
 
 def test_nothing_left_is_an_error(capture: Path, config: Path, tmp_path: Path) -> None:
