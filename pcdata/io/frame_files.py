@@ -56,7 +56,7 @@ def make_frame(
             found = _words(tuple(image.shape[:2]))
             raise CaptureError(
                 f"{files[role]}: the {role} image is {found} but its depth is {_words(size)}; are "
-                "they of one frame? Register the images to each other first, or leave this one out"
+                f"they of one frame? Register the images to each other first, or leave this one out (--folder {role}=)"
             )
     labels = images.get("labels")
     if labels is not None and background_label is not None:
