@@ -52,6 +52,8 @@ class ChunkGrid:
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Read one row of the first axis, or everything for ``...``."""
+        if index is Ellipsis and self.shape == self.chunks:
+            return np.array(self.chunk((0,) * len(self.shape)))
         if index is Ellipsis:
             return self._read(0, self.shape[0])
         if not 0 <= index < self.shape[0]:
