@@ -25,7 +25,7 @@ from pathlib import Path
 import torch
 from faults import DIRECTIONS, FAULTS, FILE_FAULTS, Captures, Recording, real, store, synthetic
 
-from pcdata.errors import PcdataError
+from pcdata.errors import PcdataError, UnitError
 from pcdata.functional import edge_votes, offset_from_votes
 from pcdata.io import open_source
 from pcdata.report import text_table
@@ -130,7 +130,11 @@ def run(recordings: Sequence[Recording], kind: str) -> tuple[list[Row], Counter[
             if fault.check == "color_registration" and not registers(recording):
                 continue
             for draw in range(fault.draws):
-                broken = fault.inject(recording.frames, draw if fault.draws > 3 else number + draw)
+                try:
+                    broken = fault.inject(recording.frames, draw if fault.draws > 3 else number + draw)
+                except UnitError:  # refused before anything can be judged
+                    row.caught += 1
+                    continue
                 if broken is None:
                     continue
                 checks = judge(recording, broken, fault.check)

@@ -137,3 +137,15 @@ def first_lines(lines: Sequence[str]) -> str:
     """Return faults one to a line, the first of them where there are very many."""
     more = [f"and {len(lines) - _LINES} more"] if len(lines) > _LINES else []
     return "\n".join([*lines[:_LINES], *more])
+
+
+def told_apart(value: float, limit: float, digits: int = 3) -> tuple[str, str]:
+    """Return a measured number and its limit in as many digits as show on which side of it the number lies.
+
+    "0.1 degrees, at most 0.1" helps nobody: 0.1004 and 0.1 do.
+    """
+    for more in range(digits, 18):
+        shown = f"{value:.{more}g}", f"{limit:.{more}g}"
+        if value == limit or value != value or float(shown[0]) != float(shown[1]):
+            break
+    return shown

@@ -94,6 +94,28 @@ def check_metres(
     return 1.0
 
 
+def check_depth(where: str, readings: NDArray[Any]) -> None:
+    """Require depth in memory, which cannot state a unit, to look like metres.
+
+    Args:
+        where: the door, named in the error.
+        readings: depths along z, without those that mean "no reading"; a sample will do.
+
+    Raises:
+        UnitError: half of the readings are farther than any depth camera sees, and what to multiply them by.
+    """
+    if not len(readings):
+        return
+    median = float(np.median(readings))
+    if median > FARTHEST:
+        named = plausible_units(median)
+        ways_out = " or ".join(f"{unit:g} if it is in {name} ({median * unit:.3g} m)" for name, unit in named.items())
+        raise UnitError(
+            f"{where}: half of the depth is beyond {median:.4g}; depth must be in metres: "
+            f"{'multiply it by ' + ways_out if ways_out else 'convert it'}"
+        )
+
+
 def plausible_units(length: float) -> dict[str, float]:
     """Return the units, name -> metres, in which a length is that of an object or a room; several may fit."""
     low, high = _PLAUSIBLE

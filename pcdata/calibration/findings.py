@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from pcdata.errors import told_apart
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -18,15 +20,15 @@ class Finding:
 
 def at_most(name: str, value: float, limit: float, unit: str, *, factor: float = 1.0, digits: int = 3) -> Finding:
     """Judge a number that must not exceed a limit; both are shown multiplied by ``factor``."""
-    shown = f"{value * factor:.{digits}g} {unit}".strip()
+    shown, most = told_apart(value * factor, limit * factor, digits)
     # A NaN fails: written so that it is not "not greater".
-    return Finding(name, shown, f"<= {limit * factor:.4g} {unit}".strip(), value <= limit)
+    return Finding(name, f"{shown} {unit}".strip(), f"<= {most} {unit}".strip(), value <= limit)
 
 
 def at_least(name: str, value: float, limit: float, unit: str, *, factor: float = 1.0, digits: int = 3) -> Finding:
     """Judge a number that must reach a limit; both are shown multiplied by ``factor``."""
-    shown = f"{value * factor:.{digits}g} {unit}".strip()
-    return Finding(name, shown, f">= {limit * factor:.4g} {unit}".strip(), value >= limit)
+    shown, least = told_apart(value * factor, limit * factor, digits)
+    return Finding(name, f"{shown} {unit}".strip(), f">= {least} {unit}".strip(), value >= limit)
 
 
 def all_passed(findings: Iterable[Finding]) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pcdata.calibration.boards import Board, BoardView, GreyImage
 from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
-from pcdata.errors import CalibrationError, CaptureError, ConfigError
+from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
 from pcdata.io.calibration import Evidence
 from pcdata.structures import Camera
@@ -203,9 +203,11 @@ def _solve(views: Mapping[str, BoardView], size: tuple[int, int], num_coefficien
 
 def _refuse_degenerate(tilt: float, focal_uncertainty: float) -> None:
     if tilt < _MIN_TILT:
+        tilted, needed = told_apart(math.degrees(tilt), math.degrees(_MIN_TILT))
         raise CalibrationError(
-            f"calibrate_intrinsics: the boards are parallel to within {math.degrees(tilt):.1f} degrees, so focal "
-            "length and distance cannot be told apart; tilt the board by 30 to 45 degrees, to all four sides"
+            f"calibrate_intrinsics: the boards are parallel to within {tilted} degrees, at least {needed} are "
+            "needed, so focal length and distance cannot be told apart; tilt the board by 30 to 45 "
+            "degrees, to all four sides"
         )
     if not focal_uncertainty <= _MAX_FOCAL_UNCERTAINTY:
         raise CalibrationError(

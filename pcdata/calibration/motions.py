@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CalibrationError
+from pcdata.errors import CalibrationError, told_apart
 
 Poses = NDArray[np.float64]  # (N, 4, 4) rigid
 
@@ -62,22 +62,26 @@ def check_motions(motions: Motions, num_poses: int) -> None:
     seen = np.linalg.norm(motions.camera_vectors, axis=1)
     largest = float(angles.max())
     if largest < _MIN_ROTATION:
+        turned, needed = told_apart(math.degrees(largest), math.degrees(_MIN_ROTATION))
         raise CalibrationError(
-            f"hand-eye: between no two poses does the robot turn by more than {math.degrees(largest):.1f} degrees; "
-            "turn the gripper by 30 to 60 degrees between poses, moving it is not enough"
+            f"hand-eye: between no two poses does the robot turn by more than {turned} degrees, at least {needed} are "
+            "needed; turn the gripper by 30 to 60 degrees between poses, moving it is not enough"
         )
     mismatch = float(np.median(np.abs(angles - seen)))
     if mismatch > _MAX_ANGLE_MISMATCH:
+        apart, most = told_apart(math.degrees(mismatch), math.degrees(_MAX_ANGLE_MISMATCH))
         raise CalibrationError(
-            f"hand-eye: robot and target turn by different angles between poses ({math.degrees(mismatch):.1f} degrees "
-            "in the median), which no mounting explains; are both lists in the same order, was the robot at rest, are "
-            "quaternions x y z w and rotation vectors in radians?"
+            f"hand-eye: robot and target turn by different angles between poses ({apart} degrees "
+            f"in the median, at most {most} is usual), which no mounting explains; are both lists in the same "
+            "order, was the robot at rest, are quaternions x y z w and rotation vectors in radians?"
         )
     spread = _axis_spread(motions.usable().mount_vectors)
     if spread < _MIN_AXIS_SPREAD:
+        found, needed = told_apart(math.degrees(spread), math.degrees(_MIN_AXIS_SPREAD))
         raise CalibrationError(
-            f"hand-eye: all rotations are about nearly one axis (spread {math.degrees(spread):.1f} degrees), so the "
-            "camera's place along that axis stays open; also turn the gripper about a second axis by 30 degrees or more"
+            f"hand-eye: all rotations are about nearly one axis (spread {found} degrees, at least {needed} is needed), "
+            "so the camera's place along that axis stays open; also turn the gripper about a second "
+            "axis by 30 degrees or more"
         )
 
 

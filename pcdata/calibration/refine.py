@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.calibration.pairwise import pairwise_motions
-from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matches
+from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matches, told_apart
 from pcdata.functional import rigid
 from pcdata.functional.held_out import GapChange, gap_change, held_out_change
 from pcdata.functional.pose_graph import average_motions
@@ -236,17 +236,21 @@ def _check(
         reasons.append(f"the alignment did not settle within {alignment.iterations} rounds; give more captures")
     for camera, found in zip(cameras, judged.cameras):
         if found.unmeasurable:
+            shift_sigma, most_shift = told_apart(1e3 * found.shift_sigma, 1e3 * limits.max_shift_sigma)
+            turn_sigma, most_turn = told_apart(found.rotation_sigma_degrees, limits.max_rotation_sigma_degrees)
             reasons.append(
                 f"{camera.name}: the scene does not determine its pose: {'; '.join(found.unmeasurable)} (standard "
-                f"deviations up to {1e3 * found.shift_sigma:.2g} mm and {found.rotation_sigma_degrees:.2g} degrees, at "
-                f"most {1e3 * limits.max_shift_sigma:g} mm and {limits.max_rotation_sigma_degrees:g} degrees are "
-                "allowed); put objects with upright sides where the cameras overlap, or give several captures"
+                f"deviations up to {shift_sigma} mm and {turn_sigma} degrees, at most {most_shift} mm and "
+                f"{most_turn} degrees are allowed); put objects with upright sides where the cameras overlap, or give "
+                "several captures"
             )
             continue
         if camera.shift > max_shift or camera.rotation_degrees > max_rotation_degrees:
+            shift, most_shift = told_apart(1e3 * camera.shift, 1e3 * max_shift)
+            turn, most_turn = told_apart(camera.rotation_degrees, max_rotation_degrees)
             reasons.append(
-                f"{camera.name}: would move by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees, "
-                f"more than {1e3 * max_shift:g} mm or {max_rotation_degrees:g} degrees; calibrate it anew"
+                f"{camera.name}: would move by {shift} mm and {turn} degrees, more than {most_shift} mm or {most_turn} "
+                "degrees; are its intrinsics those of this resolution? If so, calibrate it anew"
             )
     if not change.fell:
         reasons.append(

@@ -45,7 +45,7 @@ class RobotPoses:
                     f"RobotPoses: {name} must be ({len(self.names)}, 4, 4) float64, one per name, got {poses.dtype} "
                     f"{tuple(poses.shape)}"
                 )
-            rigid.check_rigid(f"RobotPoses: {name}", poses, tolerance=RIGID_TOLERANCE)
+            _check_pose(f"RobotPoses: {name}", poses)
         if len(set(self.names)) != len(self.names):
             raise CalibrationError(f"RobotPoses: names must be unique, got {', '.join(self.names)}")
 
@@ -115,7 +115,7 @@ def _read_pose(document: YamlDocument, node: yaml.Node, what: str) -> Tensor | N
 
 def _check_pose(what: str, pose: Tensor) -> None:
     rigid.check_rigid(what, pose, tolerance=RIGID_TOLERANCE)
-    length = float(pose[:3, 3].norm())
+    length = max(pose[..., :3, 3].norm(dim=-1).flatten().tolist(), default=0.0)
     if length > LARGEST_TRANSLATION:
         raise CalibrationError(f"{what}: the translation is {length:g} m long; is it in millimetres? Write metres")
 

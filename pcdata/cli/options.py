@@ -14,6 +14,13 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         "--metres-per-unit",
         {"type": float, "metavar": "M", "help": "length of one stored depth unit"},
     ),
+    "depth_encoding": (
+        "--depth-encoding",
+        {
+            "choices": ("plain", "rotated", "swapped"),
+            "help": "order of the stored bits: rotated to the left by three (SUN3D), or bytes swapped (default: plain)",
+        },
+    ),
     "invalid_values": (
         "--invalid-values",
         {
@@ -59,7 +66,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
     ),
 }
-RIG_OPTIONS = ("metres_per_unit", "invalid_values", "background_label", "folders", "links_to")
+RIG_OPTIONS = ("metres_per_unit", "depth_encoding", "invalid_values", "background_label", "folders", "links_to")
 
 
 def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:

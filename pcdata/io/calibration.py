@@ -16,12 +16,13 @@ from pcdata.errors import CalibrationError, FrameError, PoseError, near_matches
 from pcdata.files import read_text, replacing
 from pcdata.functional import rigid
 from pcdata.io.sample_names import name_some
+from pcdata.lengths import WIDEST
 from pcdata.structures import Camera
 
 # An inverse by transposition is off by as much as the rotation is from orthonormal: 0.1 mm at 1 m.
 RIGID_TOLERANCE = 1e-4
-# No work cell is as wide; a transform in millimetres nearly always is "longer".
-LARGEST_TRANSLATION = 100.0  # metres
+# No work cell is as wide; a transform in millimetres nearly always is "longer", the baseline of a camera too.
+LARGEST_TRANSLATION = WIDEST
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-/]*")
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, near_matches
 from pcdata.files import map_npy, read_text, replacing
 from pcdata.functional import rigid
+from pcdata.functional.depth_unit import DepthEncoding, check_depth_encoding
 from pcdata.io.option_checks import check_invalid_values
 from pcdata.io.strict_json import json_object
 from pcdata.lengths import check_metres_per_unit
@@ -23,7 +24,7 @@ from pcdata.structures import Camera
 
 _SHOWN = 8  # faults of a file in one message
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("distortion", "metres_per_unit", "frame_id", "background_label", "invalid_values")
+_OPTIONAL = ("distortion", "metres_per_unit", "depth_encoding", "frame_id", "background_label", "invalid_values")
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
 _DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
@@ -42,6 +43,7 @@ class CaptureCamera:
 
     camera: Camera
     metres_per_unit: float | None = None  # length of one stored depth unit; None = the file does not say
+    depth_encoding: DepthEncoding | None = None  # order of the stored bits; None = the file does not say
     frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
     background_label: int | None = None  # what means "no object" in the label images; None = the file does not say
     invalid_values: tuple[int, ...] | None = None  # stored depth besides 0 that is no reading; None = not said
@@ -55,14 +57,14 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
 
-    The last three are optional, as are ``background_label``, the id that means "no object", and ``invalid_values``, a
-    list of stored depths besides 0 that mean "no reading"; ``notes``, ``sensor``, ``serial``, ``registered_to`` and
-    ``date`` are free remarks. Any other key is an error, because a misspelt ``distortion`` that is ignored bends every
-    cloud.
+    The last three are optional, as are ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
+    "swapped"), ``background_label``, the id that means "no object", and ``invalid_values``, a list of stored depths
+    besides 0 that mean "no reading"; ``notes``, ``sensor``, ``serial``, ``registered_to`` and ``date`` are free
+    remarks. Any other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
 
     Raises:
         CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
-        UnitError: ``metres_per_unit`` is not a number above 0 and at most 1.
+        UnitError: ``metres_per_unit`` is not a number above 0 and at most 1, or ``depth_encoding`` is not known.
     """
     where = f"read_capture_camera: {path}"
     data = json_object(where, read_text(where, path))
@@ -70,6 +72,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     width, height = (_whole(where, data, key) for key in ("width", "height"))
     fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
     unit = data.get("metres_per_unit")
+    encoding = data.get("depth_encoding")
     frame_id = data.get("frame_id")
     if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
         raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r:.80}")
@@ -88,6 +91,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     return CaptureCamera(
         camera=camera,
         metres_per_unit=None if unit is None else check_metres_per_unit(where, unit),
+        depth_encoding=None if encoding is None else check_depth_encoding(where, encoding),
         frame_id=frame_id,
         background_label=background,
         invalid_values=invalid,

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, UnitError
 from pcdata.files import check_inside
+from pcdata.functional.depth_unit import DepthEncoding, check_depth_encoding
 from pcdata.io.calibration import Calibration
 from pcdata.io.capture_camera import read_capture_camera
 from pcdata.io.folder_roles import ROLES, role_folders
@@ -53,6 +54,7 @@ class FolderSource(Source):
         path: Path,
         *,
         metres_per_unit: float | None = None,
+        depth_encoding: DepthEncoding | None = None,
         invalid_values: Collection[int] = (),
         background_label: int | None = None,
         frame_id: str | None = None,
@@ -66,6 +68,7 @@ class FolderSource(Source):
         Args:
             path: the folder.
             metres_per_unit: length of one stored depth unit, where ``intrinsics.json`` does not state it.
+            depth_encoding: order of the stored bits, where ``intrinsics.json`` does not state it; None = "plain".
             invalid_values: stored depth values besides 0 that mean "no reading", where ``intrinsics.json`` does not
                 state them.
             background_label: the label in the files that means "no object" and becomes -1, where ``intrinsics.json``
@@ -94,6 +97,7 @@ class FolderSource(Source):
         check_inside(str(path), present[0], allowed)
         stated = read_capture_camera(present[0])
         self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
+        self.depth_encoding = _one_encoding(present[0], stated.depth_encoding, depth_encoding)
         check_name(str(path), "frame_id", frame_id)
         check_name(str(path), "camera", camera)
         if frame_id and stated.frame_id not in (None, frame_id):
@@ -170,7 +174,12 @@ class FolderSource(Source):
         files = self.files(sample_id)
         frame = make_frame(
             files,
-            depth=read_depth(files["depth"], metres_per_unit=self.metres_per_unit, invalid_values=self.invalid_values),
+            depth=read_depth(
+                files["depth"],
+                metres_per_unit=self.metres_per_unit,
+                depth_encoding=self.depth_encoding,
+                invalid_values=self.invalid_values,
+            ),
             camera=self.camera,
             sample_id=sample_id,
             frame_id=self.frame_id,
@@ -178,6 +187,7 @@ class FolderSource(Source):
             provenance={
                 **self.provenance(sample_id),
                 "metres_per_unit": self.metres_per_unit,
+                **({} if self.depth_encoding == "plain" else {"depth_encoding": self.depth_encoding}),
                 **self._calibrated,
                 **({"timestamps": [self.timestamps[sample_id]]} if self.timestamps else {}),
             },
@@ -197,6 +207,12 @@ def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
     if stated is not None and given is not None and stated != given:
         raise UnitError(f"{file}: says metres_per_unit {stated:g}, the argument {given:g}; correct the wrong one")
     return check_metres_per_unit(str(file), stated if given is None else given)  # type: ignore[arg-type]
+
+
+def _one_encoding(file: Path, stated: DepthEncoding | None, given: DepthEncoding | None) -> DepthEncoding:
+    if stated is not None and given not in (None, stated):
+        raise UnitError(f"{file}: says depth_encoding {stated!r}, the argument {given!r}; correct the wrong one")
+    return check_depth_encoding(str(file), stated or given or "plain")
 
 
 def _override(

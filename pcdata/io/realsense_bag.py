@@ -19,6 +19,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.functional import rigid
+from pcdata.functional.depth_unit import DepthUnit
 from pcdata.io.bag_index import MAGIC
 from pcdata.io.images import check_plausible, metres_of_value
 from pcdata.io.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
@@ -119,7 +120,7 @@ class RealSenseBagSource(Source):
             units = depth_units(bag.message(self._depth.topic, number))
             colors = rgb_pixels(bag.message(self._color.topic, self._partner[number])) if self._color else None
         depth = metres_of_value(self.metres_per_unit)[units]
-        check_plausible(str(self), depth, self.metres_per_unit)
+        check_plausible(str(self), depth, DepthUnit(self.metres_per_unit), units)
         frame = DepthFrame(
             depth=torch.from_numpy(depth)[None],
             camera=self._depth.camera,
@@ -128,6 +129,7 @@ class RealSenseBagSource(Source):
             provenance={
                 **self.provenance(sample_id),
                 "metres_per_unit": self.metres_per_unit,
+                "unit_is_recorded": True,
                 "timestamps": [self._depth.times[number] / 1e9],
                 **self.sensor,
             },

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 from pcdata.errors import CaptureError, FrameError
+from pcdata.functional.depth_unit import DepthEncoding
 from pcdata.io.calibration import Calibration
 from pcdata.io.folder import FolderSource, opened_calibration
 from pcdata.io.joined_views import join_views
@@ -48,6 +49,7 @@ class RigSource(Source):
         path: str | os.PathLike[str],
         *,
         metres_per_unit: float | None = None,
+        depth_encoding: DepthEncoding | None = None,
         invalid_values: Collection[int] = (),
         background_label: int | None = None,
         frame_id: str | None = None,
@@ -60,6 +62,7 @@ class RigSource(Source):
         Args:
             path: the folder that holds the cameras' folders.
             metres_per_unit: as for the layout ``folder``, of every camera.
+            depth_encoding: as for the layout ``folder``, of every camera.
             invalid_values: as for the layout ``folder``, of every camera.
             background_label: as for the layout ``folder``, of every camera.
             frame_id: where the poses lead to, where the cameras' ``intrinsics.json`` do not state it.
@@ -82,6 +85,7 @@ class RigSource(Source):
             name: FolderSource(
                 path / name,
                 metres_per_unit=metres_per_unit,
+                depth_encoding=depth_encoding,
                 invalid_values=invalid_values,
                 background_label=background_label,
                 frame_id=frame_id,
@@ -141,6 +145,9 @@ class RigSource(Source):
         units = {camera.metres_per_unit for camera in self.cameras.values()}
         if len(units) == 1:
             provenance["metres_per_unit"] = units.pop()
+        encodings = {camera.depth_encoding for camera in self.cameras.values()}
+        if len(encodings) == 1 and "plain" not in encodings:
+            provenance["depth_encoding"] = encodings.pop()
         if self.calibration_name is not None:
             provenance["calibration"] = self.calibration_name
         times = [camera.timestamps[sample_id] for camera in self.cameras.values() if camera.timestamps]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pcdata.errors import told_apart
 from pcdata.report.table import text_table
 from pcdata.validation import Check, Summary, Verdict
 from pcdata.validation.report import Message
@@ -18,7 +19,7 @@ def validation_text(summary: Summary) -> str:
         if entry.worst is None:
             continue
         counts = [entry.counts[verdict] for verdict in Verdict]
-        rows.append([name, "" if view is None else view, *counts, _value(entry.worst), _limit(entry.worst)])
+        rows.append([name, "" if view is None else view, *counts, *_value_and_limit(entry.worst)])
         if entry.worst.verdict is not Verdict.PASS:
             of_view = "" if view is None else f", view {view}"
             notes += [_note(f"{name}{of_view}", message) for message in entry.messages.values()]
@@ -37,9 +38,11 @@ def _note(name: str, message: Message) -> str:
     return f"{check.verdict.value.upper()} {name} ({where}): {check.found}{advice}"
 
 
-def _value(check: Check) -> str:
-    return "-" if check.value is None else f"{check.value:.3g} {check.unit}".strip()
-
-
-def _limit(check: Check) -> str:
-    return "" if check.threshold is None else f"{check.threshold:.3g} {check.unit}".strip()
+def _value_and_limit(check: Check) -> tuple[str, str]:
+    """Return the number and its limit with digits that show which is larger."""
+    value, limit = check.value, check.threshold
+    if value is not None and limit is not None:
+        shown = told_apart(value, limit)
+    else:
+        shown = ("-" if value is None else f"{value:.3g}", "" if limit is None else f"{limit:.3g}")
+    return tuple(f"{one} {check.unit}".strip() if one not in ("", "-") else one for one in shown)  # type: ignore[return-value]

@@ -13,11 +13,13 @@ from pcdata.checks import any_negative, check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional import rigid
 from pcdata.functional.depth import mask_depth
+from pcdata.lengths import check_depth
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.derive import derived
 
 CAMERA_FRAME = "camera"
+_SAMPLE = 1 << 12  # readings
 _MASKED = {"depth": "V H W", "mask": "V H W : bool"}
 
 
@@ -69,6 +71,9 @@ class DepthFrame:
         )
         if any_negative(self.depth):
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
+        # Some thousand pixels tell the median; on a GPU they are one small copy.
+        some = self.depth.flatten()[:: max(1, self.depth.numel() // _SAMPLE)].detach().cpu().numpy()
+        check_depth(where, some[some > 0])
         if self.confidence is not None and bool((self.confidence > max(Confidence)).any()):
             raise CaptureError(
                 f"{where}: confidence must hold the values of Confidence, 0 .. {max(Confidence)}, got "

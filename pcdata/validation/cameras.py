@@ -6,6 +6,7 @@ import math
 
 import torch
 
+from pcdata.lengths import FARTHEST
 from pcdata.structures import Camera, DepthFrame
 from pcdata.validation.check import Check, Verdict, graded
 from pcdata.validation.limits import Limits
@@ -76,9 +77,12 @@ def pose_checks(frame: DepthFrame) -> list[Check]:
     if frame.world_from_camera is None:
         return []
     rotation = frame.world_from_camera[:, :3, :3]
+    away = frame.world_from_camera[:, :3, 3].norm(dim=1).tolist()
     error = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)).abs().amax((1, 2))
     return [
-        graded(
+        _far_pose(far, frame.frame_id or "world", view)
+        if far > FARTHEST and off <= _MAX_SKEWED
+        else graded(
             "pose",
             float(off),
             threshold=_MAX_SKEWED,
@@ -87,5 +91,16 @@ def pose_checks(frame: DepthFrame) -> list[Check]:
             advice="write rotations with more digits, or make them orthonormal again",
             view=view,
         )
-        for view, off in enumerate(error)
+        for view, (off, far) in enumerate(zip(error, away))
     ]
+
+
+def _far_pose(metres: float, frame_id: str, view: int) -> Check:
+    return Check(
+        name="pose",
+        verdict=Verdict.WARN,
+        found=f"the camera stands {metres:.4g} m from the origin of {frame_id!r}",
+        value=None,
+        advice=f"are translations in millimetres ({metres / 1000:.3g} m)? Write metres; right if it is that far",
+        view=view,
+    )

@@ -48,7 +48,8 @@ def coverage_checks(
             found=f"{100 * region.fraction:.0f} % of the image in one piece have no reading, {where}"
             if region.fraction
             else "no region without readings",
-            advice=f"whole lines have no reading {where}: the image was stored or decoded in part only"
+            advice=f"whole lines have no reading {where}: the background was cut away, the scene is out of range, "
+            "or a part of the image was not stored; compare with the colour image before you drop it"
             if is_block
             else f"look at what the camera sees {where}: something before the lens, out of range, black, shiny or "
             "transparent; right if the background was cut away on purpose",

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
 
+_TABLE = (0.2, 2.0)  # metres, of a camera above a table
+
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
@@ -17,7 +19,9 @@ class Limits:
     """
 
     # Depth that the task is about, (nearest, farthest) in metres.
-    workspace: tuple[float, float] = (0.2, 2.0)
+    workspace: tuple[float, float] = _TABLE
+    # Metres: what one stored unit of depth of the sensor may be; none = any usual one.
+    units: tuple[float, ...] = ()
     # Of a 640x480 image 200,000 readings are usual, and fewer than 100,000 are a coverage problem; as fractions they
     # hold for every resolution.
     valid_fraction: tuple[float, float] = (200_000 / 307_200, 100_000 / 307_200)
@@ -41,12 +45,18 @@ class Limits:
 
     @classmethod
     def for_sensor(cls, name: str) -> Limits:
-        """Return limits whose workspace is the range in which the named sensor works well.
+        """Return limits whose workspace is the range of the named sensor, with the units that it stores.
 
         Raises:
             ConfigError: there is no profile of this name.
         """
-        return cls(workspace=sensor_profile(name).range)
+        profile = sensor_profile(name)
+        return cls(workspace=profile.range, units=profile.metres_per_unit)
+
+    @property
+    def workspace_is_stated(self) -> bool:
+        """Whether the workspace is that of this scene; the usual one and the range of a sensor are wider."""
+        return self.workspace != _TABLE and not self.units
 
     def __post_init__(self) -> None:
         near, far = self.workspace

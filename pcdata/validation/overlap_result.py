@@ -7,10 +7,12 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, told_apart
 
 # From best to worst: what could not be measured is no pass, but nothing was found wrong either.
 VERDICTS = ("pass", "not measurable", "warn", "fail")
+# Intrinsics of another resolution or another unit of depth move surfaces as a bent mount does.
+_FIRST = "make sure that its intrinsics are those of these images (size, fx) and its unit of depth is right"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,16 +111,19 @@ class OverlapResult:
         for name in self.wrong:
             found = by_name[name]
             if math.isinf(found.shift):
-                yield f"recalibrate {name}: the others agree without it, and it is too far off to be measured"
+                yield (
+                    f"recalibrate {name}: the others agree without it, and it is too far off to be measured; first "
+                    f"{_FIRST}"
+                )
                 continue
             yield (
                 f"recalibrate {name}: the others agree without it, and it is off by {1e3 * found.shift:.1f} mm and "
-                f"{found.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose"
+                f"{found.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose; first {_FIRST}"
             )
         if self.candidates:
             yield (
                 f"{' and '.join(self.candidates)} contradict each other and the views cannot tell which is wrong; "
-                "check both mounts, add a third camera, or recalibrate them"
+                f"first {_FIRST}, then check the mounts, add a third camera, or recalibrate them"
             )
         for pair in self.pairs:
             if pair.verdict == "fail":
@@ -132,11 +137,13 @@ class OverlapResult:
 
     def _why_failed(self, pair: PairOverlap) -> str:
         if pair.median > self.limits.residual[1]:
-            return f"their surfaces lie {1e3 * pair.median:.1f} mm apart"
+            apart, most = told_apart(1e3 * pair.median, 1e3 * self.limits.residual[1])
+            return f"their surfaces lie {apart} mm apart, at most {most} may be"
         assert pair.meeting is not None  # otherwise nothing else fails a pair
         return (
             f"only {100 * pair.meeting:.0f} % of what both could see lies within reach of the other's surface; check "
-            "that the poses are world_from_camera, in metres, and that nothing moved between the views"
+            "that the poses are world_from_camera, in metres, that the intrinsics and the unit of depth are right, and "
+            "that nothing moved between the views"
         )
 
     def to_json(self) -> dict[str, Any]:

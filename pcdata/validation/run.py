@@ -158,11 +158,11 @@ class _Series:
 def _frame_checks(
     frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits, repeated: Collection[int] = ()
 ) -> list[Check]:
-    unit = frame.provenance.get("metres_per_unit")
     checks = []
     for view, depth in enumerate(frame.depth):
         checks += coverage_checks(depth > 0, limits, view)
-        checks += reading_checks(depth, limits, metres_per_unit=unit, view=view)
+        focal = float(frame.camera.intrinsics[view, 0, 0])
+        checks += reading_checks(depth, limits, facts=frame.provenance, focal=focal, view=view)
     checks += intrinsics_checks(frame.camera, limits)
     checks += pose_checks(frame)
     direction = direction_checks(frame, {*repeated, *_views_failing(checks, "depth_unit")})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pcdata.errors import PcdataError
+from pcdata.errors import PcdataError, told_apart
 from pcdata.structures import DepthFrame
 from pcdata.validation.check import Check, Verdict
 from pcdata.validation.overlap import verify_overlap
@@ -49,7 +49,7 @@ def _gap(result: OverlapResult) -> Check:
             unit="m",
         )
     pair = f"{worst.first} and {worst.second}"
-    found = f"half of the surface that {pair} share lies within {1e3 * worst.median:.1f} mm"
+    found = f"half of the surface that {pair} share lies within {told_apart(1e3 * worst.median, 1e3 * passes)[0]} mm"
     if not math.isfinite(worst.median):
         found = f"{pair} look at one place and share no surface"
     verdict = _VERDICTS[worst.verdict]
@@ -69,7 +69,13 @@ def _pose(result: OverlapResult, view: int) -> Check:
     camera = result.cameras[view]
     verdict = _VERDICTS[camera.verdict]
     passes, fails = result.limits.shift
-    found = f"out of place by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees"
+    shift, turn = camera.shift, camera.rotation_degrees
+    shown = told_apart(1e3 * shift, 1e3 * passes)[0], told_apart(turn, result.limits.rotation_degrees[0])[0]
+    found = f"out of place by {shown[0]} mm and {shown[1]} degrees"
+    if camera.name == result.reference and shift == 0:
+        found = "the camera that the others are measured against"
+        if camera.name in result.candidates:
+            found += "; they contradict it, and it may be wrong itself"
     if math.isinf(camera.shift):
         found = "too far out of place to be measured; the others agree without it"
     elif verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
@@ -101,5 +107,5 @@ def _advice(result: OverlapResult, camera: CameraOverlap) -> str:
     if not _is_certain(camera, result.limits):
         return "put objects with upright sides where the cameras overlap"
     if camera.name in result.wrong:
-        return f"recalibrate the camera of {camera.name}: the others agree without it"
+        return next(line for line in result.advice if line.startswith(f"recalibrate {camera.name}:"))
     return "; ".join(result.advice)

@@ -54,10 +54,35 @@ def test_float_tiff_in_metres_is_read(tmp_path: Path) -> None:
     assert depth.tolist() == [[0.5, 2.0]]
 
 
-def test_float_depth_in_another_unit_than_metres_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "d.npy", np.full((2, 2), 500.0, np.float32))
-    with pytest.raises(UnitError, match=r"d\.npy: float depth must already be in metres"):
-        read_depth(path, metres_per_unit=0.001)
+def test_float_millimetres_are_named_and_the_named_unit_reads_them(tmp_path: Path) -> None:
+    path = save(tmp_path / "d.npy", np.linspace(500.0, 501.3, 600, dtype=np.float32).reshape(20, 30))
+    with pytest.raises(UnitError, match=r"beyond 500.* m with metres_per_unit=1; .* fit metres_per_unit=0\.001 "):
+        read_depth(path, metres_per_unit=1.0)
+    depth = read_depth(path, metres_per_unit=0.001)
+    assert depth[0, 0].item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("unit", "encoding"), [(0.001, "rotated"), (0.0001, "rotated"), (0.001, "swapped")])
+def test_depth_whose_bits_are_out_of_order_is_put_in_order(tmp_path: Path, unit: float, encoding: str) -> None:
+    units = np.array([[0, 1, 7, 8], [812, 8191, 8192, 20_001]], np.uint16)
+    bits = (units << 3) | (units >> 13) if encoding == "rotated" else (units << 8) | (units >> 8)
+    depth = read_depth(save(tmp_path / "d.png", bits), metres_per_unit=unit, depth_encoding=encoding)
+    np.testing.assert_array_equal(depth.numpy(), (units * unit).astype(np.float32))
+
+
+def test_a_mark_that_becomes_points_is_warned_of_and_a_wall_at_that_number_is_not(tmp_path: Path) -> None:
+    ramp = np.linspace(700, 900, 4000).reshape(50, 80).astype(np.uint16)
+    marked = np.where(ramp > 880, 65535, ramp).astype(np.uint16)
+    with pytest.warns(UserWarning, match=r"hold 65535, .* points at 65\.535 m.* invalid_values=\[65535\]"):
+        read_depth(save(tmp_path / "m.png", marked), metres_per_unit=0.001)
+    read_depth(save(tmp_path / "m.png", marked), metres_per_unit=0.001, invalid_values=(65535,))
+    read_depth(save(tmp_path / "w.png", np.clip(ramp + 3215, 0, 4095).astype(np.uint16)), metres_per_unit=0.001)
+
+
+def test_an_unknown_order_of_bits_is_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "d.png", MILLIMETRES)
+    with pytest.raises(UnitError, match="depth_encoding must be one of plain, rotated, swapped"):
+        read_depth(path, metres_per_unit=0.001, depth_encoding="shifted")  # type: ignore[arg-type]
 
 
 def test_negative_float_depth_is_refused(tmp_path: Path) -> None:
@@ -75,7 +100,9 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path: Path, unit: object) -> No
 @pytest.mark.parametrize(("value", "unit", "word"), [(600, 1.0, "beyond"), (600, 1e-6, "within")])
 def test_a_wrong_unit_shows_in_the_median_depth(tmp_path: Path, value: int, unit: float, word: str) -> None:
     path = save(tmp_path / "d.png", np.full((4, 4), value, np.uint16))
-    with pytest.raises(UnitError, match=rf"{word} .* is metres_per_unit right\? 0\.001 for millimetres"):
+    with pytest.raises(
+        UnitError, match=rf"{word} .* is metres_per_unit right\? the numbers fit .*metres_per_unit=0\.001 "
+    ):
         read_depth(path, metres_per_unit=unit)
 
 
