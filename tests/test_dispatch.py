@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import subprocess
 import sys
 import types
 
@@ -140,3 +141,28 @@ def test_a_wanted_gradient_is_computed_by_the_reference():
     chamfer_distance(points, None, target, None).sum().backward()
     assert points.grad is not None
     assert bool((points.grad != 0).any())
+
+
+SLOW = """
+import sys, warnings, torch
+from pcdata.kernels import native
+def absent():
+    raise OSError("there is no core")
+native.library = absent
+from pcdata import functional as F
+from pcdata.errors import SlowBackendWarning
+points = torch.rand(20, 3)
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    F.knn(points, k=2, backend="torch")
+    assert not told
+    F.knn(points, k=2)
+    F.dbscan(points)
+assert [(one.category, "there is no core" in str(one.message)) for one in told] == [(SlowBackendWarning, True)], told
+print("once")
+"""
+
+
+def test_without_the_core_one_warning_says_that_all_is_slow():
+    done = subprocess.run([sys.executable, "-c", SLOW], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "once", done.stderr

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from pcdata.dispatch import warn_if_slow
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.rng import generator_for
 from pcdata.structures import PointCloud
@@ -28,6 +29,7 @@ class SampleDataset(Dataset[PointCloud]):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
         if len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
+        warn_if_slow()  # workers stay silent
         self.ids = list(ids)
         self.transform = transform
         self.seed = seed

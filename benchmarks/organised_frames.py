@@ -1,0 +1,123 @@
+"""Organised real captures through normals and outliers, one process per frame: no crash, and the reference's answers.
+
+    PCDATA_TEST_DATA=... python benchmarks/organised_frames.py [--limit 2] [--out RESULTS.json]
+
+Every folder of the data, and in them, that a source reads counts; of each, the first ``--limit`` captures. In a process
+of its own each frame is deprojected and goes through three settings each of statistical outliers, radius outliers and
+normals, with its image grid. Compared: the masks of the whole frame with those found without the grid, by another
+search, and those of 4,000 points of its first view with torch's; normals of the whole frame with those found without the
+grid (a thousandth may differ: where two directions tie, either may be given).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+SETTINGS: dict[str, list[dict[str, Any]]] = {
+    "statistical_outlier_mask": [
+        {"num_neighbors": 20, "std_ratio": 2.0},
+        {"num_neighbors": 8, "std_ratio": 1.0},
+        {"num_neighbors": 40, "std_ratio": 3.0},
+    ],
+    "radius_outlier_mask": [
+        {"min_neighbors": 5, "radius": 0.01},
+        {"min_neighbors": 16, "radius": 0.02},
+        {"min_neighbors": 3, "radius": 0.005},
+    ],
+    "estimate_normals": [
+        {"radius": 0.02, "max_neighbors": 30},
+        {"radius": 0.01, "max_neighbors": 9},
+        {"radius": 0.05, "max_neighbors": 48},
+    ],
+}
+MOST_COMPARED = 4000
+
+
+def check_frame(folder: str, capture: str) -> dict[str, Any]:
+    """Run all settings on one capture; return what differs from the reference."""
+    import torch
+
+    import pcdata
+    from pcdata import functional as F
+    from pcdata.functional.grid import ImageGrid
+
+    frame = pcdata.open_source(folder).load(capture)
+    if not isinstance(frame, pcdata.DepthFrame):
+        return {"skipped": "not a depth frame"}
+    points, ptr, pixel = F.deproject_depth(frame.depth, frame.camera.intrinsics)
+    grid = ImageGrid(pixel, tuple(frame.depth.shape[1:]), frame.camera.intrinsics)
+    first = int(ptr[1]) // 2
+    part = slice(max(0, first - MOST_COMPARED // 2), min(int(ptr[1]), first + MOST_COMPARED // 2))
+    some, some_ptr = points[part], torch.tensor([0, part.stop - part.start])
+    some_grid = ImageGrid(pixel[part], grid.size, grid.intrinsics[:1])
+    differences = 0
+    for name, settings in SETTINGS.items():
+        function = getattr(F, name)
+        for options in settings:
+            with_grid = function(points, ptr, **options, grid=grid)
+            without = function(points, ptr, **options)
+            if with_grid.dtype is torch.bool:
+                reference = function(some, some_ptr, **options, backend="torch")
+                ours = function(some, some_ptr, **options, grid=some_grid)
+                differences += int((with_grid != without).sum()) + int((ours != reference).sum())
+            else:
+                # Sums taken in another order: directions that stand out agree; where two tie, any may be given.
+                apart = torch.minimum((with_grid - without).abs().amax(1), (with_grid + without).abs().amax(1))
+                differences += int((~torch.isfinite(with_grid)).sum()) + int((apart > 1e-3).sum() > len(apart) // 1000)
+    return {"points": len(points), "differences": differences}
+
+
+def frames(data: Path, limit: int) -> list[tuple[str, str]]:
+    """List (folder, capture) of everything below the data that opens as a source."""
+    import pcdata
+
+    found = []
+    for folder in [*sorted(path for path in data.glob("*") if path.is_dir()), *sorted(data.glob("*/*/"))]:
+        try:
+            ids = list(pcdata.open_source(folder).ids)
+        except Exception as error:
+            print(f"{folder.name:40s} skipped: {str(error).splitlines()[0][:100]}")
+            continue
+        found += [(str(folder), capture) for capture in ids[:limit]]
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--limit", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--frame", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.frame:
+        print(json.dumps(check_frame(*options.frame)))
+        return
+    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+    data = Path(os.environ["PCDATA_TEST_DATA"])
+    rows = []
+    for folder, capture in frames(data, options.limit):
+        start = time.perf_counter()
+        command = [sys.executable, __file__, "--frame", folder, capture]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        row: dict[str, Any] = {"frame": f"{Path(folder).relative_to(data)}/{capture}", "exit": done.returncode}
+        if done.returncode == 0:
+            row |= json.loads(done.stdout.splitlines()[-1])
+        else:
+            row["error"] = (done.stderr.strip().splitlines() or [""])[-1]
+        rows.append(row)
+        print(f"{row['frame']:60s} {row} {time.perf_counter() - start:.1f} s", flush=True)
+    crashes = sum(row["exit"] < 0 for row in rows)
+    differences = sum(row.get("differences", 0) for row in rows)
+    print(f"{len(rows)} frames, {crashes} crashes, {differences} differences")
+    if options.out:
+        options.out.write_text(json.dumps({"crashes": crashes, "differences": differences, "frames": rows}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
