@@ -2,11 +2,12 @@
 
     PCDATA_TEST_DATA=... python benchmarks/organised_frames.py [--limit 2] [--out RESULTS.json]
 
-Every folder of the data, and in them, that a source reads counts; of each, the first ``--limit`` captures. In a process
-of its own each frame is deprojected and goes through three settings each of statistical outliers, radius outliers and
-normals, with its image grid. Compared: the masks of the whole frame with those found without the grid, by another
-search, and those of 4,000 points of its first view with torch's; normals of the whole frame with those found without the
-grid (a thousandth may differ: where two directions tie, either may be given).
+Of every folder that a source reads, and of every other folder of 16-bit PNG, EXR or .npy depth images, the first
+``--limit`` frames; the latter with a camera made up, for only the geometry of the pixels matters here. In a process of
+its own each frame goes through three settings each of statistical outliers, radius outliers and normals, with its image
+grid. Compared: masks of the whole frame with those found without the grid, by another search, and masks of 4,000 points
+of the first view with torch's; normals of the whole frame with those found without the grid (a thousandth may differ:
+where two directions tie, either may be given).
 """
 
 from __future__ import annotations
@@ -48,11 +49,17 @@ def check_frame(folder: str, capture: str) -> dict[str, Any]:
     from pcdata import functional as F
     from pcdata.functional.grid import ImageGrid
 
-    frame = pcdata.open_source(folder).load(capture)
-    if not isinstance(frame, pcdata.DepthFrame):
-        return {"skipped": "not a depth frame"}
-    points, ptr, pixel = F.deproject_depth(frame.depth, frame.camera.intrinsics)
-    grid = ImageGrid(pixel, tuple(frame.depth.shape[1:]), frame.camera.intrinsics)
+    if Path(capture).is_file():
+        depth, intrinsics = read_image(Path(capture))
+    else:
+        frame = pcdata.open_source(folder).load(capture)
+        if not isinstance(frame, pcdata.DepthFrame):
+            return {"skipped": "not a depth frame"}
+        depth, intrinsics = frame.depth, frame.camera.intrinsics
+    points, ptr, pixel = F.deproject_depth(depth, intrinsics)
+    if len(points) == 0:
+        return {"points": 0, "differences": 0}
+    grid = ImageGrid(pixel, (depth.shape[1], depth.shape[2]), intrinsics)
     first = int(ptr[1]) // 2
     part = slice(max(0, first - MOST_COMPARED // 2), min(int(ptr[1]), first + MOST_COMPARED // 2))
     some, some_ptr = points[part], torch.tensor([0, part.stop - part.start])
@@ -74,6 +81,34 @@ def check_frame(folder: str, capture: str) -> dict[str, Any]:
     return {"points": len(points), "differences": differences}
 
 
+def read_image(path: Path) -> tuple[Any, Any]:
+    """Read one depth image in metres, (1, H, W), and a camera that could have taken it."""
+    import numpy as np
+    import torch
+
+    if path.suffix == ".npy":
+        values = np.load(path, allow_pickle=False)
+    elif path.suffix == ".exr":
+        import cv2
+
+        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    else:
+        from PIL import Image
+
+        values = np.asarray(Image.open(path))
+    values = np.squeeze(values if values.ndim < 3 or values.shape[-1] in (1,) else values[..., 0])
+    scale = 0.001 if values.dtype.kind in "iu" else 1.0
+    depth = np.nan_to_num(values.astype(np.float32) * np.float32(scale), nan=0, posinf=0, neginf=0).clip(0, 50)
+    height, width = depth.shape
+    camera = [[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]]
+    return torch.from_numpy(depth)[None], torch.tensor([camera], dtype=torch.float64)
+
+
+def depth_images(folder: Path) -> list[str]:
+    files = [path for path in sorted(folder.iterdir()) if path.suffix in (".png", ".npy", ".exr")]
+    return [str(path) for path in files if "depth" in f"{folder.name}/{path.name}".lower()]
+
+
 def frames(data: Path, limit: int) -> list[tuple[str, str]]:
     """List (folder, capture) of everything below the data that opens as a source."""
     import pcdata
@@ -83,8 +118,9 @@ def frames(data: Path, limit: int) -> list[tuple[str, str]]:
         try:
             ids = list(pcdata.open_source(folder).ids)
         except Exception as error:
-            print(f"{folder.name:40s} skipped: {str(error).splitlines()[0][:100]}")
-            continue
+            ids = depth_images(folder)
+            if not ids:
+                print(f"{folder.name:40s} skipped: {str(error).splitlines()[0][:100]}")
         found += [(str(folder), capture) for capture in ids[:limit]]
     return found
 
