@@ -9,6 +9,7 @@ import difflib
 import errno
 from collections.abc import Iterable, Sequence
 
+_LONGEST = 2000  # characters of one fault, which may repeat a name from a file
 _LINES = 50  # faults of one file, of which nearly every line is wrong
 
 
@@ -136,7 +137,8 @@ def near_matches(word: str, known: Iterable[str]) -> str:
 def first_lines(lines: Sequence[str]) -> str:
     """Return faults one to a line, the first of them where there are very many."""
     more = [f"and {len(lines) - _LINES} more"] if len(lines) > _LINES else []
-    return "\n".join([*lines[:_LINES], *more])
+    shown = [line if len(line) <= _LONGEST else f"{line[:_LONGEST]}..." for line in lines[:_LINES]]
+    return "\n".join([*shown, *more])
 
 
 def told_apart(value: float, limit: float, digits: int = 3) -> tuple[str, str]:
