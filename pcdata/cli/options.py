@@ -12,7 +12,7 @@ KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
 _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class: its flag
     "metres_per_unit": (
         "--metres-per-unit",
-        {"type": float, "metavar": "M", "help": "length of one stored depth unit"},
+        {"type": float, "metavar": "M", "help": "length of one stored unit of depth or coordinates"},
     ),
     "depth_encoding": (
         "--depth-encoding",

@@ -10,6 +10,7 @@ import struct
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ Columns = dict[str, NDArray[Any]]
 _RUN = 1 << 12  # rows compared at once
 _ALONE = 64  # rows stepped over before another run is tried
 _GATHER = 1 << 20  # bytes picked at once
+_FACES = 1 << 16  # checked at once
+_CORNERS = ("vertex_indices", "vertex_index")
 
 
 def vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> Columns:
@@ -36,7 +39,7 @@ def vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> 
     for element in elements:
         dtype = element.row_dtype
         if dtype is None:
-            columns, offset = _rows_with_lists(where, element, body, offset)
+            columns, offset = _rows_with_lists(where, element, body, offset, _vertex(elements).count)
         else:
             end = offset + element.count * dtype.itemsize
             if end > len(body):
@@ -70,7 +73,7 @@ def vertices_of_text(where: str, elements: list[Element], body: memoryview) -> C
             element, missing = waiting[0]
             taken = min(missing, len(lines.bounds) - 1)
             mine, lines = _split(lines, taken)
-            columns = _columns_of_text(where, element, mine)
+            columns = _columns_of_text(where, element, mine, _vertex(elements).count)
             if element.name == "vertex":
                 parts.append(columns)
             waiting[0] = element, missing - taken
@@ -93,7 +96,9 @@ class _Segment:
     dtype: np.dtype
     length_of: Callable[[memoryview, int], tuple[Any, ...]] | None = None
     length_dtype: np.dtype | None = None
+    item: np.dtype | None = None
     item_bytes: int = 0
+    is_corners: bool = False  # the list names vertices
 
 
 def _segments(element: Element) -> list[_Segment]:
@@ -106,18 +111,28 @@ def _segments(element: Element) -> list[_Segment]:
         code = code.replace("i4", "i").replace("u4", "I").replace("|", "")
         length_of = struct.Struct(code).unpack_from
         names = [name for name, _ in fixed]
-        segments.append(_Segment(names, np.dtype(fixed), length_of, entry.length_dtype, entry.dtype.itemsize))
+        segments.append(
+            _Segment(
+                names, np.dtype(fixed), length_of, entry.length_dtype, entry.dtype, entry.dtype.itemsize,
+                entry.name in _CORNERS and entry.dtype.kind in "iu",
+            )
+        )  # fmt: skip
         fixed = []
     return [*segments, _Segment([name for name, _ in fixed], np.dtype(fixed))] if fixed else segments
 
 
-def _rows_with_lists(where: str, element: Element, body: memoryview, offset: int) -> tuple[Columns, int]:
+def _rows_with_lists(
+    where: str, element: Element, body: memoryview, offset: int, num_vertices: int
+) -> tuple[Columns, int]:
     segments = _segments(element)
     least = sum(one.dtype.itemsize + (one.length_dtype.itemsize if one.length_dtype else 0) for one in segments)
     if element.count * least > len(body) - offset:
         needed = element.count * least
         raise _truncated(where, element, f"needs {needed} bytes or more but only {len(body) - offset} are left")
     kept = [array("q") if element.name == "vertex" and one.names else None for one in segments]
+    corners = [one for one in segments if element.name == "face" and one.is_corners]
+    if corners:
+        kept[segments.index(corners[0])] = array("q")  # whose vertices are checked
     row, alone = 0, _ALONE
     while row < element.count:
         rows, offset = _run(element.count - row, segments, body, offset, kept)
@@ -129,7 +144,9 @@ def _rows_with_lists(where: str, element: Element, body: memoryview, offset: int
             row += count
     columns: Columns = {}
     for one, starts in zip(segments, kept):
-        if starts is not None:
+        if starts is not None and one in corners:
+            _check_corners(where, element, one, np.frombuffer(starts, np.int64), body, num_vertices)
+        elif starts is not None:
             rows_of_segment = _gather(body, np.frombuffer(starts, np.int64), one.dtype)
             columns |= {name: rows_of_segment[name] for name in one.names}
     return {entry.name: columns[entry.name] for entry in element.properties if entry.name in columns}, offset
@@ -205,6 +222,56 @@ def _run(
     return rows, offset + rows * size
 
 
+def _check_corners(
+    where: str,
+    element: Element,
+    segment: _Segment,
+    starts: NDArray[np.int64],
+    body: memoryview,
+    num_vertices: int,
+) -> None:
+    """Require the vertices of faces to be there: where a count is wrong, faces are read from other bytes."""
+    if segment.item is None or segment.length_dtype is None:
+        return
+    raw = np.frombuffer(body, np.uint8)
+    for first in range(0, len(starts), _FACES):
+        places = starts[first : first + _FACES] + segment.dtype.itemsize
+        lengths = _gather(body, places, np.dtype([("n", segment.length_dtype)]))["n"].astype(np.int64)
+        places = places + segment.length_dtype.itemsize
+        pitch = int(places[1] - places[0]) if len(places) > 1 else 1
+        if (lengths == lengths[0]).all() and (np.diff(places) == pitch).all():  # triangles: no need to pick them
+            shape, strides = (len(places), int(lengths[0])), (pitch, segment.item_bytes)
+            corners = np.ndarray(shape, segment.item, body, int(places[0]) if lengths[0] else 0, strides)
+            _check_named(where, element, corners, num_vertices)
+            continue
+        for part in _in_parts(lengths, _GATHER // segment.item_bytes):
+            at = _of_lists(places[part], lengths[part], segment.item_bytes)
+            corners = raw[at[:, None] + np.arange(segment.item_bytes)].reshape(-1).view(segment.item)
+            _check_named(where, element, corners, num_vertices)
+
+
+def _check_named(where: str, element: Element, corners: NDArray[Any], num_vertices: int) -> None:
+    if corners.size and not 0 <= int(corners.min()) <= int(corners.max()) < num_vertices:
+        raise CaptureError(
+            f"{where}: element {element.name!r} names the vertices {int(corners.min())} to {int(corners.max())}, but "
+            f"there are {num_vertices}; is a count wrong, or the file damaged?"
+        )
+
+
+def _in_parts(lengths: NDArray[np.int64], most: int) -> list[slice]:
+    """Cut rows into parts of about ``most`` items."""
+    part = np.cumsum(lengths) // most
+    cuts = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(lengths)]
+    return [slice(a, b) for a, b in pairwise(cuts)]
+
+
+def _of_lists(starts: NDArray[np.int64], lengths: NDArray[np.int64], step: int) -> NDArray[np.int64]:
+    """Return where every item of lists lies, by where the lists start."""
+    ends = np.cumsum(lengths)
+    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
+    return np.repeat(starts, lengths) + step * within
+
+
 def _gather(body: memoryview, starts: NDArray[np.int64], dtype: np.dtype) -> NDArray[Any]:
     """Return the packed rows that begin at the given bytes."""
     raw = np.frombuffer(body, np.uint8)
@@ -232,7 +299,7 @@ def _check_end(where: str, elements: list[Element], rest: memoryview) -> None:
 # -- text --------------------------------------------------------------------------------------------------------------
 
 
-def _columns_of_text(where: str, element: Element, lines: TextLines) -> list[NDArray[Any]]:
+def _columns_of_text(where: str, element: Element, lines: TextLines, num_vertices: int) -> list[NDArray[Any]]:
     if element.row_dtype is not None:
         names, dtypes = [e.name for e in element.properties], [e.dtype for e in element.properties]
         return table_columns(where, names, dtypes, lines)
@@ -246,7 +313,10 @@ def _columns_of_text(where: str, element: Element, lines: TextLines) -> list[NDA
             place += 1
         else:
             _check_lines(where, element, lines, (found >= 0) & (found == np.rint(found)) & (found <= ends - place))
-            place += 1 + found.astype(np.int64)
+            lengths = found.astype(np.int64)
+            if element.name == "face" and entry.name in _CORNERS:
+                _check_named(where, element, lines.values[_of_lists(place + 1, lengths, 1)], num_vertices)
+            place += 1 + lengths
     _check_lines(where, element, lines, place == ends)
     return columns
 

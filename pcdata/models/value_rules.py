@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.planes import ransac_plane
+from pcdata.lengths import WIDEST, plausible_units
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import is_camera
 from pcdata.models.contract import MIN_POINTS, Channel, InputTensor, ModelContract, Role
@@ -18,7 +19,7 @@ from pcdata.validation.check import graded
 
 # The longest side of a cloud in metres. Below: a cloud in kilometres or a lone point; above: millimetres, where a cup
 # is 80 and a table 800.
-EXTENT = (0.005, 25.0)
+EXTENT = (0.005, WIDEST)
 
 _STRAY = 0.01  # share of values that sensor noise may put outside a crop or behind the camera
 _TOLERANCE = 1e-3  # of a normalised coordinate
@@ -150,7 +151,9 @@ def _scale(clouds: list[Tensor], contract: ModelContract) -> Check:
         fault = found if high > 2 + _TOLERANCE or low < 0.1 else ""
         return verdict("scale", fault, "normalise as the preset does: the longest side is at most 2", found=found)
     fault = found if low < EXTENT[0] or high > EXTENT[1] else ""
-    hint = "millimetres? give the reader metres_per_unit=0.001" if high > EXTENT[1] else "a crop that leaves nothing?"
+    fitting = [f"by {unit:g} if they are {name}" for name, unit in plausible_units(high).items() if unit < 1]
+    hint = f"multiply the coordinates {' or '.join(fitting) or 'by their unit'}, where they are read or before"
+    hint = hint if high > EXTENT[1] else "a crop that leaves nothing, or a unit that was applied twice?"
     return verdict("scale", fault, f"the model works in metres: {hint}", found=f"{found}, in metres")
 
 

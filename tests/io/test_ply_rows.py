@@ -90,6 +90,40 @@ def test_a_count_that_is_too_small_is_refused(tmp_path: Path, encoding: str, cou
 
 
 @each_encoding
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("sides", ["triangles", "mixed"])
+def test_a_count_that_is_too_small_before_faces_is_refused(
+    tmp_path: Path, encoding: str, seed: int, sides: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    numbers = [3] * 40 if sides == "triangles" else rng.integers(3, 6, 40)
+    faces = [(tuple(rng.integers(0, 120, n).tolist()),) for n in numbers]
+    faces[-1] = ((119, 0, 1),)
+    path = file_of(
+        tmp_path / "c.ply",
+        encoding,
+        ("vertex", XYZ, [tuple(row) for row in vertices(120, seed)]),
+        ("face", [("vertex_indices", "list uchar int")], faces),
+    )
+    assert read_ply(path).num_points == 120
+    right = path.read_bytes()
+    for told, wrong in ((b"vertex 120", b"vertex 12"), (b"vertex 120", b"vertex 119"), (b"face 40", b"face 4")):
+        path.write_bytes(right.replace(told, wrong))
+        with pytest.raises(CaptureError):
+            read_ply(path)
+
+
+@each_encoding
+@pytest.mark.parametrize("corner", [-1, 3])
+def test_faces_that_name_vertices_which_are_not_there_are_refused(tmp_path: Path, encoding: str, corner: int) -> None:
+    for faces in ([((0, 1, 2),), ((0, 1, corner),)], [((0, 1, 2, 0),), ((0, 1, corner),)]):
+        face = ("face", [("flag", "uchar"), ("vertex_index", "list uchar int")], [(7, *row) for row in faces])
+        path = file_of(tmp_path / "c.ply", encoding, face, ("vertex", XYZ, [tuple(row) for row in vertices(3)]))
+        with pytest.raises(CaptureError, match="names the vertices"):
+            read_ply(path)
+
+
+@each_encoding
 @pytest.mark.parametrize("tail", [b"\n", b"\r\n", b"\0", b"\0\0\0\0", b"\n\n", b"\x1a"])
 def test_line_ends_and_padding_behind_the_data_are_no_points(tmp_path: Path, encoding: str, tail: bytes) -> None:
     if encoding == "ascii" and tail.strip():
