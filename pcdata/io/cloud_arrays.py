@@ -36,6 +36,7 @@ class CloudArrays:
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # of extra fields, where known
 
 
+@np.errstate(invalid="ignore", over="ignore")  # NaNs of every kind are judged by value
 def to_cloud(
     where: str,
     arrays: CloudArrays,

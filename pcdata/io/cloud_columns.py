@@ -48,6 +48,7 @@ _MEASURED = (
 )
 
 
+@np.errstate(invalid="ignore", over="ignore")  # NaNs of every kind are judged by value
 def arrays_of_columns(
     where: str, columns: Columns, statement: CloudStatement, *, labels_from: str | None = None
 ) -> CloudArrays:
