@@ -20,14 +20,13 @@ def seeded(seed: int) -> Generator:
     return Generator().manual_seed(seed)
 
 
-def generator_for(seed: int, epoch: int, sample_id: str) -> Generator:
-    """Return the generator that belongs to one sample in one epoch.
+def generator_for(seed: int, epoch: int, sample_id: str, *, copy: int = 0) -> Generator:
+    """Return the generator that belongs to one sample in one epoch, or to one of several copies of it.
 
     The key is hashed (SHA-256), so neighbouring seeds and ids give unrelated streams.
     """
-    digest = hashlib.sha256(
-        f"{seed}\0{epoch}\0{sample_id}".encode(errors="surrogatepass")
-    ).digest()  # file names may be no UTF-8
+    key = f"{seed}\0{epoch}\0{sample_id}" + (f"\0{copy}" if copy else "")
+    digest = hashlib.sha256(key.encode(errors="surrogatepass")).digest()  # file names may be no UTF-8
     return seeded(int.from_bytes(digest[:8], "big") >> 1)
 
 

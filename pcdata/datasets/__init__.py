@@ -3,12 +3,16 @@
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.datasets.clouds import CaptureSource, CloudDataset
 from pcdata.datasets.collate import collate_fixed, collate_packed, collate_padded
+from pcdata.datasets.copies import CountedSampler
+from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.datasets.samples import SampleDataset
 
 __all__ = [
     "CachedCloudDataset",
     "CaptureSource",
     "CloudDataset",
+    "CountedSampler",
+    "RepeatedEpochWarning",
     "SampleDataset",
     "collate_fixed",
     "collate_packed",

@@ -28,6 +28,7 @@ class CachedCloudDataset(SampleDataset):
         augment: what runs on the stored clouds: "stored" = the random suffix of the pipeline, None = nothing, or any
             transform.
         seed: of all random draws, together with the epoch and the sample id.
+        repeats: how often every sample is in the dataset, each time with other random draws.
 
     Raises:
         CacheError: damaged, hostile or incomplete files, or another pipeline's cache.
@@ -40,6 +41,7 @@ class CachedCloudDataset(SampleDataset):
         pipeline: Pipeline | None = None,
         augment: Transform | Literal["stored"] | None = "stored",
         seed: int = 0,
+        repeats: int = 1,
     ) -> None:
         if isinstance(augment, str) and augment != "stored":
             raise ConfigError(f"augment must be 'stored', None or a transform, got {augment!r}")
@@ -60,7 +62,7 @@ class CachedCloudDataset(SampleDataset):
             )
         self.pipeline = wanted
         transform = wanted.random_suffix() if isinstance(augment, str) else augment
-        super().__init__([sample.id for sample in self.manifest.samples], transform, seed)
+        super().__init__([sample.id for sample in self.manifest.samples], transform, seed, repeats)
         self._store = STORES[self.manifest.format](self.folder)
 
     def _stored_pipeline(self) -> Pipeline:

@@ -28,15 +28,18 @@ class CloudDataset(SampleDataset):
         source: where captures come from.
         transform: from what the source gives to a ``PointCloud``; may be random.
         seed: of all random draws, together with the epoch and the sample id.
+        repeats: how often every sample is in the dataset, each time with other random draws.
     """
 
-    def __init__(self, source: CaptureSource, transform: Transform | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self, source: CaptureSource, transform: Transform | None = None, *, seed: int = 0, repeats: int = 1
+    ) -> None:
         if not hasattr(source, "ids") or not hasattr(source, "load"):
             raise DTypeError(
                 f"CloudDataset: source must have ids and load(id), got {type(source).__name__}; "
                 "pcdata.open_source(path) makes one of a folder"
             )
-        super().__init__(source.ids, transform, seed)
+        super().__init__(source.ids, transform, seed, repeats)
         self.source = source
 
     def _load(self, index: int) -> DepthFrame | PointCloud:

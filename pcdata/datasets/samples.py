@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from pcdata.datasets.passes import PassWatch, shared
 from pcdata.dispatch import warn_if_slow
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.rng import generator_for
@@ -17,24 +18,29 @@ from pcdata.transforms import Transform
 
 
 class SampleDataset(Dataset[PointCloud]):
-    """Samples by index; random steps draw from (seed, epoch, sample id) alone.
+    """Samples by index; random steps draw from (seed, epoch, sample id, copy) alone.
 
-    So the same sample comes out of the main process, or of any worker of any number of workers.
+    So the same sample comes out of the main process, or of any worker of any number of workers. With ``repeats`` every
+    sample is in the dataset so often: index ``i + copy * len(ids)`` is copy number ``copy`` of sample ``i``, with draws
+    of its own. ``dataset[index, copy]``, which :class:`~pcdata.datasets.CountedSampler` asks for, counts on from there.
     """
 
     gives: type = PointCloud  # what every sample must be in the end
 
-    def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int) -> None:
+    def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int, repeats: int = 1) -> None:
         if transform is not None and not isinstance(transform, Transform):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
         if len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
+        if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+            raise ConfigError(f"repeats must be how often every sample is in the dataset, 1 or more, got {repeats!r}")
         warn_if_slow()  # workers stay silent
         self.ids = list(ids)
+        self.repeats = repeats
         self.transform = transform
         self.seed = seed
-        # Shared memory: workers that live through several epochs see the change too.
-        self._epoch = _shared(torch.zeros((), dtype=torch.int64, device="cpu"))
+        self._epoch = shared(torch.zeros((), dtype=torch.int64, device="cpu"))
+        self._passes = PassWatch(len(self))
 
     @property
     def epoch(self) -> int:
@@ -42,24 +48,36 @@ class SampleDataset(Dataset[PointCloud]):
         return int(self._epoch)
 
     def set_epoch(self, epoch: int) -> None:
-        """Change the random draws; call it before each epoch, also with persistent workers."""
+        """Change the random draws; call it before each pass over the data, also with persistent workers.
+
+        A second pass without it repeats the draws of the first and warns once (:class:`RepeatedEpochWarning`).
+        """
         self._epoch.fill_(operator.index(epoch))
+        self._passes.restart()
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return len(self.ids) * self.repeats
 
     def __iter__(self) -> Iterator[PointCloud]:
         # Without this, Python would take an IndexError from inside a transform for the end.
         return (self[index] for index in range(len(self)))
 
-    def __getitem__(self, index: int | slice) -> PointCloud:
+    def __getitem__(self, index: int | tuple[int, int] | slice) -> PointCloud:
         if isinstance(index, slice):
             raise DTypeError("a dataset gives one sample per index; for several use torch.utils.data.Subset")
-        sample_id = self.ids[index]
+        place, more = index if isinstance(index, tuple) else (index, 0)
+        if not -len(self) <= place < len(self):
+            raise IndexError(f"there is no sample {place}: {self!r} has indices 0 to {len(self) - 1}")
+        place = operator.index(place) % len(self)
+        copy, number = divmod(place, len(self.ids))
+        sample_id = self.ids[number]
         try:
-            data = self._load(index)
+            data = self._load(number)
             if self.transform is not None:
-                data = self.transform(data, generator=generator_for(self.seed, self.epoch, sample_id))
+                if self.transform.is_random and not more:
+                    self._passes.note(place, repr(self))
+                generator = generator_for(self.seed, self.epoch, sample_id, copy=copy + more * self.repeats)
+                data = self.transform(data, generator=generator)
             if not isinstance(data, self.gives):
                 raise DTypeError(
                     f"the dataset gives a {type(data).__name__}; its transform must end in a {self.gives.__name__}"
@@ -71,13 +89,8 @@ class SampleDataset(Dataset[PointCloud]):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._epoch = _shared(self._epoch)  # a copy or an unpickled dataset owns its own number
+        self._epoch = shared(self._epoch)  # a copy or an unpickled dataset owns its own number
 
     def _load(self, index: int) -> Any:
         """Load the sample before the transform."""
         raise NotImplementedError
-
-
-def _shared(number: torch.Tensor) -> torch.Tensor:
-    shared: torch.Tensor = number.share_memory_()
-    return shared

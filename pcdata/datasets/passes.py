@@ -1,0 +1,72 @@
+"""Whether the data are gone through a second time in one epoch: then every random draw comes again."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor
+
+
+class RepeatedEpochWarning(UserWarning):
+    """A second pass over a dataset repeats the random draws of the first."""
+
+
+class PassWatch:
+    """Notice a second pass, in shared memory: whatever the number of workers, and however they were started.
+
+    A pass reads (nearly) every sample once before it reads one again. What reads samples again earlier (sampling with
+    replacement, looking at single samples) is no pass, and a few looks after a pass are no second one.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._seen = shared(torch.zeros(size, dtype=torch.bool, device="cpu"))
+        self._again = shared(torch.zeros((), dtype=torch.int64, device="cpu"))  # reads again; negative: look no more
+
+    def restart(self) -> None:
+        """Begin an epoch."""
+        self._seen.zero_()
+        self._again.zero_()
+
+    @property
+    def has_warned(self) -> bool:
+        """Whether a second pass was noticed in this epoch."""
+        return int(self._again) == _WARNED
+
+    def note(self, index: int, what: str) -> None:
+        """Note that a sample is read with random draws; warn once an epoch when half of a second pass is done."""
+        if int(self._again) < 0:
+            return
+        if not bool(self._seen[index]):
+            self._seen[index] = True
+            return
+        size = len(self._seen)
+        if int(self._again) == 0 and int(self._seen.sum()) < (size if size < _FEW else _MOST * size):
+            self._again.fill_(_NO_PASSES)
+            return
+        self._again += 1  # a count that workers take from each other now and then only comes a little later
+        if int(self._again) < max(2, (size + 1) // 2):
+            return
+        self._again.fill_(_WARNED)
+        warnings.warn(
+            f"{what}: a second pass in one epoch repeats every random draw of the first; call set_epoch(number) on the "
+            "dataset before each pass (with the same number where the same draws are wanted)",
+            RepeatedEpochWarning,
+            stacklevel=4,
+        )
+
+    def __setstate__(self, state: dict[str, Tensor]) -> None:
+        self.__dict__.update({name: shared(tensor) for name, tensor in state.items()})
+
+
+# Of so many samples one after another a sampler with replacement gives most different ones by chance.
+_FEW = 16
+# A loader that drops its last batch leaves a part of a pass out.
+_MOST = 0.75
+_NO_PASSES, _WARNED = -1, -2
+
+
+def shared(tensor: Tensor) -> Tensor:
+    """Move a tensor to shared memory: workers that live through several epochs see the change too."""
+    moved: Tensor = tensor.share_memory_()
+    return moved

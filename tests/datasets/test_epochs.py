@@ -1,0 +1,188 @@
+"""A forgotten set_epoch is said once, and a sample that comes several times comes with draws of its own."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, RandomSampler, Subset, WeightedRandomSampler
+
+from pcdata import CloudDataset, CountedSampler, PointCloud, collate_packed
+from pcdata.datasets import RepeatedEpochWarning
+from pcdata.errors import ConfigError
+from pcdata.transforms import Center, RandomJitter, Transform
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+
+class Clouds:
+    """A source of small clouds."""
+
+    def __init__(self, count: int) -> None:
+        self.ids = [f"s{number}" for number in range(count)]
+
+    def load(self, sample_id: str) -> PointCloud:
+        return PointCloud(points=torch.full((5, 3), float(sample_id[1:])), frame_id="base")
+
+
+def dataset_of(count: int = 24, transform: Transform | None = None, **options) -> CloudDataset:
+    return CloudDataset(Clouds(count), transform or RandomJitter(sigma=0.1), **options)
+
+
+def read(dataset, order) -> None:
+    for index in order:
+        dataset[index]
+
+
+def shuffled(count: int, seed: int) -> list[int]:
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+
+
+@pytest.mark.parametrize("count", [2, 5, 24, 100])
+def test_a_second_pass_in_one_epoch_is_said_once(count):
+    dataset = dataset_of(count)
+    read(dataset, range(count))
+    with pytest.warns(RepeatedEpochWarning, match=r"second pass in one epoch .* call set_epoch\(number\)") as caught:
+        read(dataset, [place for seed in range(4) for place in shuffled(count, seed)])
+    assert len(caught) == 1
+    dataset.set_epoch(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(dataset, range(count))
+
+
+def test_passes_with_their_own_epochs_say_nothing():
+    dataset = dataset_of()
+    for epoch in range(4):
+        dataset.set_epoch(epoch)
+        read(dataset, range(24))
+    assert not dataset._passes.has_warned
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        [*range(24), 0, 23, 5, 0],  # a look at some samples afterwards
+        [3, 3, *range(24), *range(24)],  # single samples first
+        [0, 0, 0, 0, 0],
+        [*range(24), *range(8)],
+        [*range(10)] * 5,  # a part of the data
+        torch.randint(24, (100,), generator=torch.Generator().manual_seed(0)).tolist(),
+    ],
+)
+def test_reading_samples_again_is_no_second_pass(order):
+    read(dataset_of(), order)
+
+
+@pytest.mark.parametrize("count", [4, 8, 24, 200])
+def test_sampling_with_replacement_is_no_second_pass(count):
+    said = 0
+    for seed in range(30):
+        dataset = dataset_of(count)
+        sampler = RandomSampler(
+            range(count), replacement=True, num_samples=count, generator=torch.Generator().manual_seed(seed)
+        )
+        read(dataset, sampler)
+        said += dataset._passes.has_warned
+    assert said == 0
+
+
+def test_without_random_steps_nothing_is_said():
+    dataset = dataset_of(transform=Center())
+    read(dataset, [*range(24)] * 3)
+
+
+@pytest.mark.parametrize(
+    ("workers", "start", "keep"),
+    [
+        (0, None, False),
+        (2, "fork", False),
+        (2, "fork", True),
+        pytest.param(2, "forkserver", False, marks=pytest.mark.slow),
+        pytest.param(2, "spawn", True, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::pcdata.datasets.RepeatedEpochWarning")
+def test_workers_notice_a_second_pass_however_they_start(workers, start, keep):
+    dataset = dataset_of(26)
+    loader = DataLoader(
+        dataset,
+        batch_size=4,
+        shuffle=True,
+        drop_last=True,
+        num_workers=workers,
+        multiprocessing_context=start,
+        persistent_workers=keep,
+        collate_fn=collate_packed,
+    )
+    for epoch in range(2):
+        dataset.set_epoch(epoch)
+        list(loader)
+        assert not dataset._passes.has_warned
+    list(loader)
+    assert dataset._passes.has_warned
+
+
+def test_a_copy_of_the_dataset_watches_for_itself():
+    dataset = dataset_of()
+    read(dataset, range(24))
+    for twin in (copy.deepcopy(dataset), pickle.loads(pickle.dumps(dataset))):
+        twin.set_epoch(0)
+        read(twin, range(24))
+    assert not dataset._passes.has_warned
+
+
+def test_repeats_are_draws_of_their_own_and_the_first_is_the_old_one():
+    once, thrice = dataset_of(6), dataset_of(6, repeats=3)
+    assert len(thrice) == 18
+    points = [thrice[index].points for index in range(18)]
+    for sample in range(6):
+        assert torch.equal(points[sample], once[sample].points)
+        copies = [points[sample + 6 * number] for number in range(3)]
+        assert all(not torch.equal(copies[a], copies[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
+        assert all(torch.allclose(one, copies[0], atol=2.0) for one in copies)
+    assert torch.equal(thrice[-1].points, thrice[17].points)
+    for outside in (18, -19):
+        with pytest.raises(IndexError, match=f"there is no sample {outside}"):
+            thrice[outside]
+    assert torch.equal(dataset_of(6, repeats=3)[13].points, points[13])
+
+
+@pytest.mark.parametrize("repeats", [0, -1, 1.5, True])
+def test_repeats_that_are_no_count_are_refused(repeats):
+    with pytest.raises(ConfigError, match="repeats must be how often"):
+        dataset_of(6, repeats=repeats)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_counted_sampler_makes_each_copy_another_draw(workers):
+    weights = [10.0, 1.0, 1.0, 1.0]
+
+    def sampler() -> CountedSampler:
+        draws = torch.Generator().manual_seed(3)
+        return CountedSampler(WeightedRandomSampler(weights, 12, replacement=True, generator=draws))
+
+    dataset = dataset_of(4)
+    loader = DataLoader(dataset, batch_size=1, sampler=sampler(), num_workers=workers, collate_fn=collate_packed)
+    points = [batch.points for batch in loader]
+    pairs = list(sampler())
+    assert len(loader) == len(set(pairs)) == 12
+    assert max(copy for _, copy in pairs) >= 3
+    for pair, one in zip(pairs, points):
+        assert torch.equal(one, dataset_of(4)[pair].points)
+    assert len({one.numpy().tobytes() for one in points}) == 12
+
+
+def test_copies_of_a_sampler_continue_those_of_the_dataset():
+    dataset = dataset_of(4, repeats=2)
+    four = [dataset[index].points for index in (1, 5, (1, 1), (5, 1))]
+    assert len({one.numpy().tobytes() for one in four}) == 4
+    assert torch.equal(dataset_of(4, repeats=3)[9].points, four[2])  # copy 2 of sample 1 either way
+
+
+def test_a_subset_of_repeats_keeps_its_draws():
+    dataset = dataset_of(6, repeats=3)
+    assert torch.equal(Subset(dataset, [13])[0].points, dataset[13].points)
