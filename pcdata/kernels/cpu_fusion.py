@@ -13,7 +13,7 @@ from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView
-from pcdata.kernels.native import address, addresses, call, room, room_for
+from pcdata.kernels.native import address, call, numbers, room, room_for
 
 _FEWEST_SLOTS = 1 << 12  # of a table of rows
 _MOST_PIXELS = 2**31 - 1  # of an image: the core numbers them with an int32
@@ -150,7 +150,7 @@ def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
     for place, name in enumerate(_PLANES):
         chunks = [getattr(chunk, name) for chunk in blocks.chunks]
         if chunks and chunks[0] is not None:
-            kept.append(addresses(chunks))
+            kept.append(numbers(plane.data_ptr() for plane in chunks))  # a view: the core knows a chunk's layout
             table[place] = address(kept[-1])
     return table, kept
 
