@@ -25,7 +25,8 @@ LAYERS = [
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
     {"datasets", "validation"},
-    {"build", "calibration", "models"},
+    {"calibration", "models"},
+    {"build"},  # datasets for a model are built by its preset
     {"exports"},  # holds samples to the contracts of models
     {"report"},
     {"demo", "cli", "__main__"},

@@ -96,6 +96,7 @@ def build_dataset(
             pipeline=config.pipeline.to_config(),
             samples=samples,
             skipped=report.skipped,
+            model=_model_of(config),
             versions={
                 "pcdata": pcdata.__version__,
                 "torch": str(torch.__version__),
@@ -105,7 +106,7 @@ def build_dataset(
         )
         try:
             (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
-            (partial / "load.py").write_text(loading_script(config.loader), encoding="utf-8")
+            (partial / "load.py").write_text(loading_script(config.loader, config.model), encoding="utf-8")
             manifest.write(partial)
         except OSError as error:
             raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
@@ -178,6 +179,12 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
             f"build_dataset: {random[0]} in the section depth is random, so no cloud is the same in every epoch and "
             "none can be stored; leave it out here, or load captures on the fly with CloudDataset"
         )
+
+
+def _model_of(config: BuildConfig) -> dict[str, Any]:
+    if config.model is None:
+        return {}
+    return {"name": config.model.contract.name, "choices": config.model.plain_choices()}
 
 
 def _checked_cloud(data: Any) -> PointCloud:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,9 +10,11 @@ import yaml
 from annotated_types import Ge
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from pcdata.build.model_section import preset_of_section, with_model
 from pcdata.build.source_section import SourceSettings, source_settings
-from pcdata.errors import near_matches
+from pcdata.errors import ConfigError, near_matches
 from pcdata.io.stores import COMPRESSIONS, Compression, Format
+from pcdata.models import Preset
 from pcdata.transforms.config import read_config
 from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
 from pcdata.transforms.sensor_words import SENSOR
@@ -44,22 +46,46 @@ class Loader(BaseModel):
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """A parsed configuration file."""
+    """A parsed configuration file; without one, everything at its default."""
 
-    pipeline: Pipeline
-    output: Output
-    loader: Loader
+    pipeline: Pipeline = field(default_factory=Pipeline)
+    output: Output = field(default_factory=Output)
+    loader: Loader = field(default_factory=Loader)
     source: SourceSettings = field(default_factory=SourceSettings)
+    model: Preset | None = None  # whose preset the pipeline is
+
+    def for_model(self, made: Preset) -> BuildConfig:
+        """Return this configuration, which has no steps, with those of a model's preset.
+
+        Raises:
+            ConfigError: it has steps or a model already, or the model takes no clouds that a build stores.
+        """
+        return with_model(self, made)
+
+    def stored_as(self, format: Format) -> BuildConfig:
+        """Return this configuration with another format of storage.
+
+        Raises:
+            ConfigError: the format does not know the compression.
+        """
+        output = self.output.model_copy(update={"format": format})
+        if output.compression not in COMPRESSIONS[format]:
+            raise ConfigError(
+                f"format {format} knows the compression {', '.join(COMPRESSIONS[format])}, not {output.compression}"
+            )
+        return replace(self, output=output)
 
 
 _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
 def load_config(path: str | Path) -> BuildConfig:
-    """Read a YAML file with the sections source, sensor, depth, cloud, augment, output and loader, each optional.
+    """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 
     ``source`` says where the captures are, how they are read and which are left out; paths in it start from the folder
     of the file.
+
+    ``model`` is ``{name: MODEL, CHOICE: VALUE, ...}``: the steps are those of the model's preset.
 
     ``sensor`` is a name that ``pcdata profiles`` lists, or ``{name: ..., depth: metres}``: what the steps' values
     ``sensor`` are computed from.
@@ -74,7 +100,7 @@ def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = N
     """Parse the text of a configuration; see :func:`load_config`. Relative paths in it start from ``folder``."""
     document = YamlDocument(text, name)
     entries = document.mapping(document.root, "a configuration")
-    known = ["source", SENSOR, *SECTIONS, *_SETTINGS]
+    known = ["source", SENSOR, *SECTIONS, "model", *_SETTINGS]
     for section, (key, _) in entries.items():
         if section not in known:
             document.fault(key, f"unknown section {section!r}{near_matches(section, known) or f'; known: {known}'}")
@@ -90,8 +116,9 @@ def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = N
             f"output.compression: format {output.format} knows {known_here}, not {output.compression}",
         )
     source = source_settings(document, entries["source"][1] if "source" in entries else None, folder)
-    pipeline = pipeline_from_document(document, entries)
-    return BuildConfig(pipeline, settings["output"], settings["loader"], source)
+    made = preset_of_section(document, entries)
+    config = BuildConfig(pipeline_from_document(document, entries), settings["output"], settings["loader"], source)
+    return config if made is None else config.for_model(made)
 
 
 def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | None) -> Any:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcdata.cli import rig
+from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def _add_check(steps: Any) -> None:
         help="how it was measured: along the optical axis (default), or normal to the surface (the shortest way)",
     )
     check.add_argument("--roi", type=float, default=0.5, metavar="PART", help="central part of the image (default 0.5)")
-    check.add_argument("--sensor", metavar="NAME", help="hold noise to this sensor's profile (see pcdata profiles)")
+    check.add_argument("--sensor", metavar="NAME", help=f"hold noise to this sensor's profile: {', '.join(SENSORS)}")
     check.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     check.set_defaults(run=_check)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from pcdata.cli.choices import add_model_options, given_preset
+from pcdata.cli.known_names import FORMATS
 from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, skip_list
 from pcdata.cli.progress import Progress
 
@@ -17,13 +19,17 @@ def add_to(commands: Any) -> None:
     demo.set_defaults(run=_demo)
 
     build = commands.add_parser("build", help="build a dataset from captures")
-    build.add_argument("config", metavar="CONFIG", help="YAML file; see configs/ for examples")
+    build.add_argument(
+        "config", nargs="?", metavar="CONFIG", help="YAML file; see configs/ for examples (default: none, with --model)"
+    )
+    add_model_options(build, required=False, help="build what a model takes, instead of the steps of CONFIG")
     build.add_argument(
         "--source",
         metavar="PATH",
         help="folder of captures, or of several cameras' folders, or one cloud file (default: that of CONFIG)",
     )
     build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
+    build.add_argument("--format", choices=FORMATS, help="of the stored clouds (default: that of CONFIG, or hdf5)")
     add_capture_options(build)
     build.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     build.add_argument("--overwrite", action="store_true", help="replace the dataset that is in DIR")
@@ -51,9 +57,18 @@ def _demo(arguments: argparse.Namespace) -> None:
 
 
 def _build(arguments: argparse.Namespace) -> None:
-    from pcdata.build import build_dataset, load_config
+    from pcdata.build import BuildConfig, build_dataset, load_config
+    from pcdata.errors import ConfigError
 
-    config = load_config(arguments.config)
+    if arguments.config is None and arguments.model is None:
+        raise ConfigError("build: nothing says what to build; give a CONFIG, or --model NAME")
+    if arguments.set and arguments.model is None:
+        raise ConfigError("build: --set makes a choice for a model; give --model NAME, or write it into the CONFIG")
+    config = BuildConfig() if arguments.config is None else load_config(arguments.config)
+    if arguments.model is not None:
+        config = config.for_model(given_preset(arguments.model, arguments.set))
+    if arguments.format is not None:
+        config = config.stored_as(arguments.format)
     source = config.source.open(
         arguments.source,
         kind=arguments.kind,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from pcdata.cli.known_names import TARGETS
 from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
 from pcdata.cli.progress import Progress
 
@@ -13,7 +14,7 @@ def add_to(commands: Any) -> None:
     """Add the command to the parser."""
     export = commands.add_parser("export", help="write a dataset or captures in the layout of a model's own loader")
     export.add_argument("path", metavar="PATH", help="dataset that 'pcdata build' wrote, or captures for image targets")
-    export.add_argument("--to", required=True, metavar="NAME", help="target, such as dp3; an unknown name lists them")
+    export.add_argument("--to", required=True, metavar="NAME", help=f"target: {', '.join(TARGETS)}")
     export.add_argument("--out", required=True, metavar="DIR", help="folder of the export")
     export.add_argument(
         "--set",
@@ -21,7 +22,7 @@ def add_to(commands: Any) -> None:
         default=[],
         metavar="OPTION=VALUE",
         type=name_and_value,
-        help="option of the target; repeatable",
+        help="option of the target; repeatable: " + "; ".join(_options_in_words()),
     )
     add_capture_options(export)
     export.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
@@ -34,6 +35,10 @@ def add_to(commands: Any) -> None:
     )
     again.add_argument("--overwrite", action="store_true", help="replace the export that is in DIR")
     export.set_defaults(run=_export)
+
+
+def _options_in_words() -> list[str]:
+    return [f"{target}: {', '.join(options)}" for target, options in TARGETS.items()]
 
 
 def _export(arguments: argparse.Namespace) -> None:

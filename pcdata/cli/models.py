@@ -6,26 +6,19 @@ import argparse
 import json
 from typing import Any
 
-from pcdata.cli.options import name_and_value, positive, value_of
+from pcdata.cli.choices import add_model_options, given_choices
+from pcdata.cli.options import positive
 
 
 def add_to(commands: Any) -> None:
     """Add the commands to the parser."""
     check = commands.add_parser("check", help="check a data set against what a model takes")
     check.add_argument("path", metavar="PATH", help="a built data set, or an npz, HDF5 or zarr v2 file of anyone's")
-    check.add_argument("--model", required=True, metavar="NAME", help="the model (pcdata models lists them)")
+    add_model_options(check, required=True, help="the model")
     check.add_argument("--keys", metavar="POINTS=NAME,...", help="which array of a foreign file is what")
     check.add_argument("--frame", metavar="NAME", help="frame that you train in; of a foreign file also its frame")
     check.add_argument("--unit", choices=["m", "normalized"], help="unit of a foreign file")
     check.add_argument("--num-points", type=positive, metavar="N", help="count, where the model is used with several")
-    check.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="CHOICE=VALUE",
-        type=name_and_value,
-        help="another choice that the model leaves open, such as category=3; repeatable",
-    )
     check.add_argument("--limit", type=positive, metavar="N", help="only the first N samples")
     check.add_argument("--json", metavar="FILE", help="write the outcome to a new file")
     check.set_defaults(run=_check)
@@ -56,18 +49,11 @@ def _holds(path: str, name: str) -> bool:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any]:
-    from pcdata.errors import ConfigError
-    from pcdata.models import CONTRACTS, contract
+    from pcdata.models import contract
 
-    contract(arguments.model)  # an unknown name is an error here
-    choices = {} if arguments.num_points is None else {"num_points": arguments.num_points}
-    if arguments.frame and not CONTRACTS[arguments.model].frame:
-        choices["frame"] = arguments.frame
-    for name, value in arguments.set:
-        if name in choices:
-            raise ConfigError(f"check: {name} is given twice; give it once")
-        choices[name] = value_of(value)
-    return choices
+    is_open = not contract(arguments.model).frame  # else the frame says what a foreign file is in
+    frame = arguments.frame if is_open else None
+    return given_choices(arguments.model, arguments.set, num_points=arguments.num_points, frame=frame)
 
 
 def _check_cache(arguments: argparse.Namespace) -> Any:

@@ -6,9 +6,10 @@ import argparse
 import sys
 from typing import Any
 
+from pcdata.cli.known_names import KINDS
+
 # Here, not taken from the layouts: reading those loads torch, which a help text need not wait for. A test holds the
-# tables to the layouts.
-KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
+# table to the layouts.
 _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class: its flag
     "metres_per_unit": (
         "--metres-per-unit",
@@ -65,6 +66,13 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         "--max-time-apart",
         {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
     ),
+}
+_NO_OPTIONS = {  # of opening captures, not of their layout
+    "path": "the path itself",
+    "kind": "--kind",
+    "limit": "--limit",
+    "skip": "--skip",
+    "skip_refused": "--skip-refused",
 }
 RIG_OPTIONS = ("metres_per_unit", "depth_encoding", "invalid_values", "background_label", "folders", "links_to")
 
@@ -124,6 +132,8 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if "folders" in given:
         given["folders"] = {role: folder or None for role, folder in given["folders"]}
     for name, text in getattr(arguments, "option", []):
+        if name in _NO_OPTIONS:
+            raise ConfigError(f"--option {name}: is no option of a layout; say it with {_NO_OPTIONS[name]}")
         if name in given:
             raise ConfigError(f"--option {name}: this option is given twice; give it once")
         given[name] = value_of(text)
@@ -182,10 +192,10 @@ def name_and_value(text: str) -> tuple[str, str]:
 
 
 def value_of(text: str) -> Any:
-    """Read numbers, boxes and lists as Python writes them, true and false; anything else is a text."""
+    """Read numbers, boxes and lists as Python writes them, true, false and none; anything else is a text."""
     import ast
 
-    words = {"true": True, "false": False, "null": None}
+    words = {"true": True, "false": False, "null": None, "none": None}
     try:
         return words[text.lower()] if text.lower() in words else ast.literal_eval(text)
     except (ValueError, SyntaxError, MemoryError, RecursionError):

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from pcdata.cli.known_names import REFINERS
 from pcdata.cli.options import (
     RIG_OPTIONS,
     add_layout_options,
@@ -36,7 +37,7 @@ def add_steps(steps: Any) -> None:
     _add_rig_options(refine, needs_calibration=True)
     refine.add_argument("--out", required=True, metavar="NEW", help="calibration file to write; must not exist")
     refine.add_argument("--fixed", metavar="NAME", help="camera that stays (default: the one that agrees best)")
-    refine.add_argument("--method", default="pcdata", metavar="NAME", help="pcdata (default), small_gicp or open3d")
+    refine.add_argument("--method", default="pcdata", choices=REFINERS, help=f"{', '.join(REFINERS)} (default: pcdata)")
     refine.add_argument("--max-shift", type=float, default=0.02, metavar="METRES", help="refuse more (default 0.02)")
     refine.add_argument(
         "--max-rotation", type=float, default=2.0, metavar="DEGREES", help="refuse more (default 2 degrees)"

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
+from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
 from pcdata.cli.progress import Progress
 
@@ -22,7 +23,9 @@ def add_to(commands: Any) -> None:
     add_capture_options(validate, can_skip_refused=False)
     validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     depths = validate.add_mutually_exclusive_group()
-    depths.add_argument("--sensor", metavar="NAME", help="depths of interest: the range of a sensor (pcdata profiles)")
+    depths.add_argument(
+        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
+    )
     depths.add_argument(
         "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
     )

@@ -47,6 +47,7 @@ class Manifest:
     samples: Sequence[Sample]
     versions: Mapping[str, str] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
+    model: Mapping[str, Any] = field(default_factory=dict)  # name and choices of the model that it was built for
     schema: str = SCHEMA
 
     def write(self, folder: Path) -> None:
@@ -111,9 +112,17 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r:.100}")
     if manifest.compression not in COMPRESSIONS[manifest.format]:
         raise CacheError(f"compression {manifest.compression!r:.100} does not exist for format {manifest.format}")
-    for name, kind in (("fingerprint", str), ("pipeline", dict), ("versions", dict), ("skipped", dict)):
+    for name, kind in (
+        ("fingerprint", str),
+        ("pipeline", dict),
+        ("versions", dict),
+        ("skipped", dict),
+        ("model", dict),
+    ):
         if not isinstance(getattr(manifest, name), kind):
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
+    if manifest.model and not (isinstance(manifest.model.get("name"), str) and _is_choices(manifest.model)):
+        raise CacheError(f"model must have a name and choices, got {manifest.model!r:.100}")
     if not manifest.samples:
         raise CacheError("it lists no samples; rebuild the dataset")
     for sample in manifest.samples:
@@ -126,6 +135,10 @@ def _check(manifest: Manifest) -> None:
         # Keys become file names: one that could climb out of the folder is refused.
         if sample.key != key_of(sample.id):
             raise CacheError(f"sample {sample.id!r} must have the key {key_of(sample.id)!r}, got {sample.key!r}")
+
+
+def _is_choices(model: Mapping[str, Any]) -> bool:
+    return set(model) == {"name", "choices"} and isinstance(model["choices"], dict)
 
 
 def key_of(sample_id: str) -> str:

@@ -18,7 +18,7 @@ CONTRACTS: dict[str, ModelContract] = {
 
 # What each choice wants, for messages and pages.
 CHOICES = {
-    "frame": "the name of the frame that you train in, as the captures call it: frame='base'",
+    "frame": "the name of the frame that you train in, as the captures call it",
     "crop": "the workspace ((x, y, z), (x, y, z)), smallest and largest, metres in that frame; or None for no crop",
     "category": "the object's category as the model numbers it, 0 to 15",
     "num_points": "the number of points of every cloud",
@@ -28,8 +28,11 @@ CHOICES = {
     "channels": "the names of the channels to feed; those that are not optional must be among them",
 }
 
+# Answers that make an example of every choice that must be made.
+EXAMPLES: dict[str, Any] = {"frame": "base", "crop": ((0.2, -0.4, 0.0), (0.9, 0.4, 0.6)), "category": 3}
 
-def contract(name: str, **choices: Any) -> ModelContract:
+
+def contract(name: str, /, **choices: Any) -> ModelContract:
     """Return the contract of a model with the given choices made; choices left out stay open.
 
     Raises:
@@ -50,7 +53,7 @@ def contract(name: str, **choices: Any) -> ModelContract:
 
 def missing_choices(chosen: ModelContract) -> str:
     """Say which choices are still open and what to give; "" = none."""
-    return "; ".join(f"{choice}: {CHOICES[choice]}" for choice in chosen.required_choices)
+    return "; ".join(f"{choice}={EXAMPLES[choice]!r}: {CHOICES[choice]}" for choice in chosen.required_choices)
 
 
 def possible_choices(chosen: ModelContract) -> dict[str, str]:
@@ -66,8 +69,9 @@ def possible_choices(chosen: ModelContract) -> dict[str, str]:
 
 
 def _unknown(chosen: ModelContract, choice: str) -> ModelContract:
+    known = possible_choices(CONTRACTS[chosen.name])
     raise ConfigError(
-        f"{chosen.name}: no choice {choice!r}; it has {', '.join(possible_choices(CONTRACTS[chosen.name])) or 'none'}"
+        f"{chosen.name}: no choice {choice!r}{near_matches(choice, known)}; it has {', '.join(known) or 'none'}"
     )
 
 

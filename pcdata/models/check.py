@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.datasets import SampleDataset
+from pcdata.datasets import CachedCloudDataset, SampleDataset
 from pcdata.errors import ContractError, DTypeError, PcdataError
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import contract as contract_named
@@ -27,10 +27,11 @@ from pcdata.validation import Check, SampleReport, Summary, Verdict
 def check(
     data: Any,
     model: str,
+    /,
     *,
     frame_id: str = "",
     unit: str = "",
-    channels: Mapping[str, tuple[str, ...]] | None = None,
+    channel_names: Mapping[str, tuple[str, ...]] | None = None,
     cheap: bool = False,
     limit: int | None = None,
     **choices: Any,
@@ -43,22 +44,25 @@ def check(
         model: the contract's name.
         frame_id: the frame of the data, where they do not say it themselves.
         unit: "m" or "normalized", where the data do not say it themselves.
-        channels: the names of the channels of each tensor, where the data do not say it themselves.
+        channel_names: the names of the channels of each tensor, where the data do not say it themselves.
         cheap: read declarations and shapes alone, no values: for every step of a training loop.
         limit: only so many samples of a data set.
-        choices: what the contract leaves open, as for :func:`preset`; a preset's batch brings its own.
+        choices: what the contract leaves open, as for :func:`preset`; a preset's batch, and a data set that was built
+            for the model, bring their own.
 
     Raises:
         ConfigError: an unknown model or choice.
         ContractError: there is no sample to judge.
         DTypeError: something that is no data.
     """
+    if isinstance(data, CachedCloudDataset) and data.manifest.model.get("name") == model:
+        choices = {**data.manifest.model["choices"], **choices}
     contract_named(model, **choices)
     summary = Summary()
     for number, (name, sample) in enumerate(_samples(data)):
         if limit is not None and number >= limit:
             break
-        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
+        declared = {"frame_id": frame_id, "unit": unit, "channels": channel_names}
         summary.add(SampleReport(name, tuple(_checks(sample, model, choices, declared, cheap))))
     _require_samples(summary, "the data")
     return summary
@@ -68,6 +72,7 @@ def check_files(
     path: str | Path,
     model: str,
     keys: Mapping[str, str],
+    /,
     *,
     frame_id: str = "",
     unit: str = "",
@@ -103,7 +108,7 @@ def check_files(
     return summary
 
 
-def require(data: Any, model: str, *, but: Collection[str] = (), **options: Any) -> None:
+def require(data: Any, model: str, /, *, but: Collection[str] = (), **options: Any) -> None:
     """Refuse data that :func:`check` fails; warnings pass.
 
     Args:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pcdata.models.catalogue import CONTRACTS, allowed_counts, possible_choices
+from pcdata.models.catalogue import CONTRACTS, EXAMPLES, allowed_counts, possible_choices
 from pcdata.models.contract import Channel, ModelContract
-
-# Answers that make an example of every open choice.
-_EXAMPLE = {"frame": '"base"', "crop": "((0.2, -0.4, 0.0), (0.9, 0.4, 0.6))", "category": "3"}
 
 
 def write_pages(folder: str | Path) -> None:
@@ -96,7 +93,7 @@ def _channel(channel: Channel) -> str:
 
 
 def _example(contract: ModelContract) -> str:
-    given = "".join(f", {choice}={_EXAMPLE[choice]}" for choice in contract.required_choices)
+    given = "".join(f", {choice}={_literal(EXAMPLES[choice])}" for choice in contract.required_choices)
     code = [
         "```python",
         "from pcdata import preset",
@@ -114,6 +111,10 @@ def _example(contract: ModelContract) -> str:
         offered = ", ".join(f'"{sampler}"' for sampler in (contract.sampler, *contract.samplers))
         said = [f"{line} ({offered})" if line.startswith("- `sampler`") else line for line in said]
     return "\n".join([*code, *([] if not said else ["", "Choices:", "", *said])])
+
+
+def _literal(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
 def _count(contract: ModelContract) -> str:

@@ -67,8 +67,11 @@ class Preset:
             sections: Any = self.pipeline.to_config()
         else:
             sections = {"depth": self.pipeline.to_config_list()}
-        choices = {name: _plain(value) for name, value in self.choices.items()}
-        return yaml_text({"model": self.contract.name, "choices": choices, "pipeline": sections})
+        return yaml_text({"model": self.contract.name, "choices": self.plain_choices(), "pipeline": sections})
+
+    def plain_choices(self) -> dict[str, Any]:
+        """Return the choices as JSON and YAML can hold them."""
+        return {name: _plain(value) for name, value in self.choices.items()}
 
     @classmethod
     def from_yaml(cls, text: str) -> Preset:
@@ -99,7 +102,7 @@ class Preset:
         return f"{self!r}: {self.contract.title}\n{self.to_yaml()}"
 
 
-def preset(name: str, **choices: Any) -> Preset:
+def preset(name: str, /, **choices: Any) -> Preset:
     """Return the pipeline and collate function of a model; what its contract leaves open must be given.
 
     Args:
@@ -110,8 +113,7 @@ def preset(name: str, **choices: Any) -> Preset:
         ConfigError: an unknown model or choice, or an open choice that was not made, with what to give.
     """
     contract = contract_named(name, **choices)
-    left = {choice for choice in contract.required_choices if choice not in choices}
-    if left:
+    if contract.required_choices:
         raise ConfigError(f"preset({name!r}): the model leaves open what must be chosen: {missing_choices(contract)}")
     return Preset(contract, choices)
 
@@ -167,6 +169,8 @@ class _PresetDataset(CloudDataset):
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, (set, frozenset)):
+        value = sorted(value)
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 

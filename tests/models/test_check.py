@@ -86,7 +86,7 @@ def test_named_arrays_warn_where_nothing_is_declared_and_pass_where_it_is():
         "graspnet_baseline",
         frame_id="camera",
         unit="m",
-        channels={"point_clouds": ("xyz",)},
+        channel_names={"point_clouds": ("xyz",)},
     )
     assert declared.verdict is Verdict.PASS
 

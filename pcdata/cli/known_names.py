@@ -1,0 +1,72 @@
+"""Names for help texts: reading them from where they are defined loads torch, which ``--help`` need not wait for.
+
+A test holds every table to the registry that it repeats.
+"""
+
+from __future__ import annotations
+
+KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
+FORMATS = ("hdf5", "npz", "pt")
+MODELS = (
+    "pointnet_cls",
+    "pointnet_part",
+    "pointnet_semseg",
+    "pointnet2_cls",
+    "pointnet2_cls_tf",
+    "pointnet2_part",
+    "pointnet2_semseg",
+    "pointnet2_policy_guide",
+    "graspnet_baseline",
+    "gsnet",
+    "anygrasp",
+    "contact_graspnet",
+    "contact_graspnet_api",
+    "m2t2",
+    "graspgen",
+    "dp3_sim",
+    "dp3_real",
+    "dp3_guide",
+    "idp3",
+    "rise",
+    "peract",
+    "3d_diffuser_actor",
+    "ggcnn",
+    "grconvnet",
+    "fcgqcnn",
+    "pointcept",
+)
+CHOICES = ("frame", "crop", "category", "num_points", "sampler", "window", "voxel_size", "channels")
+TARGETS: dict[str, tuple[str, ...]] = {
+    "dp3": ("episodes", "colors", "frame", "num_points", "compression"),
+    "contact_graspnet": ("view", "label_offset"),
+    "graspnet": ("view", "any_size", "factor_depth", "round_depth", "label_offset"),
+    "graspnet_scene": (
+        "view",
+        "any_size",
+        "factor_depth",
+        "round_depth",
+        "label_offset",
+        "camera",
+        "first_scene",
+        "frames_per_scene",
+    ),
+    "pointnet": ("table", "prefix"),
+    "pointnet_part": ("table", "prefix"),
+    "modelnet": ("table", "num_points"),
+    "pointcept": ("table", "segment", "instance", "frame"),
+    "ggcnn": ("grasps", "holes", "colors", "view", "any_size"),
+}  # with their options
+SENSORS = (
+    "realsense_d415",
+    "realsense_d435",
+    "realsense_d435i",
+    "realsense_d455",
+    "realsense_l515",
+    "azure_kinect_nfov",
+    "azure_kinect_wfov",
+    "kinect_v1",
+    "photoneo_phoxi_m",
+    "ouster_os1",
+    "velodyne_vlp16",
+)
+REFINERS = ("pcdata", "small_gicp", "open3d")
