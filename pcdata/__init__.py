@@ -79,9 +79,11 @@ _HOMES = {
         "read_pcd",
         "read_ply",
         "refused_captures",
+        "register_layout",
         "write_pcd",
         "write_ply",
     ],
+    "pcdata.imports": ["import_file"],
     "pcdata.datasets": [
         "CachedCloudDataset",
         "CloudDataset",

@@ -89,7 +89,11 @@ class BackendError(PcdataError, RuntimeError):
     """A named backend is absent or cannot keep the contract for this call."""
 
 
-class SlowBackendWarning(UserWarning):
+class PcdataWarning(UserWarning):
+    """Base of every warning of pcdata."""
+
+
+class SlowBackendWarning(PcdataWarning):
     """A slow body serves because a fast one is absent; the message says why and what to do."""
 
 

@@ -52,6 +52,7 @@ def test_flags_and_kinds_are_those_of_the_layouts() -> None:
 def test_every_flag_becomes_the_option_of_python() -> None:
     words = {
         "metres_per_unit": (["0.001"], 0.001),
+        "depth_encoding": (["rotated"], "rotated"),
         "invalid_values": (["65535,4095"], [65535, 4095]),
         "background_label": (["0"], 0),
         "calibration": (["c.yaml"], "c.yaml"),

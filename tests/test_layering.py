@@ -24,6 +24,7 @@ LAYERS = [
     {"sensors"},
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
+    {"imports"},
     {"datasets", "validation"},
     {"calibration", "models"},
     {"build"},  # datasets for a model are built by its preset

@@ -18,6 +18,7 @@ from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note, write_fault
+from pcdata.imports import imported_files, step_names
 from pcdata.inputs import recording
 from pcdata.io.manifest import Manifest, Sample, key_of
 from pcdata.io.raw import write_capture
@@ -88,6 +89,10 @@ def build_dataset(
     with complete_or_nothing(
         folder, overwrite=overwrite, owned=check_only_dataset, note=report.notes.append
     ) as partial:
+        steps = {name for file in imported_files() for name in file.transforms} & step_names(
+            config.pipeline.to_config()
+        )
+        imports = [file for file in imported_files() if steps & {*file.transforms} or _reads(source) & {*file.layouts}]
         samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -97,6 +102,7 @@ def build_dataset(
             samples=samples,
             skipped=report.skipped,
             model=_model_of(config),
+            imports=[file.to_json() for file in imports],
             versions={
                 "pcdata": pcdata.__version__,
                 "torch": str(torch.__version__),
@@ -106,7 +112,12 @@ def build_dataset(
         )
         try:
             (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
-            (partial / "load.py").write_text(loading_script(config.loader, config.model), encoding="utf-8")
+            (partial / "load.py").write_text(
+                loading_script(
+                    config.loader, config.model, [file.name for file in imports if steps & {*file.transforms}]
+                ),
+                encoding="utf-8",
+            )
             manifest.write(partial)
         except OSError as error:
             raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
@@ -179,6 +190,15 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
             f"build_dataset: {random[0]} in the section depth is random, so no cloud is the same in every epoch and "
             "none can be stored; leave it out here, or load captures on the fly with CloudDataset"
         )
+
+
+def _reads(source: Any) -> set[str]:
+    """Return the layouts that a source, or the one that it is made around, reads."""
+    kinds = set()
+    while source is not None:
+        kinds.add(str(getattr(source, "kind", "")))
+        source = getattr(source, "source", None)
+    return kinds
 
 
 def _model_of(config: BuildConfig) -> dict[str, Any]:

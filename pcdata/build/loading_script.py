@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pcdata.build.config import Loader
 from pcdata.models import Preset
 
-_TEMPLATE = '''"""Load this dataset, batch by batch: python load.py"""
+_TEMPLATE = '''"""Load this dataset, batch by batch: python load.py{usage}"""
 
-from pathlib import Path
+{argparse}from pathlib import Path
 
 from torch.utils.data import DataLoader
 
-from pcdata import CachedCloudDataset, {name}
+from pcdata import CachedCloudDataset, {names}
 
 
 def main() -> None:
-    dataset = CachedCloudDataset(Path(__file__).parent, seed={seed})
+{imports}    dataset = CachedCloudDataset(Path(__file__).parent, seed={seed})
 {preset}    loader = DataLoader(
         dataset,
         batch_size={batch_size},
@@ -32,15 +34,39 @@ def main() -> None:
 if __name__ == "__main__":  # workers may import this file
     main()
 '''
+_IMPORTS = """    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--import", dest="files", action="append", default=[], metavar="FILE.py", help={files!r})
+    files = parser.parse_args().files
+    if not files:
+        parser.error({missing!r})
+    for file in files:
+        import_file(file)
+"""
 
 
-def loading_script(loader: Loader, made: Preset | None = None) -> str:
-    """Return the script's text with the loader's settings filled in; a model's dataset gives the model's tensors."""
+def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence[str] = ()) -> str:
+    """Return the script's text.
+
+    Args:
+        loader: the settings that are filled in.
+        made: the preset of the model that the dataset was built for: batches are the model's tensors.
+        imports: names of the files that define steps of the dataset: the script asks for their paths.
+    """
     settings = loader.model_dump(exclude={"collate"})
+    settings |= {"usage": "", "argparse": "", "imports": ""}
+    if imports:
+        files = ", ".join(imports)
+        missing = f"this dataset has steps of its own; say where they are: --import FILE.py, for {files}"
+        code = _IMPORTS.format(files=files.replace("%", "%%"), missing=missing)
+        settings |= {"usage": " --import FILE.py", "argparse": "import argparse\n", "imports": code}
     if made is None:
         name = collate = f"collate_{loader.collate}"
-        return _TEMPLATE.format(
-            **settings, name=name, collate=collate, preset="", shapes=", points {tuple(batch.points.shape)}"
-        )
+        shapes = ", points {tuple(batch.points.shape)}"
+        return _TEMPLATE.format(**settings, names=_names(name, imports), collate=collate, preset="", shapes=shapes)
     line = f"    model = {made!r}  # what the dataset was built for\n"
-    return _TEMPLATE.format(**settings, name="preset", collate="model.collate", preset=line, shapes="")
+    names = _names("preset", imports)
+    return _TEMPLATE.format(**settings, names=names, collate="model.collate", preset=line, shapes="")
+
+
+def _names(name: str, imports: Sequence[str]) -> str:
+    return ", ".join(sorted([name, "import_file"])) if imports else name

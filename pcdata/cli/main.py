@@ -39,6 +39,7 @@ def _run(argv: Sequence[str] | None) -> int:
     wait_asleep()
     arguments = _parser().parse_args(argv)
     try:
+        _import(getattr(arguments, "imports", []))
         verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code
         sys.stdout.flush()
     except PcdataError as error:
@@ -57,6 +58,14 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"pcdata: {error if str(error) else 'not enough memory'}", file=sys.stderr)
         return 1
     return verdict or 0
+
+
+def _import(paths: Sequence[str]) -> None:
+    if paths:
+        from pcdata.imports import import_file
+
+        for path in paths:
+            import_file(path)
 
 
 def _parser() -> argparse.ArgumentParser:

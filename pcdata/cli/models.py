@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from pcdata.cli.choices import add_model_options, given_choices
-from pcdata.cli.options import positive
+from pcdata.cli.options import add_import_option, positive
 
 
 def add_to(commands: Any) -> None:
@@ -21,6 +21,7 @@ def add_to(commands: Any) -> None:
     check.add_argument("--num-points", type=positive, metavar="N", help="count, where the model is used with several")
     check.add_argument("--limit", type=positive, metavar="N", help="only the first N samples")
     check.add_argument("--json", metavar="FILE", help="write the outcome to a new file")
+    add_import_option(check)
     check.set_defaults(run=_check)
     models = commands.add_parser("models", help="list the models with a contract, or show one")
     models.add_argument("name", nargs="?", metavar="NAME", help="show this one")

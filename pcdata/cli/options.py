@@ -94,6 +94,19 @@ def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: b
         help="any option of the layout by its name in Python; repeatable",
     )
     add_skip_options(command, can_skip_refused=can_skip_refused)
+    add_import_option(command)
+
+
+def add_import_option(command: argparse.ArgumentParser) -> None:
+    """Add what runs a file of the user's own before the command."""
+    command.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="FILE.py",
+        help="run this Python file first: transforms and layouts of your own; repeatable",
+    )
 
 
 def add_layout_options(command: argparse.ArgumentParser, names: tuple[str, ...]) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Literal
 
 from pcdata.datasets.samples import SampleDataset
-from pcdata.errors import CacheError, ConfigError, DTypeError
+from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning
+from pcdata.imports import imported_files
 from pcdata.io.manifest import FILE_NAME, Manifest
 from pcdata.io.record import cloud_from_record
 from pcdata.io.stores import STORES
@@ -53,6 +55,7 @@ class CachedCloudDataset(SampleDataset):
         self.folder = Path(folder)
         self.manifest = Manifest.read(folder)
         stored = self._stored_pipeline()
+        self._warn_of_other_files()
         wanted = stored if pipeline is None else pipeline
         if wanted.fingerprint() != self.manifest.fingerprint:
             raise CacheError(
@@ -70,9 +73,33 @@ class CachedCloudDataset(SampleDataset):
             return Pipeline.from_config(self.manifest.pipeline)
         except (ConfigError, RecursionError) as error:
             raise CacheError(
-                f"{self.folder / FILE_NAME}: its pipeline cannot be built: {error}; import the modules that define "
-                "your own transforms before you load the dataset, or rebuild it"
+                f"{self.folder / FILE_NAME}: its pipeline cannot be built: {error}{self._own_steps()}, or rebuild the "
+                "dataset"
             ) from error
+
+    def _own_steps(self) -> str:
+        """Say which files have the steps that are not pcdata's."""
+        files = [f"{one['file']} (sha256 {one['sha256'][:12]})" for one in self.manifest.imports if one["transforms"]]
+        if not files:
+            return "; import the modules that define your own transforms before you load it"
+        return (
+            f"; it was built with steps from {', '.join(files)}: say where that is, with --import FILE.py or "
+            "pcdata.import_file(path)"
+        )
+
+    def _warn_of_other_files(self) -> None:
+        """Warn where a file that was imported defines the same steps, and is not the one of the build."""
+        known = {file.sha256 for file in imported_files()}
+        mine = {name: file for file in imported_files() for name in file.transforms}
+        for one in self.manifest.imports:
+            others = {mine[name].name for name in one["transforms"] if name in mine}
+            if others and one["sha256"] not in known:
+                warnings.warn(
+                    f"{self.folder}: was built with another {one['file']} (sha256 {one['sha256'][:12]}) than the "
+                    f"{', '.join(sorted(others))} that is imported; rebuild it if its steps have changed",
+                    PcdataWarning,
+                    stacklevel=4,
+                )
 
     def _load(self, index: int) -> PointCloud:
         sample = self.manifest.samples[index]

@@ -7,8 +7,10 @@ import warnings
 import torch
 from torch import Tensor
 
+from pcdata.errors import PcdataWarning
 
-class RepeatedEpochWarning(UserWarning):
+
+class RepeatedEpochWarning(PcdataWarning):
     """A second pass over a dataset repeats the random draws of the first."""
 
 

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 from pcdata.datasets.passes import PassWatch, shared
 from pcdata.dispatch import warn_if_slow
 from pcdata.errors import ConfigError, DTypeError, add_note
+from pcdata.imports import ImportedFile, imported_files
 from pcdata.rng import generator_for
 from pcdata.structures import PointCloud
 from pcdata.transforms import Transform
@@ -87,6 +88,10 @@ class SampleDataset(Dataset[PointCloud]):
             add_note(error, f"sample {sample_id!r} of {self!r}")
             raise
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Files with classes of one's own come first, so that a worker that is spawned knows those when it meets them.
+        return _empty, (imported_files(), type(self)), self.__dict__
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._epoch = shared(self._epoch)  # a copy or an unpickled dataset owns its own number
@@ -94,3 +99,8 @@ class SampleDataset(Dataset[PointCloud]):
     def _load(self, index: int) -> Any:
         """Load the sample before the transform."""
         raise NotImplementedError
+
+
+def _empty(files: tuple[ImportedFile, ...], cls: type[SampleDataset]) -> SampleDataset:
+    """Return a dataset without its state; the files were run when they were unpickled."""
+    return cls.__new__(cls)

@@ -11,7 +11,7 @@ from pcdata.io.capture_camera import (
     write_pose,
 )
 from pcdata.io.confidence import read_confidence, write_confidence
-from pcdata.io.detect import LAYOUTS, open_source
+from pcdata.io.detect import LAYOUTS, open_source, register_layout
 from pcdata.io.image_writing import write_color, write_depth, write_labels, write_mask
 from pcdata.io.images import read_color, read_depth, read_labels, read_mask
 from pcdata.io.pcd import read_pcd, write_pcd
@@ -42,6 +42,7 @@ __all__ = [
     "read_ply",
     "read_pose",
     "refused_captures",
+    "register_layout",
     "write_capture_camera",
     "write_color",
     "write_confidence",

@@ -24,6 +24,27 @@ LAYOUTS: dict[str, type[Source]] = {
 }
 
 
+def register_layout(layout: type[Source]) -> type[Source]:
+    """Make a layout of your own known by its ``kind``, to :func:`open_source` and to every command; a decorator.
+
+    Raises:
+        ConfigError: it is no complete :class:`Source`, or the kind exists.
+    """
+    if not (isinstance(layout, type) and issubclass(layout, Source)):
+        raise ConfigError(f"register_layout: must be a subclass of pcdata.io.Source, got {layout!r:.100}")
+    if inspect.isabstract(layout):
+        missing = ", ".join(sorted(layout.__abstractmethods__))
+        raise ConfigError(f"register_layout: {layout.__name__} does not say {missing}; define that")
+    for name in ("kind", "needs"):
+        if not isinstance(getattr(layout, name, None), str) or not getattr(layout, name):
+            raise ConfigError(f"register_layout: {layout.__name__}.{name} must be a text; see pcdata.io.Source")
+    known = LAYOUTS.get(layout.kind)
+    if known is not None and (known.__module__, known.__qualname__) != (layout.__module__, layout.__qualname__):
+        raise ConfigError(f"a layout called {layout.kind} is registered already; choose another name")
+    LAYOUTS[layout.kind] = layout
+    return layout
+
+
 def open_source(
     path: str | os.PathLike[str],
     *,
@@ -63,7 +84,10 @@ def open_source(
 
 def _named(kind: str) -> type[Source]:
     if kind not in LAYOUTS:
-        raise ConfigError(f"open_source: no layout {kind!r}{near_matches(kind, LAYOUTS)}; known: {', '.join(LAYOUTS)}")
+        raise ConfigError(
+            f"open_source: no layout {kind!r}{near_matches(kind, LAYOUTS)}; known: {', '.join(LAYOUTS)}; "
+            "one of your own needs --import FILE.py"
+        )
     return LAYOUTS[kind]
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from pcdata.errors import CaptureError, NoReadingError, UnitError
+from pcdata.errors import CaptureError, NoReadingError, PcdataWarning, UnitError
 from pcdata.files import map_npy, read_bytes
 from pcdata.functional.depth_unit import (
     DepthEncoding,
@@ -178,6 +178,7 @@ def _warn_of_marks(stored: NDArray[Any], unit: DepthUnit) -> None:
             warnings.warn(
                 f"depth images hold {mark}, {MARKS[mark]}, at more than {_MARKED:.1%} of their readings: it becomes "
                 f"points at {metres:.5g} m. If it marks 'no reading', say invalid_values=[{mark}]",
+                PcdataWarning,
                 stacklevel=2,
             )
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, PcdataWarning
 from pcdata.files import read_bytes
 from pcdata.io.record import parse_info
 from pcdata.io.scratch import retired_of
@@ -48,6 +48,9 @@ class Manifest:
     versions: Mapping[str, str] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     model: Mapping[str, Any] = field(default_factory=dict)  # name and choices of the model that it was built for
+    imports: Sequence[
+        Mapping[str, Any]
+    ] = ()  # files with steps or the reader that were used: name, hash, what is in it
     schema: str = SCHEMA
 
     def write(self, folder: Path) -> None:
@@ -80,7 +83,10 @@ class Manifest:
             if content.get("schema") != SCHEMA:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}; rebuild the dataset")
             found = content.pop(_CHECKSUM, None)
-            manifest = cls(**{**content, "samples": [Sample(**sample) for sample in content["samples"]]})
+            listed: dict[str, Any] = {"samples": [Sample(**sample) for sample in content["samples"]]}
+            if isinstance(content.get("imports"), list):
+                listed["imports"] = tuple(content["imports"])
+            manifest = cls(**{**content, **listed})
             _check(manifest)
             if found is not None and found != checksum_of(content):
                 raise CacheError(
@@ -96,6 +102,7 @@ class Manifest:
             warnings.warn(
                 f"{path}: has no checksum, so it was written by an earlier version or by hand, and later edits cannot "
                 "be told; rebuild the dataset to have one",
+                PcdataWarning,
                 stacklevel=2,
             )
         return manifest
@@ -123,6 +130,8 @@ def _check(manifest: Manifest) -> None:
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
     if manifest.model and not (isinstance(manifest.model.get("name"), str) and _is_choices(manifest.model)):
         raise CacheError(f"model must have a name and choices, got {manifest.model!r:.100}")
+    if not isinstance(manifest.imports, tuple) or not all(map(_is_import, manifest.imports)):
+        raise CacheError(f"imports must list files with their sha256 and names, got {manifest.imports!r:.100}")
     if not manifest.samples:
         raise CacheError("it lists no samples; rebuild the dataset")
     for sample in manifest.samples:
@@ -135,6 +144,16 @@ def _check(manifest: Manifest) -> None:
         # Keys become file names: one that could climb out of the folder is refused.
         if sample.key != key_of(sample.id):
             raise CacheError(f"sample {sample.id!r} must have the key {key_of(sample.id)!r}, got {sample.key!r}")
+
+
+def _is_import(entry: Any) -> bool:
+    """Say whether an entry is as :meth:`pcdata.imports.ImportedFile.to_json` writes it."""
+    if not isinstance(entry, dict) or set(entry) != {"file", "sha256", "transforms", "layouts"}:
+        return False
+    names = [entry["file"], entry["sha256"]]
+    for listed in (entry["transforms"], entry["layouts"]):
+        names += listed if isinstance(listed, list) else [None]
+    return all(isinstance(name, str) for name in names)
 
 
 def _is_choices(model: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, PcdataWarning, TooFewPointsError
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.ragged import ptr_after_mask
 from pcdata.rng import Streams
@@ -17,7 +17,7 @@ from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
 from pcdata.transforms.fields import Count, Metres
 
 
-class LeftOutWarning(UserWarning):
+class LeftOutWarning(PcdataWarning):
     """A step left out what may be wanted."""
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Generator, nn
 
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.rng import Streams, seeded
 from pcdata.structures import METRE, NORMALIZED, PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds, unit_advice
@@ -18,7 +18,7 @@ from pcdata.transforms.capture import find_capture, run_capture
 from pcdata.transforms.fields import Fraction
 
 
-class PipelineOrderWarning(UserWarning):
+class PipelineOrderWarning(PcdataWarning):
     """A pipeline is valid but its order costs time or quality."""
 
 

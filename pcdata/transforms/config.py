@@ -84,7 +84,7 @@ def _step_from_node(document: YamlDocument, node: yaml.Node) -> Transform | None
     cls = REGISTRY.get(name)
     if cls is None:
         hint = near_matches(name, REGISTRY) or f"; known: {', '.join(sorted(REGISTRY))}"
-        document.fault(name_node, f"unknown transform {name!r}{hint}")
+        document.fault(name_node, f"unknown transform {name!r}{hint}; one of your own needs --import FILE.py")
         return None
     return _build(document, cls, name_node, fields_node)
 
