@@ -58,10 +58,10 @@ def dataset_text(folder: str | Path) -> str:
         ["format", f"{manifest.format}, compression {manifest.compression}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
         ["fields", ", ".join(f"{name} {tuple(value.shape)}" for name, value in cloud.fields().items())],
-        *([["built with", f"{one['file']}, sha256 {one['sha256'][:16]}"] for one in manifest.imports]),
         ["fingerprint", manifest.fingerprint[:16]],
         ["made with", ", ".join(f"{name} {version}" for name, version in manifest.versions.items())],
     ]
+    facts += [["built with", f"{one['file']}, sha256 {one['sha256'][:16]}"] for one in manifest.imports]
     stored = dataset.pipeline.deterministic_prefix()
     steps = [["stored", repr(step)] for step in [*stored.depth, *stored.cloud, *stored.augment]]
     steps += [["on the fly", repr(step)] for step in dataset.pipeline.random_suffix().steps]
