@@ -165,7 +165,7 @@ def _fill_row_pointers(arguments: dict[str, Any], specs: dict[str, str]) -> None
         spec = parse_spec(text)
         if spec.is_ptr and arguments.get(key) is None and spec.dims[0] in rows_of:
             rows = rows_of[spec.dims[0]]
-            arguments[key] = torch.tensor([0, rows.shape[0]], device=rows.device)
+            arguments[key] = torch.tensor([0, rows.shape[0]], dtype=torch.int64, device=rows.device)
 
 
 def _wants_gradient(arguments: Iterable[Any]) -> bool:

@@ -226,7 +226,7 @@ def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: floa
             f"ransac_plane: cloud {first_cloud + cloud}: no plane has 3 points nearer than distance={distance:g}; "
             "is it in the right unit?"
         )
-    return planes[torch.arange(len(planes), device="cpu"), best]
+    return planes[torch.arange(len(planes), dtype=torch.int64, device="cpu"), best]
 
 
 def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
@@ -263,7 +263,7 @@ def _refine(
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
     """Refit to the inliers until they no longer change; return the last allowed planes and their inliers."""
     inliers = work.inlier_mask(points, ptr, planes, distance)
-    unsettled = torch.arange(len(planes), device="cpu")  # clouds
+    unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
     rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(_MAX_REFINEMENTS):
         if len(unsettled) == 0:

@@ -80,7 +80,7 @@ def ball_query(
         points, queries, radius * _WIDER, cloud_of_rows(ptr), cloud_of_rows(queries_ptr), max_num_neighbors=len(points)
     )
     squared = _squared_distance(points[row], queries[query])
-    limit = torch.tensor(radius, dtype=torch.float32).square()
+    limit = torch.tensor(radius, dtype=torch.float32, device="cpu").square()
     within = squared < limit
     return _nearest_per_query(query[within], row[within], squared[within], len(queries), max_neighbors, len(points))
 
@@ -101,7 +101,7 @@ def _require_cpu(name: str, points: Tensor) -> None:
 
 def _sample_cloud(points: Tensor, count: int, cloud: int) -> Tensor:
     if count == 0:
-        return torch.empty(0, dtype=torch.int64)
+        return torch.empty(0, dtype=torch.int64, device="cpu")
     # It takes ceil(ratio * n) points in float32; half a point below the count cannot round to a neighbour.
     index: Tensor = _load().fps(points, ratio=(count - 0.5) / len(points), random_start=False)
     if len(index) != count or len(index.unique()) != count:
@@ -121,15 +121,15 @@ def _nearest_per_query(
     query: Tensor, row: Tensor, squared: Tensor, num_queries: int, max_neighbors: int, num_points: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Order pairs by (query, squared distance, row) and lay the first ``max_neighbors`` of each query side by side."""
-    order = torch.arange(len(query))
+    order = torch.arange(len(query), dtype=torch.int64, device="cpu")
     for key in (row, squared, query):  # least significant first; stable sorts keep the order among equals
         order = order[key[order].argsort(stable=True)]
     query, row, squared = query[order], row[order], squared[order]
     found = torch.bincount(query, minlength=num_queries)
-    place = torch.arange(len(query)) - ptr_from_counts(found)[query]
+    place = torch.arange(len(query), dtype=torch.int64, device="cpu") - ptr_from_counts(found)[query]
     kept = place < max_neighbors
-    index = torch.full((num_queries, max_neighbors), num_points)
-    distance = torch.full((num_queries, max_neighbors), torch.inf)
+    index = torch.full((num_queries, max_neighbors), num_points, dtype=torch.int64, device="cpu")
+    distance = torch.full((num_queries, max_neighbors), torch.inf, dtype=torch.float32, device="cpu")
     index[query[kept], place[kept]] = row[kept]
     distance[query[kept], place[kept]] = squared[kept].double().sqrt().float()
     return index, distance, found.clamp(max=max_neighbors)
