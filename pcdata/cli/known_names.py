@@ -7,6 +7,8 @@ from __future__ import annotations
 
 KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
 FORMATS = ("hdf5", "npz", "pt")
+WEIGHTINGS = ("constant", "inverse_square", "angle")
+CARVINGS = ("never", "near", "everywhere")
 MODELS = (
     "pointnet_cls",
     "pointnet_part",

@@ -13,6 +13,7 @@ from pcdata.cli import signals
 from pcdata.cli.printable import printable_output
 from pcdata.cli.signals import signals_interrupt
 from pcdata.cli.threads import wait_asleep
+from pcdata.cli.warning_lines import warnings_in_one_line
 from pcdata.errors import ConfigError, PcdataError
 
 
@@ -21,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     128 and the number of the signal where one ended it. Without ``argv`` this is the whole life of the process.
     """
-    with printable_output(), signals_interrupt(until_exit=argv is None) as heard:
+    with printable_output(), warnings_in_one_line(), signals_interrupt(until_exit=argv is None) as heard:
         try:
             return _run(argv)
         except KeyboardInterrupt:
@@ -70,13 +71,13 @@ def _import(paths: Sequence[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     # Imported here, where a signal is heard already.
-    from pcdata.cli import calib, datasets, export, models, sensors, validate
+    from pcdata.cli import calib, datasets, export, fuse, models, sensors, validate
 
     parser = argparse.ArgumentParser(prog="pcdata", description="From raw depth frames to training-ready point clouds.")
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (datasets, export, validate, models, sensors, calib):
+    for group in (datasets, fuse, export, validate, models, sensors, calib):
         group.add_to(commands)
     for command in commands.choices.values():  # also after the command, where one adds it to a line that failed
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)

@@ -13,7 +13,9 @@ from pcdata.cli.options import add_import_option, positive
 def add_to(commands: Any) -> None:
     """Add the commands to the parser."""
     check = commands.add_parser("check", help="check a data set against what a model takes")
-    check.add_argument("path", metavar="PATH", help="a built data set, or an npz, HDF5 or zarr v2 file of anyone's")
+    check.add_argument(
+        "path", metavar="PATH", help="a built data set, an export, or an npz, HDF5 or zarr v2 file of anyone's"
+    )
     add_model_options(check, required=True, help="the model")
     check.add_argument("--keys", metavar="POINTS=NAME,...", help="which array of a foreign file is what")
     check.add_argument("--frame", metavar="NAME", help="frame that you train in; of a foreign file also its frame")
@@ -29,13 +31,18 @@ def add_to(commands: Any) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    from pcdata.exports import is_export
     from pcdata.files import replacing
     from pcdata.io.manifest import FILE_NAME
     from pcdata.report.validation import validation_text
     from pcdata.validation import Verdict
 
-    is_ours = not arguments.keys and _holds(arguments.path, FILE_NAME)
-    summary = _check_cache(arguments) if is_ours else _check_foreign(arguments)
+    if arguments.keys:
+        summary = _check_foreign(arguments)
+    elif _holds(arguments.path, FILE_NAME):
+        summary = _check_cache(arguments)
+    else:
+        summary = _check_export(arguments) if is_export(arguments.path) else _check_foreign(arguments)
     if arguments.json:
         with replacing("check --json", arguments.json) as temporary, open(temporary, "w", encoding="utf-8") as file:
             json.dump({"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}, file, indent=1)
@@ -63,6 +70,19 @@ def _check_cache(arguments: argparse.Namespace) -> Any:
 
     choices = _choices(arguments)
     return check(CachedCloudDataset(arguments.path), arguments.model, limit=arguments.limit, **choices)
+
+
+def _check_export(arguments: argparse.Namespace) -> Any:
+    from pcdata.exports import check_export
+
+    return check_export(
+        arguments.path,
+        arguments.model,
+        frame_id=arguments.frame or "",
+        unit=arguments.unit or "",
+        limit=arguments.limit,
+        **_choices(arguments),
+    )
 
 
 def _check_foreign(arguments: argparse.Namespace) -> Any:

@@ -6,11 +6,11 @@ Source: YanjieZe/3D-Diffusion-Policy, ``diffusion_policy_3d/common/replay_buffer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from pcdata.errors import ConfigError, near_matches
 from pcdata.exports.checks import check_channels, check_same_count, one_cloud
 from pcdata.exports.contracts import require_cloud
 from pcdata.exports.episodes import Given, episode_names, read_episodes
-from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
 from pcdata.structures import PointCloud
 
@@ -54,6 +54,11 @@ class DP3(Target):
     num_points: int | None = None
     compression: Compression = "zlib"
 
+    @classmethod
+    def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
+        """One array of all timesteps."""
+        return {folder: CloudArray("data/point_cloud", _channels(bool(options.get("colors", True))))}
+
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One array of all timesteps: one item."""
         known = set(ids)
@@ -79,7 +84,7 @@ class DP3(Target):
         ranges, frame = _Ranges(), self.frame
         clouds: RowWriter | None = None
         count = 0
-        channels = ["xyz", "rgb_255"] if self.colors else ["xyz"]
+        channels = _channels(self.colors)
         for sample_id, data in samples:
             where = f"dp3: sample {sample_id!r}"
             cloud = one_cloud(where, data)
@@ -131,6 +136,10 @@ class DP3(Target):
 
     def _rows(self, folder: Path, key: str, shape: tuple[int, ...], dtype: str) -> RowWriter:
         return RowWriter(folder / "data" / key, shape, dtype, chunk_rows=_CHUNK, compression=self.compression)
+
+
+def _channels(colors: bool) -> tuple[str, ...]:
+    return ("xyz", "rgb_255") if colors else ("xyz",)
 
 
 class _Ranges:

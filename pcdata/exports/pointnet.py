@@ -17,7 +17,7 @@ from pcdata.errors import ConfigError
 from pcdata.exports.checks import one_cloud
 from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
-from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.structures import PointCloud
 
 NUM_POINTS = 2048
@@ -43,6 +43,12 @@ class PointNet(Target):
 
     table: Given | None = None
     prefix: str = "data/modelnet40_ply_hdf5_2048"
+
+    @classmethod
+    def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
+        """The files with shapes."""
+        files = sorted(file for file in folder.glob("ply_data_*.h5") if not file.is_symlink())
+        return dict.fromkeys(files, CloudArray("data", ("xyz",)))
 
     def rows(self, ids: Sequence[str]) -> dict[str, Row]:
         """Return class and split of every sample."""

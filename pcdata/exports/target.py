@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from pcdata.structures import DepthFrame, PointCloud
 
@@ -23,6 +23,13 @@ class Item:
 
     ids: tuple[str, ...]
     paths: tuple[str, ...]
+
+
+class CloudArray(NamedTuple):
+    """Where a file of an export has its clouds, and what their columns are."""
+
+    name: str
+    channels: tuple[str, ...]  # as the model's contract calls them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +61,11 @@ class Target(ABC):
     def finish(self, items: Sequence[Item], folder: Path, note: Note) -> None:
         """Write what goes over all items, such as lists of files; here nothing."""
         return
+
+    @classmethod
+    def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
+        """Return the files of an export with these options that ``pcdata check`` reads; here none."""
+        return {}
 
     def options(self) -> dict[str, Any]:
         """Return the options as JSON can hold them; of a mapping, the names in it."""

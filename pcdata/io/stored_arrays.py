@@ -85,6 +85,32 @@ def stored_arrays(path: str | Path, names: Collection[str]) -> Iterator[dict[str
         raise CacheError(f"{path}: is no .npz, .npy, .h5, .hdf5 file and no zarr directory")
 
 
+def stored_names(path: str | Path) -> list[str]:
+    """Return the names of the arrays in a file, the first of them where there are very many; "" is that of a .npy file.
+
+    Raises:
+        CacheError, CaptureError: the file cannot be read.
+    """
+    path = Path(path)
+    with stored_arrays(path, ()), _damage_named(str(path)):  # what kind of file is wrong comes first
+        if path.is_dir():
+            return sorted(zarr_names(path, _MAX_NAMES))
+        if path.suffix == ".npz":
+            with open_input("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
+                return sorted(array_names(ZipArchive(file, os.fstat(file.fileno()).st_size)))
+        if path.suffix == ".npy":
+            return [""]
+        with open_hdf5(path) as file:
+            return sorted(islice(_datasets_below(file), _MAX_NAMES))
+
+
+def shown_names(names: Collection[str]) -> str:
+    """Return names for a message: not more than can be read, none of them long."""
+    known = sorted(names)
+    shown = ", ".join(f"{other:.100}" for other in known[:_SHOWN]) or "none"
+    return f"{shown} and {len(known) - _SHOWN} others" if len(known) > _SHOWN else shown
+
+
 def _arrays(path: Path, chosen: Mapping[str, Any]) -> dict[str, StoredArray]:
     return {name: StoredArray(f"{path}: {name}" if name else str(path), array) for name, array in chosen.items()}
 
@@ -144,10 +170,8 @@ def _datasets_below(group: Any) -> Iterator[str]:
 
 def _named(path: Path, found: Mapping[str, Any], name: str) -> Any:
     if name not in found:
-        known = sorted(found)
-        shown = ", ".join(f"{other:.100}" for other in known[:_SHOWN]) or "none"
-        more = f" and {len(known) - _SHOWN} others" if len(known) > _SHOWN else ""
-        raise CacheError(f"{path}: no array {name!r:.100}{near_matches(name, known)}; it has {shown}{more}")
+        hint = near_matches(name, sorted(found))
+        raise CacheError(f"{path}: no array {name!r:.100}{hint}; it has {shown_names(found)}")
     return found[name]
 
 

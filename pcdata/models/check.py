@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,15 +97,32 @@ def check_files(
         DTypeError: an array that holds no numbers.
         ShapeError: arrays without samples, or that do not go together.
     """
-    contract = contract_named(model, **choices)
     summary = Summary()
-    made = _category_tensors(contract, choices)
-    for name, stored, channels in itertools.islice(read_samples(path, contract, keys), limit):
-        arrays = {**made, **stored}
-        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
-        summary.add(SampleReport(name, tuple(_checks(arrays, model, choices, declared, False))))
+    for report in itertools.islice(reports_of_file(path, model, keys, frame_id, unit, choices), limit):
+        summary.add(report)
     _require_samples(summary, str(path))
     return summary
+
+
+def reports_of_file(
+    path: str | Path,
+    model: str,
+    keys: Mapping[str, str],
+    frame_id: str,
+    unit: str,
+    choices: Mapping[str, Any],
+    columns: tuple[str, ...] = (),
+) -> Iterator[SampleReport]:
+    """Judge one sample after another; see :func:`check_files`.
+
+    ``columns`` are the names of the channels of the first tensor, where somebody knows them.
+    """
+    contract = contract_named(model, **choices)
+    made = _category_tensors(contract, choices)
+    for name, stored, channels in read_samples(path, contract, keys):
+        channels = {**channels, contract.main.key: columns} if columns else channels
+        declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
+        yield SampleReport(name, tuple(_checks({**made, **stored}, model, choices, declared, False)))
 
 
 def require(data: Any, model: str, /, *, but: Collection[str] = (), **options: Any) -> None:

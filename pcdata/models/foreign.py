@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pcdata.errors import ConfigError, ShapeError, near_matches
-from pcdata.io.stored_arrays import StoredArray, stored_arrays
+from pcdata.io.stored_arrays import StoredArray, shown_names, stored_arrays, stored_names
 from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
 
 # What the keys of a mapping may be called besides the model's own tensor names: the roles of channels.
@@ -38,10 +38,11 @@ def read_samples(path: str | Path, contract: ModelContract, keys: Mapping[str, s
         if name not in known:
             raise ConfigError(f"{contract.name}: no key {name!r}{near_matches(name, known)}; it has {', '.join(known)}")
     if not keys:
-        with stored_arrays(path, ()):
-            pass  # what kind of file is wrong comes before which array is what
+        found = stored_names(path)  # what kind of file is wrong comes before which array is what
+        which = "it is one array, without a name: --keys points=" if found == [""] else f"it has {shown_names(found)}"
         raise ConfigError(
-            f"{contract.name}: say which array is what, as in --keys points=NAME; the keys are {', '.join(known)}"
+            f"{contract.name}: {path}: say which array is what, as in --keys points=NAME; {which}; the keys are "
+            f"{', '.join(known)}"
         )
     by_role = set(keys) <= set(ROLES)
     if not by_role and not set(keys) <= {spec.key for spec in contract.tensors}:

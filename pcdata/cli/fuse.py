@@ -1,0 +1,97 @@
+"""The command that averages the views of captures into one surface: fuse."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from pcdata.cli.known_names import CARVINGS, WEIGHTINGS
+from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.progress import Progress
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    fuse = commands.add_parser("fuse", help="average the views of captures into one cloud, mesh or volume")
+    fuse.add_argument("path", metavar="PATH", help="folder of captures with poses, or of several cameras' folders")
+    fuse.add_argument(
+        "--out", required=True, metavar="FILE", help=".ply: a cloud, or a mesh with --mesh; .npz: the volume itself"
+    )
+    fuse.add_argument("--mesh", action="store_true", help="write triangles instead of points")
+    fuse.add_argument("--voxel-size", type=float, default=0.002, metavar="M", help="metres (default 0.002)")
+    fuse.add_argument(
+        "--truncation", type=float, metavar="M", help="metres on either side of a surface (default: 5 voxels)"
+    )
+    fuse.add_argument(
+        "--weighting", choices=WEIGHTINGS, default="constant", help="how much a reading counts (default: constant)"
+    )
+    fuse.add_argument(
+        "--carve", choices=CARVINGS, default="near", help="where views wear away what they see through (default: near)"
+    )
+    fuse.add_argument(
+        "--min-weight", type=float, metavar="N", help="leave out points of less weight, such as seen by fewer views"
+    )
+    fuse.add_argument(
+        "--max-megabytes", type=positive, default=4096, metavar="N", help="refuse to take more memory (default 4096)"
+    )
+    add_capture_options(fuse)
+    fuse.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    fuse.add_argument("--overwrite", action="store_true", help="replace FILE")
+    fuse.set_defaults(run=_fuse)
+
+
+def _fuse(arguments: argparse.Namespace) -> None:
+    out = _checked_target(arguments)  # before the work, not after
+    from pcdata.io import write_ply
+    from pcdata.structures import TSDFVolume
+
+    volume = TSDFVolume(
+        voxel_size=arguments.voxel_size,
+        truncation=arguments.truncation,
+        weighting=arguments.weighting,
+        carve=arguments.carve,
+        max_bytes=arguments.max_megabytes << 20,
+    )
+    source = open_captures(arguments.path, arguments, limit=arguments.limit)
+    with Progress("fuse") as progress:
+        for done, sample_id in enumerate(source.ids, 1):
+            volume.integrate(source.load(sample_id))
+            progress(done, len(source), sample_id)
+    least = arguments.min_weight or 0.0
+    if out.suffix == ".npz":
+        volume.save(out)
+        what = f"volume of {volume.num_blocks:,} blocks, {volume.num_bytes / 2**20:.0f} MiB"
+    elif arguments.mesh:
+        mesh = volume.extract_mesh(min_weight=least)
+        write_ply(out, mesh)
+        what = f"mesh of {mesh.vertices.num_points:,} points, {len(mesh.triangles):,} triangles"
+    else:
+        cloud = volume.extract_points(min_weight=least)
+        write_ply(out, cloud)
+        what = f"cloud of {cloud.num_points:,} points"
+    views = f"{volume.num_views} views of {len(source)} captures"
+    print(f"fuse  {out}  ({what} in frame {volume.frame_id!r}, from {views})")
+
+
+def _checked_target(arguments: argparse.Namespace) -> Path:
+    """Return where the result goes.
+
+    Raises:
+        ConfigError: its name does not say what it is, an option does not fit it, or it cannot go there.
+    """
+    from pcdata.errors import ConfigError
+
+    out = Path(arguments.out).expanduser()
+    if out.suffix not in (".ply", ".npz"):
+        raise ConfigError(f"fuse: --out must end in .ply (a cloud, or --mesh) or .npz (the volume), got {out.name!r}")
+    if out.suffix == ".npz" and (arguments.mesh or arguments.min_weight is not None):
+        flag = "--mesh" if arguments.mesh else "--min-weight"
+        raise ConfigError(f"fuse: an .npz holds the whole volume, which {flag} cannot change; write a .ply, or drop it")
+    if not out.parent.is_dir():
+        raise ConfigError(f"fuse: there is no folder {out.parent} to write into; make it, or choose another")
+    if out.is_dir():
+        raise ConfigError(f"fuse: {out} is a folder; name a file")
+    if out.exists() and not arguments.overwrite:
+        raise ConfigError(f"fuse: {out} exists; choose another file, or replace it (--overwrite)")
+    return out

@@ -1,0 +1,80 @@
+"""Exports held to a model's contract once more: what is on disk, as ``pcdata check`` judges anybody's files."""
+
+from __future__ import annotations
+
+import os
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import CacheError, ConfigError, ContractError
+from pcdata.exports.record import FILE_NAME, ExportRecord
+from pcdata.exports.registry import TARGETS
+from pcdata.models import contract
+from pcdata.models.catalogue import possible_choices
+from pcdata.models.check import reports_of_file
+from pcdata.validation import SampleReport, Summary
+
+
+def is_export(path: str | os.PathLike[str]) -> bool:
+    """Say whether a path is a folder that an export wrote, by its record."""
+    return (Path(path) / FILE_NAME).is_file()
+
+
+def check_export(
+    folder: str | os.PathLike[str],
+    model: str,
+    /,
+    *,
+    frame_id: str = "",
+    unit: str = "",
+    limit: int | None = None,
+    **choices: Any,
+) -> Summary:
+    """Judge every sample of an export of clouds; its record says which arrays are what.
+
+    Args:
+        folder: what :func:`pcdata.export_dataset` wrote.
+        model: the contract's name; that of the target, or another that takes the same points.
+        frame_id: the frame of the data, where the export was not told.
+        unit: "m" or "normalized"; "" = that of the target's model, which the export held every sample to.
+        limit: only so many samples.
+        choices: what the contract leaves open, besides the options of the export.
+
+    Raises:
+        CacheError: the export is damaged or unfinished.
+        ConfigError: an unknown model or choice, or a target whose files hold no clouds for a model.
+        ContractError: there is no sample to judge.
+    """
+    folder = Path(folder)
+    record = ExportRecord.read(folder)
+    contract(model, **choices)
+    if record.target not in TARGETS:
+        raise CacheError(f"{folder / FILE_NAME}: no target {record.target!r:.100}; export again")
+    if not record.complete:
+        raise CacheError(f"{folder} holds an unfinished export; finish it with 'pcdata export --continue'")
+    target = TARGETS[record.target]
+    files = target.cloud_arrays(folder, record.options)
+    if not files:
+        raise ConfigError(
+            f"check: {folder}: the target {target.name} writes {target.layout}, which check does not read; "
+            f"every sample passed the rules of {target.model} when it was exported"
+        )
+    (channels,) = {array.channels for array in files.values()}
+    stated = {name: record.options.get(name) for name in ("frame", "num_points")}
+    stated["channels"] = list(channels) if model == target.model else None
+    known = possible_choices(contract(model))
+    choices = {**{name: value for name, value in stated.items() if value is not None and name in known}, **choices}
+    frame_id = frame_id or stated["frame"] or choices.get("frame") or ""
+    unit = unit or ("" if "unit" in target.left_to_loader else contract(target.model).unit_of_tensors())
+    summary = Summary()
+    reports = (
+        SampleReport(f"{path.name}/{report.sample_id}" if len(files) > 1 else report.sample_id, report.checks)
+        for path, array in files.items()
+        for report in reports_of_file(path, model, {"points": array.name}, frame_id, unit, choices, channels)
+    )
+    for report in islice(reports, limit):
+        summary.add(report)
+    if not sum(summary.samples.values()):
+        raise ContractError(f"check: there is nothing to judge: {folder} holds 0 samples")
+    return summary

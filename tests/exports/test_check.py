@@ -1,0 +1,102 @@
+"""pcdata check on what pcdata export wrote: the record says which arrays are what."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from pcdata.cli.main import main
+from pcdata.errors import CacheError, ConfigError
+from pcdata.exports import TARGETS, check_export, export_dataset
+from pcdata.exports.record import FILE_NAME
+from tests.exports import test_dp3
+from tests.exports.samples import Samples, cloud, shape
+
+TABLE = {name: {"class": "mug", "split": split} for name, split in {"a": "train", "b": "test", "c": "train"}.items()}
+
+
+def dp3(folder: Path, **options: object) -> Path:
+    export_dataset(test_dp3.clouds(), "dp3", folder, episodes=test_dp3.episodes(), **options)
+    return folder
+
+
+@pytest.mark.parametrize("options", [{}, {"colors": False}, {"frame": "base"}, {"compression": "none"}])
+def test_an_export_for_dp3_needs_no_keys(capsys, tmp_path, options):
+    folder = dp3(tmp_path / "out.zarr", **options)
+    frame = [] if "frame" in options else ["--frame", "base"]
+    assert main(["check", str(folder), "--model", "dp3_sim", *frame]) == 0
+    assert "PASS: of 5 captures 5 pass" in capsys.readouterr().out
+    assert main(["check", str(folder), "--model", "dp3_sim", *frame, "--limit", "2"]) == 0
+    assert "of 2 captures" in capsys.readouterr().out
+    # The same by keys; for a model of other counts it is as wrong as it is.
+    keys = ["--keys", "points=data/point_cloud", "--frame", "base", "--unit", "m"]
+    keys += [] if options.get("colors", True) else ["--set", "channels=xyz"]
+    assert main(["check", str(folder), "--model", "dp3_sim", *keys]) == 0
+    assert main(["check", str(folder), "--model", "graspnet_baseline"]) == 1
+
+
+def test_a_stated_number_of_points_is_that_of_the_export(tmp_path):
+    source = Samples({f"t{step}": cloud(100, seed=step) for step in range(5)})
+    export_dataset(source, "dp3", tmp_path / "o", episodes=test_dp3.episodes(), num_points=100, frame="base")
+    assert check_export(tmp_path / "o", "dp3_sim").verdict.value == "pass"
+    assert check_export(tmp_path / "o", "dp3_sim", num_points=512).verdict.value == "fail"
+
+
+def test_every_file_of_an_export_of_shapes_is_judged(capsys, tmp_path):
+    source = Samples({name: shape(seed=number) for number, name in enumerate(TABLE)})
+    export_dataset(source, "pointnet", tmp_path / "out", table=TABLE)
+    assert main(["check", str(tmp_path / "out"), "--model", "pointnet_cls", "--frame", "base"]) in (0, 1)
+    told = capsys.readouterr().out
+    assert "of 3 captures" in told
+    with h5py.File(tmp_path / "out" / "ply_data_test0.h5", "a") as file:
+        file["data"][...] = np.nan
+    assert main(["check", str(tmp_path / "out"), "--model", "pointnet_cls", "--frame", "base"]) == 1
+    assert "FAIL finite (ply_data_test0.h5/0)" in capsys.readouterr().out
+
+
+def test_an_export_without_clouds_that_check_reads_says_so(tmp_path):
+    export_dataset(Samples({"a": cloud(1100)}), "modelnet", tmp_path / "out", table={"a": {"class": "mug"}})
+    with pytest.raises(ConfigError, match=r"writes a text per shape.* passed the rules of pointnet2_cls"):
+        check_export(tmp_path / "out", "pointnet2_cls")
+    readable = {name for name, target in TARGETS.items() if target.cloud_arrays(tmp_path, {})}
+    assert readable == {"dp3"}, "pointnet and pointnet_part have files, which are not here"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"complete": False}, "unfinished export"),
+        ({"target": "nothing"}, "no target 'nothing'"),
+        ({"schema": 3}, "sch"),
+    ],
+)
+def test_a_record_that_is_not_whole_is_told(capsys, tmp_path, change, message):
+    record = dp3(tmp_path / "out") / FILE_NAME
+    record.write_text(json.dumps({**json.loads(record.read_text()), **change}))
+    with pytest.raises(CacheError, match=message):
+        check_export(tmp_path / "out", "dp3_sim")
+    assert main(["check", str(tmp_path / "out"), "--model", "dp3_sim"]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_files_of_others_name_the_candidates(capsys, tmp_path):
+    (dp3(tmp_path / "out") / FILE_NAME).unlink()
+    np.savez(tmp_path / "a.npz", xyz=np.zeros((3, 3)), rgb=np.zeros((3, 3)))
+    np.save(tmp_path / "a.npy", np.zeros((3, 3)))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["clouds/xyz"] = np.zeros((3, 3))
+    for name, words in {
+        "out": "it has data/action, data/img, data/point_cloud, data/state, meta/episode_ends",
+        "a.npz": "it has rgb, xyz",
+        "a.h5": "it has clouds/xyz",
+        "a.npy": "it is one array, without a name: --keys points=",
+    }.items():
+        assert main(["check", str(tmp_path / name), "--model", "dp3_sim"]) == 2
+        told = capsys.readouterr().err
+        assert words in told
+        assert "the keys are point_cloud, points, colors, normals" in told
+    assert main(["check", str(tmp_path / "a.npy"), "--model", "dp3_sim", "--keys", "points="]) in (0, 1)
