@@ -13,6 +13,7 @@ from torch.utils.data import Subset
 
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataError
+from pcdata.io.manifest import checksum_of
 from pcdata.transforms import MaskDepth, Pipeline, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
 from tests.messages import told
 
@@ -171,8 +172,10 @@ def edited(folder, tmp_path, edit):
     copied = tmp_path / "edited"
     shutil.copytree(folder, copied)
     content = json.loads((copied / "dataset.json").read_text())
+    del content["checksum"]
     edit(content)
-    (copied / "dataset.json").write_text(json.dumps(content))
+    # With a checksum that fits, so that what else is checked is reached.
+    (copied / "dataset.json").write_text(json.dumps({**content, "checksum": checksum_of(content)}))
     return copied
 
 
