@@ -221,7 +221,7 @@ def test_a_pipeline_without_deprojection_is_refused(tmp_path, source):
     from pcdata.build import config_from_yaml
 
     with pytest.raises(ConfigError, match="Deproject"):
-        build_dataset(config_from_yaml(""), source, tmp_path / "out")
+        build_dataset(config_from_yaml("cloud: []"), source, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 

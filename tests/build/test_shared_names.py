@@ -13,7 +13,7 @@ import pytest
 
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, CaptureError
 from pcdata.io import scratch, whole_folders
 from tests.build.test_builder import Clouds, cloud, tree
 
@@ -271,10 +271,14 @@ def test_a_name_that_is_too_long_is_a_cache_error(tmp_path, source, configure):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_that_is_no_utf8_round_trips(tmp_path, source, configure):
+def test_a_folder_whose_name_is_no_utf8_round_trips(tmp_path, source, configure):
     out = tmp_path / os.fsdecode(b"\xff\xfe-out")
     build_dataset(configure(), source, out)
-    build_dataset(configure(), Clouds({os.fsdecode(b"scan\xff"): cloud()}), out, overwrite=True)
-    dataset = CachedCloudDataset(out)
-    assert dataset.ids == [os.fsdecode(b"scan\xff")]
-    assert next(iter(dataset)).meta[0]["sample_id"] == dataset.ids[0]
+    build_dataset(configure(), Clouds({"scan": cloud()}), out, overwrite=True)
+    assert next(iter(CachedCloudDataset(out))).meta[0]["sample_id"] == "scan"
+
+
+def test_a_sample_whose_name_is_no_utf8_is_refused_before_anything_is_written(tmp_path, source, configure):
+    with pytest.raises(CaptureError, match="names must be UTF-8 text"):
+        build_dataset(configure(), Clouds({os.fsdecode(b"scan\xff"): cloud()}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())

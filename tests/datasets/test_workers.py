@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud, collate_fixed, collate_packed, collate_padded
 from pcdata.errors import CacheError, CaptureError, ShapeError
-from pcdata.io.manifest import Manifest, Sample
+from pcdata.io.manifest import Manifest, Sample, checksum_of
 from pcdata.io.record import record_from_cloud
 from pcdata.io.stores import STORES
 from pcdata.transforms import Pipeline, RandomJitter
@@ -30,6 +30,7 @@ def points_by_id(loader: DataLoader) -> list[tuple[str, torch.Tensor]]:
 
 
 def expected(dataset, order=ORDER) -> list[tuple[str, torch.Tensor]]:
+    dataset.set_epoch(dataset.epoch)  # the same draws once more, on purpose
     return [(dataset.ids[index], dataset[index].points) for index in order]
 
 
@@ -112,6 +113,7 @@ def test_a_shuffling_loader_gives_the_same_samples_in_another_order(caches):
     orders = []
     for seed in range(3):
         torch.manual_seed(seed)
+        dataset.set_epoch(0)
         given = points_by_id(loader)
         orders.append([name for name, _ in given])
         assert sorted(orders[-1]) == sorted(wanted)
@@ -125,6 +127,7 @@ def test_padded_and_fixed_batches_come_through_workers_whole(caches):
         loader = DataLoader(dataset, batch_size=4, num_workers=2, collate_fn=collate)
         rows = [(points, mask) for batch in loader for points, mask in zip(batch.points, batch.mask, strict=True)]
         assert len(rows) == 8
+        dataset.set_epoch(0)
         for (points, mask), one in zip(rows, dataset, strict=True):
             assert torch.equal(points[mask], one.points)
 
@@ -182,7 +185,8 @@ def test_many_epochs_leave_no_open_files_behind(caches, num_workers):
 
     dataset = CachedCloudDataset(caches["hdf5"])
     loader = DataLoader(dataset, batch_size=4, num_workers=num_workers, collate_fn=collate_packed)
-    for _ in range(3):  # the first worker processes open what stays open: a sentinel, a shared-memory socket
+    for epoch in range(3):  # the first worker processes open what stays open: a sentinel, a shared-memory socket
+        dataset.set_epoch(epoch)
         points_by_id(loader)
     before = open_files()
     for epoch in range(30 if num_workers == 0 else 12):
@@ -217,6 +221,8 @@ def test_a_damaged_sample_keeps_its_error_type_and_names_itself(caches, tmp_path
     shutil.copytree(caches["npz"], tmp_path / "copy")
     content = json.loads((tmp_path / "copy" / "dataset.json").read_text())
     content["samples"][5]["digest"] = "0" * 64
+    del content["checksum"]
+    content["checksum"] = checksum_of(content)
     (tmp_path / "copy" / "dataset.json").write_text(json.dumps(content))
     dataset = CachedCloudDataset(tmp_path / "copy")
     kind, text = error_of(DataLoader(dataset, num_workers=num_workers, collate_fn=collate_packed))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 import json
 import pickle
 import shutil
@@ -16,6 +17,7 @@ from scipy.io import savemat
 from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, UnitError
 from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
 from pcdata.io.sample_names import in_order
+from pcdata.io.source import Source
 from pcdata.structures import DepthFrame, PointCloud
 from tests.messages import told
 
@@ -160,6 +162,12 @@ def test_naming_the_kind_gives_what_detection_gives(capture: Path) -> None:
     named = open_source(capture, kind=found.kind)
     assert type(named) is type(found)
     assert named.ids == found.ids
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_a_layout_shows_its_options_in_its_signature(layout: type[Source]) -> None:
+    assert str(inspect.signature(layout)).startswith("(path: ")
+    assert "links_to" in inspect.signature(layout).parameters
 
 
 def test_unknown_options_kinds_and_limits_are_refused_with_near_matches(capture: Path) -> None:

@@ -14,6 +14,7 @@ from pcdata import Camera, DepthFrame, PointCloud
 from pcdata.build import BuildReport, BuiltSample
 from pcdata.errors import MissingExtraError
 from pcdata.io import open_source, write_ply
+from pcdata.io.source import Source
 from pcdata.report import save_pipeline_figure, text_table
 from pcdata.report.inspection import build_text, capture_text
 from pcdata.synthetic import tabletop
@@ -59,16 +60,21 @@ def test_capture_text_of_a_cloud_file_tells_its_extent(tmp_path):
         assert part in text
 
 
-class _Source:
-    kind, name, ids = "test", "none", ["a"]
+class _Source(Source):
+    kind = "test"
 
     def __init__(self, capture):
+        super().__init__(Path("none"), ["a"])
         self.capture = capture
 
-    def __len__(self):
-        return 1
+    @classmethod
+    def recognises(cls, path):
+        return False
 
-    def load(self, sample_id):
+    def files(self, sample_id):
+        return {}
+
+    def _load(self, sample_id):
         return self.capture
 
 
