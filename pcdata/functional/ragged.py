@@ -121,9 +121,9 @@ def segment_min(values: Tensor, ptr: Tensor) -> Tensor:
 def _segment_extreme(values: Tensor, ptr: Tensor, reduce: str, empty: float) -> Tensor:
     found = torch.full((len(ptr) - 1, *values.shape[1:]), empty, dtype=values.dtype, device=values.device)
     if len(ptr) <= _FEW_CLOUDS:  # each at the speed of memory
-        for row, start, stop in zip(found, ptr.tolist(), ptr[1:].tolist()):
-            if stop > start:
-                row.copy_(values[start:stop].amax(0) if reduce == "amax" else values[start:stop].amin(0))
+        for cloud, (start, stop) in enumerate(pairwise(ptr.tolist())):
+            if stop > start:  # by index: autograd takes no change of rows that iteration gave
+                found[cloud] = values[start:stop].amax(0) if reduce == "amax" else values[start:stop].amin(0)
         return found
-    cloud = cloud_of_rows(ptr).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
-    return found.scatter_reduce_(0, cloud, values, reduce)
+    clouds = cloud_of_rows(ptr).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
+    return found.scatter_reduce_(0, clouds, values, reduce)

@@ -60,6 +60,16 @@ def test_integer_sums_stay_integers():
     assert total.tolist() == [2**53 + 1, 0, 5]
 
 
+def test_extremes_of_few_and_of_many_clouds_have_a_gradient():
+    for copies in (1, 50):
+        values = torch.tensor([1.0, 3.0, 2.0, -1.0] * copies, requires_grad=True)
+        ptr = ragged.ptr_from_counts([3, 0, 1] * copies)
+        filled = ragged.counts_from_ptr(ptr) > 0
+        for extreme, wanted in ((ragged.segment_max, [0, 1, 0, 1]), (ragged.segment_min, [1, 0, 0, 1])):
+            (grad,) = torch.autograd.grad(extreme(values, ptr)[filled].sum(), values)
+            assert grad.tolist() == wanted * copies
+
+
 def test_the_maximum_of_an_empty_integer_cloud_is_the_lowest_integer():
     top = ragged.segment_max(torch.tensor([-7, -9]), torch.tensor([0, 0, 2]))
     assert top.tolist() == [torch.iinfo(torch.int64).min, -7]
