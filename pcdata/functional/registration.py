@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,9 +17,27 @@ from pcdata.functional.normals import estimate_normals
 from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.robust import KERNELS, TUKEY_CUT, robust_weights
-from pcdata.functional.small_motions import PlaneSystem, motion_from_twist, plane_system, solve_observable
+from pcdata.functional.small_motions import (
+    PlaneSystem,
+    TwistSolution,
+    motion_from_twist,
+    plane_system,
+    solve_observable,
+)
+from pcdata.functional.surface_descent import Descent, Step, descend
 
 _MIN_MATCHES = 20  # fewer cannot carry six unknowns and a robust scale
+_FINE = (0.05, 0.02, 0.01)  # search distances, in metres for clouds in metres: a depth camera's noise at 1 m fits the last
+_NUM_FINE = len(_FINE)
+_ANY_ANGLE = 2.0  # radians: beyond a quarter turn, so every pair of normals without sign agrees
+_SMALL = 1e-6  # radians and units
+_WITHIN_NOISE = 0.01  # standard deviations: nobody could measure that step
+_MAX_SEARCHES = 4  # after the first; better poses than these find are out of reach
+_BETTER = 0.01  # of the fitted share: less is the noise of the matching
+_ROUNDS_BACK = 5  # Gauss-Newton on a quadratic: the second is exact for slides, turns of half a radian take four
+_NEAR = 3.0  # times the last distance
+_MIN_SUPPORT = 0.5  # most of what is near has to be on the surface
+_CHANCE = 0.5  # of the distance; evenly spread residuals have 1 / sqrt(3) = 0.58
 _MIN_NORMAL_NOISE = 0.01  # radians; no estimated normal is better, and exact data should not divide by 0
 # The median angle between two directions that each err by s along both tangents is sqrt(2) sqrt(2 ln 2) s = 1.665 s.
 _MEDIAN_ANGLE = 1.665
@@ -38,11 +57,14 @@ class Registration:
     """Where a source cloud lies in a target's frame, and how far that can be trusted."""
 
     target_from_source: Tensor  # (4, 4) float64 rigid
-    rmse: float  # of the point-to-plane residuals that overlap at the last distance, in the points' unit
+    rmse: float  # of the point-to-plane residuals that overlap at the last distance, in the points' unit; inf = none do
     overlap: float  # share of the source points that have a partner, 0..1
-    iterations: int  # over all scales
-    converged: bool  # the last scale stopped because the steps had become small
-    unobservable: Tensor  # (M, 6) float64 twists about pivot that were not moved along: rotation vector, translation
+    support: float  # of the source points within three times the last distance of the target, the share with a partner
+    iterations: int  # over all scales and searches
+    converged: bool  # the steps had become small, the surfaces meet there, and a wider search found no better pose
+    reason: str  # why not converged, in words; empty where it is
+    unobservable: Tensor  # (M, 6) float64 twists about pivot that the surfaces leave open at this pose: rotation vector,
+    #   translation. Of the poses that differ by these alone, this is the one nearest to the start.
     covariance: Tensor  # (6, 6) float64 of the twist about pivot, 0 along the unobservable directions
     pivot: Tensor  # (3,) float64, in the target's frame
 
@@ -95,19 +117,28 @@ def icp_point_to_plane(
     target_normals: Tensor | None = None,  # (M, 3) unit; None = estimated within normal_radius
     source_normals: Tensor | None = None,  # (N, 3) unit; None = estimated; partners must have similar normals
     initial: Tensor | None = None,  # (4, 4) target_from_source; None = the identity
-    max_distances: Sequence[float] = (0.05, 0.02, 0.01),
+    max_distances: Sequence[float] | None = None,  # None = by the clouds
     kernel: str = "tukey",
     scale: float | None = None,
     max_normal_angle: float = 0.6,
     normal_radius: float = 0.02,
     max_iterations: int = 30,
 ) -> Registration:
-    """Find the rigid motion that brings one cloud onto the surface of another, from a nearby start.
+    """Find the rigid motion that brings one cloud onto the surface of another, and say whether it can be trusted.
 
     Each round pairs every source point with its nearest target point (closer than the scale's distance, normals within
-    ``max_normal_angle``), weighs the point-to-plane residuals and takes a Gauss-Newton step along the directions that
-    the surfaces determine. A scale ends when the step is below 1e-6 radians and 1e-6 units, or after
-    ``max_iterations``. All sums are float64.
+    ``max_normal_angle``; the widest of several scales does not compare normals, which a turned start would spoil),
+    weighs the point-to-plane residuals and takes a Gauss-Newton step. A scale ends when the step is below 1e-6 radians
+    and 1e-6 units or a hundredth of its standard deviation, or after ``max_iterations``. All sums are float64.
+
+    Searches start at the given pose with all scales and with the finest alone, and again with all scales at the pose
+    that they found. The best is kept: the one that brings the most source points onto the target within the last
+    distance. Which directions the surfaces determine is judged there, not on the way, where normals differ because the
+    clouds are apart.
+
+    The result says ``converged=False`` with its reason where the last steps were not small, the clouds ceased to overlap
+    on the way, fewer than half of the source points near the target lie on it, the residuals fill the search distance
+    as chance would, no direction is determined, or wider searches still find better poses.
 
     Args:
         source: the cloud that moves; thousands of points are enough.
@@ -115,7 +146,10 @@ def icp_point_to_plane(
         target_normals: the target's normals, any sign.
         source_normals: the source's normals, any sign.
         initial: where to start.
-        max_distances: the largest distance of partners at each scale, coarse to fine, in the points' unit.
+        max_distances: the largest distance of partners at each scale, coarse to fine, in the points' unit. The first
+            bounds the error that can be found. None = 0.05, 0.02 and 0.01, none of them less than twice the spacing of
+            the target's points; before them 0.1, 0.2, ... up to twice the median distance between the clouds as they
+            start, but no wider than the target.
         kernel: "tukey", "huber", "trimmed" (the smaller 80 per cent) or "none".
         scale: standard deviation of a good residual, for Tukey and Huber; None = each scale's distance / 4.685, where
             Tukey's weight reaches 0. The spread of the residuals would be no good guide: on a table most of them are
@@ -127,66 +161,206 @@ def icp_point_to_plane(
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError, PoseError: an argument breaks the contract above.
         ConfigError: distances that do not descend, an unknown kernel, a count or length that is not positive.
-        TooFewPointsError: fewer than 20 source points overlap the target.
+        TooFewPointsError: fewer than 20 source points overlap the target at the start.
 
     Source: Chen & Medioni, Object modelling by registration of multiple range images, 1992.
     """
     where = "icp_point_to_plane"
     _check_schedule(where, max_distances, kernel, scale, max_iterations)
     check_tensors(where, {"source": source, "target": target}, {"source": "N 3", "target": "M 3"})
+    pose = torch.eye(4, dtype=torch.float64, device=source.device) if initial is None else initial.double()
+    rigid.check_rigid(f"{where}: initial", pose)
+    for name, cloud in (("source", source), ("target", target)):
+        if len(cloud) < _MIN_MATCHES:
+            raise TooFewPointsError(f"{where}: {name} has {len(cloud)} points; at least {_MIN_MATCHES} must overlap")
     if target_normals is None:
         target_normals = estimate_normals(target, radius=normal_radius)
     if source_normals is None:
         source_normals = estimate_normals(source, radius=normal_radius)
-    pose = torch.eye(4, dtype=torch.float64, device=source.device) if initial is None else initial.double()
-    rigid.check_rigid(f"{where}: initial", pose)
-    one_cloud = torch.tensor([0, len(source)], dtype=torch.int64, device=source.device)
-    options = {"max_normal_angle": max_normal_angle}
-
-    def measure(distance: float) -> tuple[Tensor, PlaneResiduals, PlaneSystem, Tensor]:
-        moved = rigid.transform_points(source, one_cloud, pose[None])
-        turned = rigid.transform_directions(source_normals, one_cloud, pose[None])
-        found = point_to_plane_residuals(
-            moved, target, target_normals, max_distance=distance, source_normals=turned, **options
+    pair = _Pair(source, source_normals, target, target_normals, kernel, scale, max_normal_angle)
+    distances = pair.distances_for(pose) if max_distances is None else tuple(max_distances)
+    found = pair.match(pose, distances[0], _ANY_ANGLE if len(distances) > 1 else max_normal_angle)
+    if len(found.residual) < _MIN_MATCHES:
+        raise TooFewPointsError(
+            f"{where}: only {len(found.residual)} of {len(source)} source points have a target point within "
+            f"{distances[0]:g}; give a better initial pose, a larger first distance, or clouds that overlap"
         )
-        if len(found.residual) < _MIN_MATCHES:
-            raise TooFewPointsError(
-                f"{where}: only {len(found.residual)} of {len(source)} source points have a target point within "
-                f"{distance:g}; give a better initial pose, a larger first distance, or clouds that overlap"
-            )
-        points = moved[found.source_index].double()
-        normals = target_normals[found.target_index].double()
-        pivot = points.mean(0)
-        sigma = found.residual.new_tensor(distance / TUKEY_CUT if scale is None else scale)
-        noise = _normal_noise(turned[found.source_index], normals)
-        weights = robust_weights(found.residual, sigma, kernel)
-        system = plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)
-        return pivot, found, system, weights
+    pivot = pair.moved(pose).double().mean(0)
 
-    iterations, converged = 0, False
-    for distance in max_distances:
-        converged = False
-        for _ in range(max_iterations):
-            pivot, found, system, weights = measure(distance)
-            solution = solve_observable(system)
-            pose = motion_from_twist(solution.twist, pivot) @ pose
-            iterations += 1
-            if float(solution.twist.abs().max()) < 1e-6:
-                converged = True
-                break
-    pivot, found, system, weights = measure(max_distances[-1])
-    solution = solve_observable(system)
-    squared = (weights * found.residual.square()).sum() / weights.sum()
-    return Registration(
-        target_from_source=pose,
-        rmse=float(found.residual.square().mean().sqrt()),
-        overlap=len(found.residual) / len(source),
-        iterations=iterations,
-        converged=converged,
-        unobservable=solution.unobservable,
-        covariance=solution.covariance * squared,
-        pivot=pivot,
-    )
+    def search(start: Tensor, distances: Sequence[float], noise: float = _MIN_NORMAL_NOISE) -> Descent:
+        def measure(motions: Tensor, distance: float) -> Step | None:
+            angle = _ANY_ANGLE if distance == distances[0] and len(distances) > 1 else max_normal_angle
+            return pair.step(motions[0] @ start, distance, angle, pivot, noise)
+
+        start_of_all = torch.eye(4, dtype=torch.float64, device=source.device)[None]
+        done = descend(measure, start_of_all, pivot, distances, max_iterations=max_iterations)
+        return replace(done, motions=done.motions @ start)
+
+    finest = distances[-1]
+    best, gain, iterations = search(pose, distances), 0.0, 0
+    iterations += best.iterations
+    fitted = pair.fitted(best.motions[0], finest)
+    starts = [(pose, distances[-_NUM_FINE:])] if len(distances) > _NUM_FINE else []
+    for again in range(_MAX_SEARCHES):
+        start, scales = starts.pop() if starts else (best.motions[0], distances)
+        other = search(start, scales)
+        iterations += other.iterations
+        share = pair.fitted(other.motions[0], finest)
+        gain = share - fitted
+        if gain > 0 and not other.lost:
+            best, fitted = other, share
+        if gain <= _BETTER * fitted and not starts and scales is distances:
+            break
+    target_from_source, open_directions = best.motions[0], pair.solve(best.motions[0], finest, pivot)
+    if open_directions is not None and len(open_directions.unobservable):
+        nearest = _nearest_along(open_directions.unobservable, target_from_source, pose, source, pivot)
+        held = search(nearest, distances[-1:], pair.noise(nearest, finest))
+        iterations += held.iterations
+        if not held.lost:
+            best, target_from_source = held, held.motions[0]
+    return pair.registration(target_from_source, pivot, best, finest, iterations, still_better=gain > _BETTER * fitted)
+
+
+def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tensor, pivot: Tensor) -> Tensor:
+    """Return the pose, of those that differ by the directions (M, 6) alone, that moves the points least from the start."""
+    points = source.double()
+    goal = points @ start[:3, :3].T + start[:3, 3]
+    for _ in range(_ROUNDS_BACK):
+        arm = points @ pose[:3, :3].T + pose[:3, 3] - pivot
+        moves = torch.linalg.cross(directions[:, None, :3], arm[None], dim=-1) + directions[:, None, 3:]  # (M, N, 3)
+        moves = moves.flatten(1)
+        amount = torch.linalg.pinv(moves @ moves.T, hermitian=True) @ (moves @ (goal - pivot - arm).flatten())
+        pose = motion_from_twist(amount @ directions, pivot) @ pose
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two clouds with normals, and what can be measured of them at a pose."""
+
+    source: Tensor
+    source_normals: Tensor
+    target: Tensor
+    target_normals: Tensor
+    kernel: str
+    scale: float | None
+    max_normal_angle: float
+
+    @property
+    def _ptr(self) -> Tensor:
+        return torch.tensor([0, len(self.source)], dtype=torch.int64, device=self.source.device)
+
+    def moved(self, pose: Tensor) -> Tensor:
+        return rigid.transform_points(self.source, self._ptr, pose[None])
+
+    def turned(self, pose: Tensor) -> Tensor:
+        return rigid.transform_directions(self.source_normals, self._ptr, pose[None])
+
+    def distances_for(self, pose: Tensor) -> tuple[float, ...]:
+        """Return search distances that the target's points can answer and that reach from the start to the target."""
+        spacing = float(knn(self.target, k=2, queries=self.target)[1][:, 1].median())
+        apart = float(knn(self.target, k=1, queries=self.moved(pose))[1][:, 0].median())
+        size = float((self.target.amax(0) - self.target.amin(0)).norm())
+        fine = tuple(distance for distance in _FINE if distance > 2 * spacing) or (2 * spacing or _FINE[-1],)
+        wide = [2 * fine[0]]
+        while wide[-1] < 2 * apart:
+            wide.append(2 * wide[-1])
+        needed = fine[0] < 2 * apart
+        return (*(d for d in reversed(wide) if needed and d <= max(size, fine[0])), *fine)
+
+    def match(self, pose: Tensor, distance: float, angle: float | None = None) -> PlaneResiduals:
+        return point_to_plane_residuals(
+            self.moved(pose),
+            self.target,
+            self.target_normals,
+            max_distance=distance,
+            source_normals=self.turned(pose),
+            max_normal_angle=self.max_normal_angle if angle is None else angle,
+        )
+
+    def weights(self, found: PlaneResiduals, distance: float) -> Tensor:
+        sigma = found.residual.new_tensor(distance / TUKEY_CUT if self.scale is None else self.scale)
+        return robust_weights(found.residual, sigma, self.kernel)
+
+    def noise(self, pose: Tensor, distance: float) -> float:
+        """Return how far the normals err, in radians, where the clouds meet at a pose."""
+        found = self.match(pose, distance)
+        return _normal_noise(self.turned(pose)[found.source_index], self.target_normals[found.target_index].double())
+
+    def system(self, pose: Tensor, found: PlaneResiduals, distance: float, pivot: Tensor, noise: float) -> PlaneSystem:
+        points = self.moved(pose)[found.source_index].double()
+        normals = self.target_normals[found.target_index].double()
+        weights = self.weights(found, distance)
+        return plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)
+
+    def step(self, pose: Tensor, distance: float, angle: float, pivot: Tensor, noise: float) -> Step | None:
+        found = self.match(pose, distance, angle)
+        if len(found.residual) < _MIN_MATCHES:
+            return None
+        solution = solve_observable(self.system(pose, found, distance, pivot, noise))
+        weights = self.weights(found, distance)
+        sigma = float(((weights * found.residual.square()).sum() / weights.sum().clamp(min=1e-300)).sqrt())
+        small = float(solution.twist.abs().max()) < _SMALL or float(solution.decrement) < _WITHIN_NOISE * sigma
+        # The distances of this schedule were asked for: only the noise of the target could make them too fine.
+        return Step(solution.twist[None], small, 0.0)
+
+    def solve(self, pose: Tensor, distance: float, pivot: Tensor) -> TwistSolution | None:
+        """Return what the surfaces determine at a pose, with the noise of the normals as measured there."""
+        found = self.match(pose, distance)
+        if len(found.residual) < _MIN_MATCHES:
+            return None
+        return solve_observable(self.system(pose, found, distance, pivot, self.noise(pose, distance)))
+
+    def fitted(self, pose: Tensor, distance: float) -> float:
+        """Return the share of the source points that lie on the target: Tukey's weights, whatever kernel finds steps."""
+        residual = self.match(pose, distance).residual
+        sigma = residual.new_tensor(distance / TUKEY_CUT)
+        return float(robust_weights(residual, sigma, "tukey").sum()) / len(self.source)
+
+    def registration(
+        self, pose: Tensor, pivot: Tensor, descent: Descent, distance: float, iterations: int, *, still_better: bool
+    ) -> Registration:
+        """Measure the result at its pose and say why it could not be trusted."""
+        found = self.match(pose, distance)
+        near = int((knn(self.target, k=1, queries=self.moved(pose))[1][:, 0] < _NEAR * distance).sum())
+        support = len(found.residual) / max(near, 1)
+        rmse = float(found.residual.square().mean().sqrt()) if len(found.residual) else math.inf
+        solution = self.solve(pose, distance, pivot)
+        identity = torch.eye(6, dtype=torch.float64, device=pose.device)
+        unobservable = identity if solution is None else solution.unobservable
+        covariance = torch.zeros_like(identity)
+        if solution is not None:
+            weights = self.weights(found, distance)
+            squared = (weights * found.residual.square()).sum() / weights.sum().clamp(min=1e-300)
+            covariance = solution.covariance * squared
+        reason = ""
+        if descent.lost or solution is None:
+            reason = f"fewer than {_MIN_MATCHES} source points kept a partner within {distance:g}"
+        elif len(unobservable) == 6:
+            reason = "the surfaces determine no direction: all points in one place or on one line, or without normals"
+        elif support < _MIN_SUPPORT:
+            reason = (
+                f"of {near} source points within {_NEAR * distance:g} of the target {len(found.residual)} lie on it "
+                f"within {distance:g}: the clouds are near each other but do not meet"
+            )
+        elif rmse > _CHANCE * distance:
+            reason = f"residuals of {rmse:.3g} fill the search distance of {distance:g} as chance would"
+        elif still_better:
+            reason = f"searching again from the result kept finding better poses, {_MAX_SEARCHES} times"
+        elif not descent.settled:
+            reason = f"steps had not become small after {descent.iterations} rounds; allow more iterations"
+        return Registration(
+            target_from_source=pose,
+            rmse=rmse,
+            overlap=len(found.residual) / len(self.source),
+            support=support,
+            iterations=iterations,
+            converged=not reason,
+            reason=reason,
+            unobservable=unobservable,
+            covariance=covariance,
+            pivot=pivot,
+        )
 
 
 def _normal_noise(normals: Tensor, partners: Tensor) -> float:
@@ -203,13 +377,16 @@ def _facing(normals: Tensor, reference: Tensor) -> Tensor:
 
 
 def _check_schedule(
-    where: str, max_distances: Sequence[float], kernel: str, scale: float | None, max_iterations: int
+    where: str, max_distances: Sequence[float] | None, kernel: str, scale: float | None, max_iterations: int
 ) -> None:
     require_count(where, "max_iterations", max_iterations)
-    for distance in max_distances:
-        require_length(where, "max_distances", distance)
-    if not max_distances or list(max_distances) != sorted(max_distances, reverse=True):
-        raise ConfigError(f"{where}: max_distances go from coarse to fine, at least one, got {tuple(max_distances)}")
+    if max_distances is not None:
+        for distance in max_distances:
+            require_length(where, "max_distances", distance)
+        if not len(max_distances) or list(max_distances) != sorted(max_distances, reverse=True):
+            raise ConfigError(
+                f"{where}: max_distances go from coarse to fine, at least one, got {tuple(max_distances)}"
+            )
     if scale is not None:
         require_length(where, "scale", scale)
     if kernel not in KERNELS:

@@ -15,11 +15,11 @@ from pcdata.functional.robust import TUKEY_CUT, robust_scale, robust_weights, un
 from pcdata.functional.small_motions import (
     PlaneSystem,
     TwistSolution,
-    motion_from_twist,
     plane_system,
     solve_observable,
     twist_from_motion,
 )
+from pcdata.functional.surface_descent import Step, descend
 from pcdata.functional.surfaces import Surface
 
 # Both directions of a pair measure the same surfaces with the same pixels.
@@ -98,28 +98,18 @@ def align_views(
     pivot = scene_middle(captures, poses)
     motions = torch.eye(4, dtype=torch.float64, device=poses.device).repeat(num_views, 1, 1)
     before = measure_pairs(captures, poses, pivot, max_distances[0], max_angle)
-    fits, iterations, converged, reach = before, 0, False, max_distances[0]
-    for distance in max_distances:
-        # A cut within the noise would keep the partners that fit by chance and throw out what could correct them.
-        if iterations and distance < TUKEY_CUT * _spread(fits):
-            break
-        reach, converged = distance, False
-        share, last = 1.0, torch.zeros(num_views, 6, dtype=torch.float64, device=poses.device)
-        for _ in range(max_iterations):
-            fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
-            solution = _solve(fits, num_views, fixed)
-            step = solution.twist.reshape(num_views, 6)
-            # Along a weak direction a step may go too far, by as much as it came; a part of it ends the swinging.
-            share, last = 0.5 * share if float((step * last).sum()) < 0 else share, step
-            motions = motion_from_twist(share * step, pivot) @ motions
-            iterations += 1
-            # The Newton decrement is the step in standard deviations: what is left lies within the noise.
-            decrement = float(solution.decrement) / _SHARED_DATA**0.5
-            if decrement < _WITHIN_NOISE or float(step.abs().max()) < _SETTLED:
-                converged = True
-                break
-    found = assess_motions(captures, poses, motions, pivot, fixed=fixed, max_distance=reach)
-    return replace(found, before=before, iterations=iterations, converged=converged)
+
+    def measure(motions: Tensor, distance: float) -> Step:
+        fits = measure_pairs(captures, motions @ poses, pivot, distance, max_angle)
+        solution = _solve(fits, num_views, fixed)
+        step = solution.twist.reshape(num_views, 6)
+        # The Newton decrement is the step in standard deviations: what is left lies within the noise.
+        decrement = float(solution.decrement) / _SHARED_DATA**0.5
+        return Step(step, decrement < _WITHIN_NOISE or float(step.abs().max()) < _SETTLED, _spread(fits))
+
+    found = descend(measure, motions, pivot, max_distances, max_iterations=max_iterations)
+    assessed = assess_motions(captures, poses, found.motions, pivot, fixed=fixed, max_distance=found.reach)
+    return replace(assessed, before=before, iterations=found.iterations, converged=found.settled)
 
 
 def assess_motions(
