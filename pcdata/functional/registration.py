@@ -16,11 +16,11 @@ from pcdata.functional.neighbors import knn
 from pcdata.functional.normals import estimate_normals
 from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.ragged import ptr_from_counts
-from pcdata.functional.robust import KERNELS, TUKEY_CUT, robust_weights
+from pcdata.functional.robust import KERNELS, TUKEY_CUT, robust_scale, robust_weights
 from pcdata.functional.small_motions import (
     PlaneSystem,
     TwistSolution,
-    motion_from_twist,
+    motion_along,
     plane_system,
     solve_observable,
 )
@@ -31,14 +31,20 @@ _FINE = (0.05, 0.02, 0.01)  # search distances, in metres for clouds in metres: 
 _NUM_FINE = len(_FINE)
 _ANY_ANGLE = 2.0  # radians: beyond a quarter turn, so every pair of normals without sign agrees
 _SMALL = 1e-6  # radians and units
-_WITHIN_NOISE = 0.01  # standard deviations: nobody could measure that step
+_WITHIN_NOISE = 0.05  # standard deviations: nobody could measure that step; partners that swap swing by less
+_ENOUGH = 1e-3  # of a distance: finer ones follow
 _MAX_SEARCHES = 4  # after the first; better poses than these find are out of reach
 _BETTER = 0.01  # of the fitted share: less is the noise of the matching
 _ROUNDS_BACK = 5  # Gauss-Newton on a quadratic: the second is exact for slides, turns of half a radian take four
 _NEAR = 3.0  # times the last distance
 _MIN_SUPPORT = 0.5  # most of what is near has to be on the surface
 _CHANCE = 0.5  # of the distance; evenly spread residuals have 1 / sqrt(3) = 0.58
-_MIN_NORMAL_NOISE = 0.01  # radians; no estimated normal is better, and exact data should not divide by 0
+_PROBE = 3.0  # times the last distance
+_LARGEST_TURN = 0.5  # radians
+_CLIP = 3.0  # standard deviations: what does not fit at all should not hide what fits less
+_RISE = 0.1  # of the mean square
+_DOUBT = 5.0  # standard deviations of a mean square
+_MIN_NORMAL_NOISE = 0.001  # radians; no estimated normal is better, and exact data should not divide by 0
 # The median angle between two directions that each err by s along both tangents is sqrt(2) sqrt(2 ln 2) s = 1.665 s.
 _MEDIAN_ANGLE = 1.665
 
@@ -128,8 +134,9 @@ def icp_point_to_plane(
 
     Each round pairs every source point with its nearest target point (closer than the scale's distance, normals within
     ``max_normal_angle``; the widest of several scales does not compare normals, which a turned start would spoil),
-    weighs the point-to-plane residuals and takes a Gauss-Newton step. A scale ends when the step is below 1e-6 radians
-    and 1e-6 units or a hundredth of its standard deviation, or after ``max_iterations``. All sums are float64.
+    weighs the point-to-plane residuals and takes a Gauss-Newton step. The last scale ends when the step is below 1e-6
+    radians and 1e-6 units or a twentieth of its standard deviation, the others below a thousandth of their distance, all
+    after ``max_iterations``. All sums are float64.
 
     Searches start at the given pose with all scales and with the finest alone, and again with all scales at the pose
     that they found. The best is kept: the one that brings the most source points onto the target within the last
@@ -187,38 +194,39 @@ def icp_point_to_plane(
         )
     pivot = pair.moved(pose).double().mean(0)
 
-    def search(start: Tensor, distances: Sequence[float], noise: float = _MIN_NORMAL_NOISE) -> Descent:
+    def search(start: Tensor, distances: Sequence[float], num_open: int | None = None) -> Descent:
         def measure(motions: Tensor, distance: float) -> Step | None:
             angle = _ANY_ANGLE if distance == distances[0] and len(distances) > 1 else max_normal_angle
-            return pair.step(motions[0] @ start, distance, angle, pivot, noise)
+            enough = _SMALL if distance == distances[-1] else _ENOUGH * distance
+            return pair.step(motions[0] @ start, distance, angle, pivot, num_open, enough)
 
         start_of_all = torch.eye(4, dtype=torch.float64, device=source.device)[None]
         done = descend(measure, start_of_all, pivot, distances, max_iterations=max_iterations)
         return replace(done, motions=done.motions @ start)
 
     finest = distances[-1]
-    best, gain, iterations = search(pose, distances), 0.0, 0
-    iterations += best.iterations
-    fitted = pair.fitted(best.motions[0], finest)
-    starts = [(pose, distances[-_NUM_FINE:])] if len(distances) > _NUM_FINE else []
-    for again in range(_MAX_SEARCHES):
+    best, gain = search(pose, distances), 0.0
+    iterations = best.iterations
+    starts = [(pose, tuple(distances[-_NUM_FINE:]))] if len(distances) > _NUM_FINE else []
+    for _ in range(_MAX_SEARCHES):
         start, scales = starts.pop() if starts else (best.motions[0], distances)
         other = search(start, scales)
         iterations += other.iterations
-        share = pair.fitted(other.motions[0], finest)
-        gain = share - fitted
-        if gain > 0 and not other.lost:
-            best, fitted = other, share
-        if gain <= _BETTER * fitted and not starts and scales is distances:
+        gain = -1.0 if other.lost else pair.gain(other.motions[0], best.motions[0], finest)
+        best = other if gain > 0 else best
+        if gain <= _BETTER and scales is distances:
             break
-    target_from_source, open_directions = best.motions[0], pair.solve(best.motions[0], finest, pivot)
-    if open_directions is not None and len(open_directions.unobservable):
-        nearest = _nearest_along(open_directions.unobservable, target_from_source, pose, source, pivot)
-        held = search(nearest, distances[-1:], pair.noise(nearest, finest))
+    num_open = pair.num_open(best.motions[0], finest, pivot)
+    left_open = pair.solve(best.motions[0], finest, pivot, num_open)
+    if left_open is not None and num_open:
+        held = search(
+            _nearest_along(left_open.unobservable, best.motions[0], pose, source, pivot), distances[-1:], num_open
+        )
         iterations += held.iterations
-        if not held.lost:
-            best, target_from_source = held, held.motions[0]
-    return pair.registration(target_from_source, pivot, best, finest, iterations, still_better=gain > _BETTER * fitted)
+        # Over so long a way a surface that is flat here may bend: then the found pose stays.
+        if not held.lost and pair.gain(held.motions[0], best.motions[0], finest) > -_BETTER:
+            best = held
+    return pair.registration(best, pivot, finest, iterations, num_open, still_better=gain > _BETTER)
 
 
 def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tensor, pivot: Tensor) -> Tensor:
@@ -230,7 +238,7 @@ def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tens
         moves = torch.linalg.cross(directions[:, None, :3], arm[None], dim=-1) + directions[:, None, 3:]  # (M, N, 3)
         moves = moves.flatten(1)
         amount = torch.linalg.pinv(moves @ moves.T, hermitian=True) @ (moves @ (goal - pivot - arm).flatten())
-        pose = motion_from_twist(amount @ directions, pivot) @ pose
+        pose = motion_along(amount @ directions, pivot) @ pose
     return pose
 
 
@@ -285,47 +293,94 @@ class _Pair:
     def noise(self, pose: Tensor, distance: float) -> float:
         """Return how far the normals err, in radians, where the clouds meet at a pose."""
         found = self.match(pose, distance)
-        return _normal_noise(self.turned(pose)[found.source_index], self.target_normals[found.target_index].double())
+        normals, partners = self.turned(pose)[found.source_index], self.target_normals[found.target_index]
+        apart = (self.moved(pose)[found.source_index].double() - self.target[found.target_index].double()).norm(dim=1)
+        return _normal_noise(normals, partners, apart)
 
-    def system(self, pose: Tensor, found: PlaneResiduals, distance: float, pivot: Tensor, noise: float) -> PlaneSystem:
-        points = self.moved(pose)[found.source_index].double()
+    def system(self, found: PlaneResiduals, points: Tensor, distance: float, pivot: Tensor, noise: float) -> PlaneSystem:
         normals = self.target_normals[found.target_index].double()
         weights = self.weights(found, distance)
         return plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)
 
-    def step(self, pose: Tensor, distance: float, angle: float, pivot: Tensor, noise: float) -> Step | None:
+    def step(
+        self, pose: Tensor, distance: float, angle: float, pivot: Tensor, num_open: int | None, enough: float
+    ) -> Step | None:
+        """Return the step of one round; which directions are open is known, or what exact normals would leave open."""
         found = self.match(pose, distance, angle)
         if len(found.residual) < _MIN_MATCHES:
             return None
-        solution = solve_observable(self.system(pose, found, distance, pivot, noise))
+        points = self.moved(pose)[found.source_index].double()
+        noise = _MIN_NORMAL_NOISE if num_open is None else self.noise(pose, distance)
+        solution = solve_observable(self.system(found, points, distance, pivot, noise), num_open=num_open)
         weights = self.weights(found, distance)
         sigma = float(((weights * found.residual.square()).sum() / weights.sum().clamp(min=1e-300)).sqrt())
-        small = float(solution.twist.abs().max()) < _SMALL or float(solution.decrement) < _WITHIN_NOISE * sigma
+        small = float(solution.twist.abs().max()) < enough or float(solution.decrement) < _WITHIN_NOISE * sigma
         # The distances of this schedule were asked for: only the noise of the target could make them too fine.
         return Step(solution.twist[None], small, 0.0)
 
-    def solve(self, pose: Tensor, distance: float, pivot: Tensor) -> TwistSolution | None:
+    def solve(self, pose: Tensor, distance: float, pivot: Tensor, num_open: int | None = None) -> TwistSolution | None:
         """Return what the surfaces determine at a pose, with the noise of the normals as measured there."""
         found = self.match(pose, distance)
         if len(found.residual) < _MIN_MATCHES:
             return None
-        return solve_observable(self.system(pose, found, distance, pivot, self.noise(pose, distance)))
+        # Where each normal was measured: at the source point it would be off by the curvature in between, which looks
+        # like relief (a sphere's normals at neighbours do not meet in its centre).
+        points = self.target[found.target_index].double()
+        system = self.system(found, points, distance, pivot, self.noise(pose, distance))
+        return solve_observable(system, num_open=num_open)
 
-    def fitted(self, pose: Tensor, distance: float) -> float:
-        """Return the share of the source points that lie on the target: Tukey's weights, whatever kernel finds steps."""
-        residual = self.match(pose, distance).residual
-        sigma = residual.new_tensor(distance / TUKEY_CUT)
-        return float(robust_weights(residual, sigma, "tukey").sum()) / len(self.source)
+    def num_open(self, pose: Tensor, distance: float, pivot: Tensor) -> int:
+        """Return how many directions the surfaces leave open at a pose.
+
+        Those that noise of the normals could feign are tried: along an open direction the points stay on the surface
+        when they move by three times the distance, one way or the other, however noisy its normals are.
+        """
+        solution = self.solve(pose, distance, pivot)
+        if solution is None:
+            return 0
+        for number, direction in enumerate(solution.unobservable):
+            if not self.is_flat_along(direction, pose, distance, pivot):
+                return number
+        return len(solution.unobservable)
+
+    def is_flat_along(self, direction: Tensor, pose: Tensor, distance: float, pivot: Tensor) -> bool:
+        arm = self.moved(pose).double() - pivot
+        way = torch.linalg.cross(direction[None, :3].expand_as(arm), arm) + direction[3:]
+        length = _PROBE * distance / float(way.square().sum(1).mean().sqrt().clamp(min=1e-12))
+        # Turns about an axis through all points move none: half a radian is as far as any.
+        length = min(length, _LARGEST_TURN / max(float(direction[:3].norm()), 1e-12))
+        here = self.match(pose, distance).residual
+        clip = _CLIP * robust_scale(here).clamp(min=1e-6 * distance)
+        for sign in (-1.0, 1.0):
+            there = self.match(motion_along(sign * length * direction, pivot) @ pose, distance).residual
+            squares = [residual.abs().clamp(max=float(clip)).square().mean() for residual in (here, there)]
+            certain = _DOUBT * (2 / max(len(there), 1)) ** 0.5
+            if len(there) >= _MIN_MATCHES and float(squares[1]) > (1 + max(_RISE, certain)) * float(squares[0]):
+                return False
+        return True
+
+    def gain(self, other: Tensor, best: Tensor, distance: float) -> float:
+        """Return by which part of the best pose's share of fitting points the other pose has more.
+
+        Points fit within the closer spread of the two poses' residuals: within the search distance both may fit alike.
+        """
+        residuals = [self.match(pose, distance).residual for pose in (other, best)]
+        if min(map(len, residuals)) < _MIN_MATCHES:
+            return float(len(residuals[0]) - len(residuals[1]))
+        sigma = torch.stack([robust_scale(residual) for residual in residuals]).min().clamp(min=1e-6 * distance)
+        ours, theirs = (float(robust_weights(residual, sigma, "tukey").sum()) for residual in residuals)
+        return ours / max(theirs, 1e-300) - 1
 
     def registration(
-        self, pose: Tensor, pivot: Tensor, descent: Descent, distance: float, iterations: int, *, still_better: bool
+        self, descent: Descent, pivot: Tensor, distance: float, iterations: int, num_open: int, *, still_better: bool
     ) -> Registration:
         """Measure the result at its pose and say why it could not be trusted."""
+        pose = descent.motions[0]
         found = self.match(pose, distance)
         near = int((knn(self.target, k=1, queries=self.moved(pose))[1][:, 0] < _NEAR * distance).sum())
         support = len(found.residual) / max(near, 1)
         rmse = float(found.residual.square().mean().sqrt()) if len(found.residual) else math.inf
-        solution = self.solve(pose, distance, pivot)
+        solution = self.solve(pose, distance, pivot, num_open)
         identity = torch.eye(6, dtype=torch.float64, device=pose.device)
         unobservable = identity if solution is None else solution.unobservable
         covariance = torch.zeros_like(identity)
@@ -363,12 +418,23 @@ class _Pair:
         )
 
 
-def _normal_noise(normals: Tensor, partners: Tensor) -> float:
-    """Return how far normals err along each tangent, in radians, from the median angle between (M, 3) partners."""
-    if len(normals) == 0:
+def _normal_noise(normals: Tensor, partners: Tensor, distance: Tensor) -> float:
+    """Return how far normals err along each tangent, in radians, from the angles between (M, 3) partners.
+
+    On a curved surface the angle grows with the distance to the partner (M,); what is left at distance 0 is noise. Of
+    the nearer and the farther half, median angle^2 = noise^2 + (curvature distance)^2.
+    """
+    if len(normals) < 2:
         return _MIN_NORMAL_NOISE
-    angle = rigid.angle_between(normals, _facing(partners, normals))
-    return max(float(angle.median()) / _MEDIAN_ANGLE, _MIN_NORMAL_NOISE)
+    angle = rigid.angle_between(normals, _facing(partners, normals)).double()
+    middle = distance.median()
+    near, far = distance <= middle, distance > middle
+    if not bool(far.any()):
+        return max(float(angle.median()) / _MEDIAN_ANGLE, _MIN_NORMAL_NOISE)
+    squares = [(float(angle[half].median()) ** 2, float(distance[half].median()) ** 2) for half in (near, far)]
+    (near_angle, near_distance), (far_angle, far_distance) = squares
+    slope = max((far_angle - near_angle) / max(far_distance - near_distance, 1e-300), 0.0)
+    return max(max(near_angle - slope * near_distance, 0.0) ** 0.5 / _MEDIAN_ANGLE, _MIN_NORMAL_NOISE)
 
 
 def _facing(normals: Tensor, reference: Tensor) -> Tensor:

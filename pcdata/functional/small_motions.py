@@ -16,6 +16,7 @@ from pcdata.functional import rigid
 # A direction counts as observed when the surfaces say at least three times as much about it as the noise of their
 # normals alone would feign: on a bare plane the noise of the normals looks like relief to slide against.
 _MAX_FEIGNED_SHARE = 0.25
+_LEAST_REAL_SHARE = 0.05  # of a direction that is known to be determined: keeps steps along it within 20 times their size
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +69,13 @@ def plane_system(
     return PlaneSystem(information, weighted.T @ residuals, feigned)
 
 
-def solve_observable(system: PlaneSystem) -> TwistSolution:
+def solve_observable(system: PlaneSystem, *, num_open: int | None = None) -> TwistSolution:
     """Solve for the twist that brings the residuals to 0, leaving alone what the surfaces do not determine.
 
     Directions are the generalised eigenvectors of (feigned, information + feigned), so neither the unit of length nor
     the choice between rotation and translation matters. A direction of which more than a quarter is feigned is
-    unobservable: a plane slides along itself, a sphere turns about its centre.
+    unobservable: a plane slides along itself, a sphere turns about its centre. ``unobservable`` lists the most feigned
+    first. Where it is known otherwise, ``num_open`` says how many of the most feigned directions are left alone.
 
     Source: the degeneracy test of Zhang, Kaess & Singh, On degeneracy of optimization-based state estimation problems,
     ICRA 2016, with the noise of the normals in the place of a hand-set threshold.
@@ -92,10 +94,12 @@ def solve_observable(system: PlaneSystem) -> TwistSolution:
     share, vectors = torch.linalg.eigh((real + real.T) / 2)  # the part that is not feigned, ascending
     directions = (scale[:, None] * (inverse.T @ vectors)).T  # (D, D), one per row
     seen = share > 1 - _MAX_FEIGNED_SHARE
+    if num_open is not None:
+        seen = torch.arange(size, device=both.device) >= num_open
     basis = directions[seen]
     # The feigned part determines nothing: it is in the information, and once more in the unit that shares are of.
     # Left in, it would shorten every step, and the fit would end before it is where the gradient vanishes.
-    real_share = 2 * share[seen] - 1
+    real_share = (2 * share[seen] - 1).clamp(min=_LEAST_REAL_SHARE)
     amount = -(basis @ system.gradient) / real_share
     spread = basis / real_share.sqrt()[:, None]
     unobservable = torch.nn.functional.normalize(directions[~seen], dim=1)
@@ -118,6 +122,19 @@ def motion_from_twist(twist: Tensor, pivot: Tensor) -> Tensor:  # (..., 6), (3,)
         rotation = torch.where((angle > 0)[..., None, None], rotation, identity + cross)
     pivot = pivot.double()
     return rigid.from_rotation_translation(rotation, pivot + shift - (rotation @ pivot[:, None]).squeeze(-1))
+
+
+def motion_along(twist: Tensor, pivot: Tensor) -> Tensor:  # (6,), (3,) -> (4, 4) float64
+    """Return the motion that goes along one screw: the exponential of the twist, whose turning carries its shift along.
+
+    Small twists give what :func:`motion_from_twist` gives. Far along, a sphere that turns about its centre stays where
+    it is only this way, whatever the pivot.
+    """
+    x, y, z = twist[:3].double().tolist()
+    velocity = torch.zeros(4, 4, dtype=torch.float64, device=twist.device)
+    velocity[:3, :3] = velocity.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    velocity[:3, 3] = twist[3:].double() - velocity[:3, :3] @ pivot.double()
+    return torch.linalg.matrix_exp(velocity)
 
 
 def twist_from_motion(motion: Tensor, pivot: Tensor) -> Tensor:  # (..., 4, 4), (3,) -> (..., 6) float64
