@@ -39,11 +39,14 @@ _ROUNDS_BACK = 5  # Gauss-Newton on a quadratic: the second is exact for slides,
 _NEAR = 3.0  # times the last distance
 _MIN_SUPPORT = 0.5  # most of what is near has to be on the surface
 _CHANCE = 0.5  # of the distance; evenly spread residuals have 1 / sqrt(3) = 0.58
+_NORMAL_RADIUS = 0.02  # metres for clouds in metres: a depth camera's noise at 1 m tilts such normals by 2 degrees
+_NORMAL_SPACINGS = 4.0  # times the median distance of neighbours: a dozen points on a surface
 _PROBE = 3.0  # times the last distance
 _LARGEST_TURN = 0.5  # radians
 _CLIP = 3.0  # standard deviations: what does not fit at all should not hide what fits less
 _RISE = 0.1  # of the mean square
 _DOUBT = 5.0  # standard deviations of a mean square
+_MOST_OPEN = 3  # directions: a plane's, a sphere's
 _MIN_NORMAL_NOISE = 0.001  # radians; no estimated normal is better, and exact data should not divide by 0
 # The median angle between two directions that each err by s along both tangents is sqrt(2) sqrt(2 ln 2) s = 1.665 s.
 _MEDIAN_ANGLE = 1.665
@@ -127,7 +130,7 @@ def icp_point_to_plane(
     kernel: str = "tukey",
     scale: float | None = None,
     max_normal_angle: float = 0.6,
-    normal_radius: float = 0.02,
+    normal_radius: float | None = None,
     max_iterations: int = 30,
 ) -> Registration:
     """Find the rigid motion that brings one cloud onto the surface of another, and say whether it can be trusted.
@@ -162,13 +165,15 @@ def icp_point_to_plane(
             Tukey's weight reaches 0. The spread of the residuals would be no good guide: on a table most of them are
             small however far the cloud slid along it, and would have the sides of the objects thrown out.
         max_normal_angle: in radians.
-        normal_radius: neighbourhood of the estimated normals, in the points' unit.
+        normal_radius: neighbourhood of the estimated normals, in the points' unit; None = 0.02, but no less than four
+            times the spacing of the points.
         max_iterations: per scale.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError, PoseError: an argument breaks the contract above.
-        ConfigError: distances that do not descend, an unknown kernel, a count or length that is not positive.
-        TooFewPointsError: fewer than 20 source points overlap the target at the start.
+        ConfigError: distances that do not descend, an unknown kernel, a count or length that is not positive, or a
+            normal_radius that holds fewer than three points at most points.
+        TooFewPointsError: a cloud of fewer than 20 points, or fewer than 20 source points overlap the target at the start.
 
     Source: Chen & Medioni, Object modelling by registration of multiple range images, 1992.
     """
@@ -181,9 +186,9 @@ def icp_point_to_plane(
         if len(cloud) < _MIN_MATCHES:
             raise TooFewPointsError(f"{where}: {name} has {len(cloud)} points; at least {_MIN_MATCHES} must overlap")
     if target_normals is None:
-        target_normals = estimate_normals(target, radius=normal_radius)
+        target_normals = _normals_of(where, "target", target, normal_radius)
     if source_normals is None:
-        source_normals = estimate_normals(source, radius=normal_radius)
+        source_normals = _normals_of(where, "source", source, normal_radius)
     pair = _Pair(source, source_normals, target, target_normals, kernel, scale, max_normal_angle)
     distances = pair.distances_for(pose) if max_distances is None else tuple(max_distances)
     found = pair.match(pose, distances[0], _ANY_ANGLE if len(distances) > 1 else max_normal_angle)
@@ -391,8 +396,11 @@ class _Pair:
         reason = ""
         if descent.lost or solution is None:
             reason = f"fewer than {_MIN_MATCHES} source points kept a partner within {distance:g}"
-        elif len(unobservable) == 6:
-            reason = "the surfaces determine no direction: all points in one place or on one line, or without normals"
+        elif len(unobservable) > _MOST_OPEN:
+            reason = (
+                f"{len(unobservable)} of 6 directions are open, and no surface leaves more than {_MOST_OPEN}: the points lie "
+                "in one place or on one line, or have no normals"
+            )
         elif support < _MIN_SUPPORT:
             reason = (
                 f"of {near} source points within {_NEAR * distance:g} of the target {len(found.residual)} lie on it "
@@ -416,6 +424,21 @@ class _Pair:
             covariance=covariance,
             pivot=pivot,
         )
+
+
+def _normals_of(where: str, name: str, points: Tensor, radius: float | None) -> Tensor:
+    """Estimate normals from neighbourhoods that hold enough points; without neighbours all would be (0, 0, 1)."""
+    distance = knn(points, k=3, queries=points)[1]  # to itself, the nearest, the next
+    if radius is None:
+        return estimate_normals(points, radius=max(_NORMAL_RADIUS, _NORMAL_SPACINGS * float(distance[:, 1].median())))
+    require_length(where, "normal_radius", radius)
+    third = float(distance[:, 2].median())
+    if third >= radius:
+        raise ConfigError(
+            f"{where}: within normal_radius {radius:g} most points of the {name} have fewer than two neighbours, which "
+            f"give no normal; give more than {third:.3g}, None, or the normals themselves"
+        )
+    return estimate_normals(points, radius=radius)
 
 
 def _normal_noise(normals: Tensor, partners: Tensor, distance: Tensor) -> float:
