@@ -18,6 +18,7 @@ from pcdata.functional.parameters import require_count, require_length
 from pcdata.functional.ragged import ptr_from_counts
 from pcdata.functional.robust import KERNELS, TUKEY_CUT, robust_scale, robust_weights
 from pcdata.functional.small_motions import (
+    MAX_FEIGNED_SHARE,
     PlaneSystem,
     TwistSolution,
     motion_along,
@@ -34,6 +35,7 @@ _SMALL = 1e-6  # radians and units
 _WITHIN_NOISE = 0.05  # standard deviations: nobody could measure that step; partners that swap swing by less
 _ENOUGH = 1e-3  # of a distance: finer ones follow
 _MAX_SEARCHES = 4  # after the first; better poses than these find are out of reach
+_BEND = 0.1  # of the mean weight
 _BETTER = 0.01  # of the fitted share: less is the noise of the matching
 _ROUNDS_BACK = 5  # Gauss-Newton on a quadratic: the second is exact for slides, turns of half a radian take four
 _NEAR = 3.0  # times the last distance
@@ -42,10 +44,12 @@ _CHANCE = 0.5  # of the distance; evenly spread residuals have 1 / sqrt(3) = 0.5
 _NORMAL_RADIUS = 0.02  # metres for clouds in metres: a depth camera's noise at 1 m tilts such normals by 2 degrees
 _NORMAL_SPACINGS = 4.0  # times the median distance of neighbours: a dozen points on a surface
 _PROBE = 3.0  # times the last distance
-_LARGEST_TURN = 0.5  # radians
+_LARGEST_TURN = 0.25  # radians
 _CLIP = 3.0  # standard deviations: what does not fit at all should not hide what fits less
-_RISE = 0.1  # of the mean square
+_RISE = 0.3  # of the mean square
+_SURE_SHARE = 0.05  # of information that noise feigns at most: noise is twice as large at the rim of a surface
 _DOUBT = 5.0  # standard deviations of a mean square
+_LEAST_WIDTH = 0.1  # of the last distance
 _MOST_OPEN = 3  # directions: a plane's, a sphere's
 _MIN_NORMAL_NOISE = 0.001  # radians; no estimated normal is better, and exact data should not divide by 0
 # The median angle between two directions that each err by s along both tangents is sqrt(2) sqrt(2 ln 2) s = 1.665 s.
@@ -222,14 +226,14 @@ def icp_point_to_plane(
         if gain <= _BETTER and scales is distances:
             break
     num_open = pair.num_open(best.motions[0], finest, pivot)
-    left_open = pair.solve(best.motions[0], finest, pivot, num_open)
+    left_open = pair.solve(best.motions[0], finest, pivot, num_open=num_open)
     if left_open is not None and num_open:
         held = search(
             _nearest_along(left_open.unobservable, best.motions[0], pose, source, pivot), distances[-1:], num_open
         )
         iterations += held.iterations
-        # Over so long a way a surface that is flat here may bend: then the found pose stays.
-        if not held.lost and pair.gain(held.motions[0], best.motions[0], finest) > -_BETTER:
+        # Over so long a way a surface that is flat here may bend: then the found pose stays. Fewer partners are no bend.
+        if not held.lost and pair.gain(held.motions[0], best.motions[0], finest, per_partner=True) > -_BEND:
             best = held
     return pair.registration(best, pivot, finest, iterations, num_open, still_better=gain > _BETTER)
 
@@ -323,7 +327,15 @@ class _Pair:
         # The distances of this schedule were asked for: only the noise of the target could make them too fine.
         return Step(solution.twist[None], small, 0.0)
 
-    def solve(self, pose: Tensor, distance: float, pivot: Tensor, num_open: int | None = None) -> TwistSolution | None:
+    def solve(
+        self,
+        pose: Tensor,
+        distance: float,
+        pivot: Tensor,
+        *,
+        num_open: int | None = None,
+        max_feigned_share: float = MAX_FEIGNED_SHARE,
+    ) -> TwistSolution | None:
         """Return what the surfaces determine at a pose, with the noise of the normals as measured there."""
         found = self.match(pose, distance)
         if len(found.residual) < _MIN_MATCHES:
@@ -332,15 +344,15 @@ class _Pair:
         # like relief (a sphere's normals at neighbours do not meet in its centre).
         points = self.target[found.target_index].double()
         system = self.system(found, points, distance, pivot, self.noise(pose, distance))
-        return solve_observable(system, num_open=num_open)
+        return solve_observable(system, num_open=num_open, max_feigned_share=max_feigned_share)
 
     def num_open(self, pose: Tensor, distance: float, pivot: Tensor) -> int:
         """Return how many directions the surfaces leave open at a pose.
 
-        Those that noise of the normals could feign are tried: along an open direction the points stay on the surface
-        when they move by three times the distance, one way or the other, however noisy its normals are.
+        Those that noise of the normals feigns in part are tried: along an open direction the points stay on the surface
+        when they move on, from three times the distance to six, one way or the other, however noisy its normals are.
         """
-        solution = self.solve(pose, distance, pivot)
+        solution = self.solve(pose, distance, pivot, max_feigned_share=_SURE_SHARE)
         if solution is None:
             return 0
         for number, direction in enumerate(solution.unobservable):
@@ -352,19 +364,29 @@ class _Pair:
         arm = self.moved(pose).double() - pivot
         way = torch.linalg.cross(direction[None, :3].expand_as(arm), arm) + direction[3:]
         length = _PROBE * distance / float(way.square().sum(1).mean().sqrt().clamp(min=1e-12))
-        # Turns about an axis through all points move none: half a radian is as far as any.
+        # Turns about an axis through all points move none: a quarter of a radian is as far as any.
         length = min(length, _LARGEST_TURN / max(float(direction[:3].norm()), 1e-12))
-        here = self.match(pose, distance).residual
-        clip = _CLIP * robust_scale(here).clamp(min=1e-6 * distance)
+        # Not from the pose itself on: there the fit is closest, if only because it was fitted to these very partners.
+        clip = _CLIP * robust_scale(self.match(pose, distance).residual).clamp(min=1e-6 * distance)
         for sign in (-1.0, 1.0):
-            there = self.match(motion_along(sign * length * direction, pivot) @ pose, distance).residual
-            squares = [residual.abs().clamp(max=float(clip)).square().mean() for residual in (here, there)]
-            certain = _DOUBT * (2 / max(len(there), 1)) ** 0.5
-            if len(there) >= _MIN_MATCHES and float(squares[1]) > (1 + max(_RISE, certain)) * float(squares[0]):
+            near, far = (
+                self.match(motion_along(sign * times * length * direction, pivot) @ pose, distance).residual
+                for times in (1.0, 2.0)
+            )
+            if min(len(near), len(far)) < _MIN_MATCHES:
+                continue
+            squares = [residual.abs().clamp(max=float(clip)).square().mean() for residual in (near, far)]
+            certain = _DOUBT * (2 / len(far)) ** 0.5
+            if float(squares[1]) > (1 + max(_RISE, certain)) * float(squares[0]):
                 return False
         return True
 
-    def gain(self, other: Tensor, best: Tensor, distance: float) -> float:
+    def width(self, found: PlaneResiduals) -> float:
+        """Return the standard deviation across the line along which the points that meet spread most."""
+        points = self.source[found.source_index].double()
+        return float(torch.linalg.svdvals(points - points.mean(0))[1]) / len(points) ** 0.5
+
+    def gain(self, other: Tensor, best: Tensor, distance: float, *, per_partner: bool = False) -> float:
         """Return by which part of the best pose's share of fitting points the other pose has more.
 
         Points fit within the closer spread of the two poses' residuals: within the search distance both may fit alike.
@@ -374,7 +396,8 @@ class _Pair:
             return float(len(residuals[0]) - len(residuals[1]))
         sigma = torch.stack([robust_scale(residual) for residual in residuals]).min().clamp(min=1e-6 * distance)
         ours, theirs = (float(robust_weights(residual, sigma, "tukey").sum()) for residual in residuals)
-        return ours / max(theirs, 1e-300) - 1
+        partners = len(residuals[1]) / len(residuals[0]) if per_partner else 1.0
+        return ours * partners / max(theirs, 1e-300) - 1
 
     def registration(
         self, descent: Descent, pivot: Tensor, distance: float, iterations: int, num_open: int, *, still_better: bool
@@ -385,7 +408,7 @@ class _Pair:
         near = int((knn(self.target, k=1, queries=self.moved(pose))[1][:, 0] < _NEAR * distance).sum())
         support = len(found.residual) / max(near, 1)
         rmse = float(found.residual.square().mean().sqrt()) if len(found.residual) else math.inf
-        solution = self.solve(pose, distance, pivot, num_open)
+        solution = self.solve(pose, distance, pivot, num_open=num_open)
         identity = torch.eye(6, dtype=torch.float64, device=pose.device)
         unobservable = identity if solution is None else solution.unobservable
         covariance = torch.zeros_like(identity)
@@ -396,16 +419,13 @@ class _Pair:
         reason = ""
         if descent.lost or solution is None:
             reason = f"fewer than {_MIN_MATCHES} source points kept a partner within {distance:g}"
-        elif len(unobservable) > _MOST_OPEN:
-            reason = (
-                f"{len(unobservable)} of 6 directions are open, and no surface leaves more than {_MOST_OPEN}: the points lie "
-                "in one place or on one line, or have no normals"
-            )
         elif support < _MIN_SUPPORT:
             reason = (
                 f"of {near} source points within {_NEAR * distance:g} of the target {len(found.residual)} lie on it "
                 f"within {distance:g}: the clouds are near each other but do not meet"
             )
+        elif len(unobservable) > _MOST_OPEN or self.width(found) < _LEAST_WIDTH * distance:
+            reason = "the points that meet lie in one place or on one line, or have no normals: no surface, no pose"
         elif rmse > _CHANCE * distance:
             reason = f"residuals of {rmse:.3g} fill the search distance of {distance:g} as chance would"
         elif still_better:

@@ -15,7 +15,7 @@ from pcdata.functional import rigid
 
 # A direction counts as observed when the surfaces say at least three times as much about it as the noise of their
 # normals alone would feign: on a bare plane the noise of the normals looks like relief to slide against.
-_MAX_FEIGNED_SHARE = 0.25
+MAX_FEIGNED_SHARE = 0.25
 _LEAST_REAL_SHARE = 0.05  # of a direction that is known to be determined: keeps steps along it within 20 times their size
 
 
@@ -69,7 +69,9 @@ def plane_system(
     return PlaneSystem(information, weighted.T @ residuals, feigned)
 
 
-def solve_observable(system: PlaneSystem, *, num_open: int | None = None) -> TwistSolution:
+def solve_observable(
+    system: PlaneSystem, *, num_open: int | None = None, max_feigned_share: float = MAX_FEIGNED_SHARE
+) -> TwistSolution:
     """Solve for the twist that brings the residuals to 0, leaving alone what the surfaces do not determine.
 
     Directions are the generalised eigenvectors of (feigned, information + feigned), so neither the unit of length nor
@@ -93,7 +95,7 @@ def solve_observable(system: PlaneSystem, *, num_open: int | None = None) -> Twi
     real = inverse @ (scale[:, None] * system.information * scale) @ inverse.T
     share, vectors = torch.linalg.eigh((real + real.T) / 2)  # the part that is not feigned, ascending
     directions = (scale[:, None] * (inverse.T @ vectors)).T  # (D, D), one per row
-    seen = share > 1 - _MAX_FEIGNED_SHARE
+    seen = share > 1 - max_feigned_share
     if num_open is not None:
         seen = torch.arange(size, device=both.device) >= num_open
     basis = directions[seen]
