@@ -87,7 +87,6 @@ class Found(NamedTuple):
     open_directions: int = 0
 
 
-
 def synthetic(name: str, points: int) -> Clouds:
     generator = torch.Generator().manual_seed(7)
     clouds = [SURFACES[name](count, generator) for count in (points, 2 * points)]
@@ -193,7 +192,9 @@ def compare(
 ) -> dict[str, Any]:
     """Run every library that is installed from every start; count who comes back."""
     middle = clouds[0].double().mean(0)
-    installed = [library for library in LIBRARIES if library == "pcdata" or importlib.util.find_spec(library.split()[0])]
+    installed = [
+        library for library in LIBRARIES if library == "pcdata" or importlib.util.find_spec(library.split()[0])
+    ]
     good: dict[str, list[bool]] = {library: [] for library in installed}
     seconds = dict.fromkeys(installed, 0.0)
     said, left_open = [], 0

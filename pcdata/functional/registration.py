@@ -28,7 +28,11 @@ from pcdata.functional.small_motions import (
 from pcdata.functional.surface_descent import Descent, Step, descend
 
 _MIN_MATCHES = 20  # fewer cannot carry six unknowns and a robust scale
-_FINE = (0.05, 0.02, 0.01)  # search distances, in metres for clouds in metres: a depth camera's noise at 1 m fits the last
+_FINE = (
+    0.05,
+    0.02,
+    0.01,
+)  # search distances, in metres for clouds in metres: a depth camera's noise at 1 m fits the last
 _NUM_FINE = len(_FINE)
 _ANY_ANGLE = 2.0  # radians: beyond a quarter turn, so every pair of normals without sign agrees
 _SMALL = 1e-6  # radians and units
@@ -76,7 +80,9 @@ class Registration:
     iterations: int  # over all scales and searches
     converged: bool  # the steps had become small, the surfaces meet there, and a wider search found no better pose
     reason: str  # why not converged, in words; empty where it is
-    unobservable: Tensor  # (M, 6) float64 twists about pivot that the surfaces leave open at this pose: rotation vector,
+    unobservable: (
+        Tensor  # (M, 6) float64 twists about pivot that the surfaces leave open at this pose: rotation vector,
+    )
     #   translation. Of the poses that differ by these alone, this is the one nearest to the start.
     covariance: Tensor  # (6, 6) float64 of the twist about pivot, 0 along the unobservable directions
     pivot: Tensor  # (3,) float64, in the target's frame
@@ -306,7 +312,9 @@ class _Pair:
         apart = (self.moved(pose)[found.source_index].double() - self.target[found.target_index].double()).norm(dim=1)
         return _normal_noise(normals, partners, apart)
 
-    def system(self, found: PlaneResiduals, points: Tensor, distance: float, pivot: Tensor, noise: float) -> PlaneSystem:
+    def system(
+        self, found: PlaneResiduals, points: Tensor, distance: float, pivot: Tensor, noise: float
+    ) -> PlaneSystem:
         normals = self.target_normals[found.target_index].double()
         weights = self.weights(found, distance)
         return plane_system(points, normals, found.residual, weights, pivot=pivot, normal_sigma=noise)

@@ -16,7 +16,9 @@ from pcdata.functional import rigid
 # A direction counts as observed when the surfaces say at least three times as much about it as the noise of their
 # normals alone would feign: on a bare plane the noise of the normals looks like relief to slide against.
 MAX_FEIGNED_SHARE = 0.25
-_LEAST_REAL_SHARE = 0.05  # of a direction that is known to be determined: keeps steps along it within 20 times their size
+_LEAST_REAL_SHARE = (
+    0.05  # of a direction that is known to be determined: keeps steps along it within 20 times their size
+)
 
 
 @dataclass(frozen=True, eq=False)

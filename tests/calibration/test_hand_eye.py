@@ -196,7 +196,7 @@ def test_rotations_about_one_axis_are_refused(setup):
 def test_a_robot_that_only_shifts_is_refused():
     shifted = camera_poses(1).repeat(6, 1, 1)
     shifted[:, :3, 3] += 0.1 * torch.rand(6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with pytest.raises(CalibrationError, match=r"turn by more than 0\.0 degrees; turn the gripper by 30 to 60"):
+    with pytest.raises(CalibrationError, match="turn by more than 0 degrees, at least 10 are needed; turn the gripper"):
         calibrate_hand_eye(robot_poses(shifted), setup="eye-in-hand")
 
 

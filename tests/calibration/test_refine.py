@@ -75,7 +75,7 @@ def test_the_captures_are_left_as_they_are():
 
 
 def test_a_camera_knocked_over_is_refused():
-    with pytest.raises(CalibrationError, match=r"right: would move by 2\d\.\d mm .* more than 20 mm"):
+    with pytest.raises(CalibrationError, match=r"right: would move by 2\d mm .* more than 20 mm"):
         refine_extrinsics([rig(0, millimetres=28.0, degrees=0.0)], names=NAMES)
     with pytest.raises(CalibrationError, match="more than 5 mm"):
         refine_extrinsics([rig(0)], names=NAMES, max_shift=0.005)
