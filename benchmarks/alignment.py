@@ -1,4 +1,4 @@
-"""From how far away two clouds find each other, beside small_gicp's (and Open3D's) point-to-plane ICP on the same input.
+"""From how far away two clouds find each other, beside point-to-plane ICP of small_gicp (and Open3D) on the same input.
 
     PCDATA_TEST_DATA=... python benchmarks/alignment.py        # prints a table, writes results/alignment.json
 
@@ -137,7 +137,7 @@ def by_pcdata(clouds: Clouds, start: Tensor) -> Found:
 def by_small_gicp(clouds: Clouds, start: Tensor, distances: Sequence[float] = (FIRST_DISTANCE,)) -> Found:
     import small_gicp
 
-    points, _, target_points, normals = (cloud.double().numpy() for cloud in clouds)
+    points, _, target_points, _ = (cloud.double().numpy() for cloud in clouds)
     source, target = small_gicp.PointCloud(points), small_gicp.PointCloud(target_points)
     tree = small_gicp.KdTree(target)
     small_gicp.estimate_normals(target, num_neighbors=10)  # it takes no normals from outside

@@ -148,17 +148,17 @@ def icp_point_to_plane(
     Each round pairs every source point with its nearest target point (closer than the scale's distance, normals within
     ``max_normal_angle``; the widest of several scales does not compare normals, which a turned start would spoil),
     weighs the point-to-plane residuals and takes a Gauss-Newton step. The last scale ends when the step is below 1e-6
-    radians and 1e-6 units or a twentieth of its standard deviation, the others below a thousandth of their distance, all
-    after ``max_iterations``. All sums are float64.
+    radians and 1e-6 units or a twentieth of its standard deviation, the others below a thousandth of their distance,
+    all after ``max_iterations``. All sums are float64.
 
     Searches start at the given pose with all scales and with the finest alone, and again with all scales at the pose
     that they found. The best is kept: the one that brings the most source points onto the target within the last
     distance. Which directions the surfaces determine is judged there, not on the way, where normals differ because the
     clouds are apart.
 
-    The result says ``converged=False`` with its reason where the last steps were not small, the clouds ceased to overlap
-    on the way, fewer than half of the source points near the target lie on it, the residuals fill the search distance
-    as chance would, no direction is determined, or wider searches still find better poses.
+    The result says ``converged=False`` with its reason where the last steps were not small, the clouds ceased to
+    overlap on the way, fewer than half of the source points near the target lie on it, the residuals fill the search
+    distance as chance would, no direction is determined, or wider searches still find better poses.
 
     Args:
         source: the cloud that moves; thousands of points are enough.
@@ -183,7 +183,8 @@ def icp_point_to_plane(
         ShapeError, DTypeError, DeviceError, NonFiniteError, PoseError: an argument breaks the contract above.
         ConfigError: distances that do not descend, an unknown kernel, a count or length that is not positive, or a
             normal_radius that holds fewer than three points at most points.
-        TooFewPointsError: a cloud of fewer than 20 points, or fewer than 20 source points overlap the target at the start.
+        TooFewPointsError: a cloud of fewer than 20 points, or fewer than 20 source points overlap the target at the
+            start.
 
     Source: Chen & Medioni, Object modelling by registration of multiple range images, 1992.
     """
@@ -238,14 +239,14 @@ def icp_point_to_plane(
             _nearest_along(left_open.unobservable, best.motions[0], pose, source, pivot), distances[-1:], num_open
         )
         iterations += held.iterations
-        # Over so long a way a surface that is flat here may bend: then the found pose stays. Fewer partners are no bend.
+        # Over so long a way a surface that is flat here may bend: then the found pose stays. Fewer partners are none.
         if not held.lost and pair.gain(held.motions[0], best.motions[0], finest, per_partner=True) > -_BEND:
             best = held
     return pair.registration(best, pivot, finest, iterations, num_open, still_better=gain > _BETTER)
 
 
 def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tensor, pivot: Tensor) -> Tensor:
-    """Return the pose, of those that differ by the directions (M, 6) alone, that moves the points least from the start."""
+    """Return the pose that moves the points least from the start, of those that differ by the directions (M, 6)."""
     points = source.double()
     goal = points @ start[:3, :3].T + start[:3, 3]
     for _ in range(_ROUNDS_BACK):

@@ -1,4 +1,4 @@
-"""ICP from starts that are off: it comes back, says which directions a surface leaves open, and when it did not arrive."""
+"""ICP from starts that are off: it comes back, says which directions are open, and when it did not arrive."""
 
 import math
 
