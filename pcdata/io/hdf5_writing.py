@@ -28,6 +28,11 @@ class FaultKeepingFile:
         self._fault: OSError | None = None
         self._kept: list[tuple[int, bytes]] = []  # offset and bytes that the disk did not take, in order
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether something that HDF5 wrote is not in the file."""
+        return self._fault is not None
+
     def check(self) -> None:
         """Raise the first fault, if there was one.
 

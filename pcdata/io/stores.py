@@ -9,8 +9,9 @@ from __future__ import annotations
 import errno
 import io
 import os
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
 
@@ -152,6 +153,7 @@ class Hdf5Store(Store):
         self._file: Any = None
         self._opened_by = 0
         self._disk: FaultKeepingFile | None = None  # under a file that is written
+        self._at_exit: weakref.finalize | None = None  # closes a file that is written and left open
 
     def path_of(self, key: str) -> Path:
         """Return the one file that holds all records."""
@@ -165,6 +167,9 @@ class Hdf5Store(Store):
             try:
                 _write_group(file.create_group(key), record, self.compression)
             finally:
+                if disk.has_failed:
+                    with suppress(CacheError):  # raised below
+                        self.close()
                 disk.check()
 
     def read(self, key: str) -> Record:
@@ -187,6 +192,8 @@ class Hdf5Store(Store):
     def close(self) -> None:
         """Force what was written to disk and close the handle of this process."""
         file, self._file = self._file, None
+        if self._at_exit is not None:
+            self._at_exit.detach()
         if file is None:
             return
         if self._opened_by != os.getpid():
@@ -208,6 +215,7 @@ class Hdf5Store(Store):
             disk = FaultKeepingFile(self.path)
             self._file = h5py.File(disk, "w" if disk.is_new else "r+")
             self._disk, self._opened_by = disk, os.getpid()
+            self._at_exit = weakref.finalize(self, _close_written, self._file, disk, self._opened_by)
             # What was written is not read again: the library's own limit of 32 MB of tables is memory for nothing.
             cache = self._file.id.get_mdc_config()
             cache.set_initial_size, cache.initial_size = True, _TABLES
@@ -225,7 +233,7 @@ class Hdf5Store(Store):
         return self._file
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_opened_by": 0, "_disk": None}
+        return {**self.__dict__, "_file": None, "_opened_by": 0, "_disk": None, "_at_exit": None}
 
 
 STORES: dict[Format, type[Store]] = {"hdf5": Hdf5Store, "npz": NpzStore, "pt": PtStore}
@@ -239,6 +247,15 @@ COMPRESSIONS: dict[Format, tuple[Compression, ...]] = {
 _TABLES = 1 << 20  # bytes of HDF5's own tables kept in memory while a file is written
 
 _INHERITED: list[Any] = []
+
+
+def _close_written(file: Any, disk: FaultKeepingFile, opened_by: int) -> None:
+    """Close a file that a store left open: HDF5 ends after Python does, when it cannot call the file object any more."""
+    if os.getpid() == opened_by:
+        with suppress(OSError, RuntimeError):
+            file.close()
+        with suppress(OSError):
+            disk.close()
 
 
 def _write_group(group: Any, record: Record, compression: Compression) -> None:

@@ -9,6 +9,8 @@ import os
 import pickle
 import resource
 import struct
+import subprocess
+import sys
 import time
 import zipfile
 from collections import OrderedDict
@@ -301,6 +303,29 @@ def test_a_full_disk_is_a_cache_error_that_names_the_file(tmp_path, form):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert str(STORES[form](tmp_path).path_of("a")) in str(caught.value)
+
+
+@pytest.mark.parametrize("disk_is_full", [True, False])
+def test_an_hdf5_store_that_is_left_open_lets_the_process_end(tmp_path, disk_is_full):
+    code = f"""
+import resource, numpy as np
+from pcdata.errors import CacheError
+from pcdata.io.record import Record
+from pcdata.io.stores import Hdf5Store
+store = Hdf5Store({str(tmp_path)!r})
+if {disk_is_full}:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+try:
+    store.write("a", Record({{"points": np.zeros((100_000, 3), np.float32)}}, {{"frame_id": "base", "unit": "m"}}))
+    print("written")
+except CacheError as error:
+    kept = error
+    print(error)
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, (done.returncode, done.stderr)
+    assert done.stdout.count("cannot be written") == disk_is_full
 
 
 # -- hostile npz ---------------------------------------------------------------------------------------------------
