@@ -250,7 +250,7 @@ _INHERITED: list[Any] = []
 
 
 def _close_written(file: Any, disk: FaultKeepingFile, opened_by: int) -> None:
-    """Close a file that a store left open: HDF5 ends after Python does, when it cannot call the file object any more."""
+    """Close a file that a store left open: HDF5 ends after Python, when it can call no file object any more."""
     if os.getpid() == opened_by:
         with suppress(OSError, RuntimeError):
             file.close()
