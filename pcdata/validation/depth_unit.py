@@ -100,7 +100,8 @@ def stored_numbers(depth: Tensor, facts: Mapping[str, Any]) -> Stored:
         if (whole := _whole(metres, float(stated))) is not None:
             return Stored(encoded(whole, encoding), DepthUnit(float(stated), encoding), True)
         return Stored(metres / float(stated), DepthUnit(float(stated)), True)
-    for unit in _GRIDS:
+    grids = _GRIDS if len(metres) > 1 else ()  # a cloud has no pixels: its numbers never were an image's integers
+    for unit in grids:
         if (whole := _whole(metres, unit)) is not None:
             return Stored(whole, DepthUnit(unit), False)
     return Stored(metres, DepthUnit(1.0), False)

@@ -57,7 +57,7 @@ def test_a_cloud_for_an_image_network_and_an_image_for_a_cloud_network_fail_by_t
 def test_arrays_of_either_byte_order_are_judged_alike(order):
     batch = correct_batch("graspnet_baseline")
     array = {key: tensor.numpy().astype(f"{order}f4") for key, tensor in batch.items()}
-    given = {"frame_id": "camera", "unit": "m", "channels": batch.channels}
+    given = {"frame_id": "camera", "unit": "m", "channel_names": batch.channels}
     assert check(array, "graspnet_baseline", **given).verdict is Verdict.PASS
 
 
