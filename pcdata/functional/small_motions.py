@@ -99,7 +99,7 @@ def solve_observable(
     directions = (scale[:, None] * (inverse.T @ vectors)).T  # (D, D), one per row
     seen = share > 1 - max_feigned_share
     if num_open is not None:
-        seen = torch.arange(size, device=both.device) >= num_open
+        seen = torch.arange(size, dtype=torch.int64, device=both.device) >= num_open
     basis = directions[seen]
     # The feigned part determines nothing: it is in the information, and once more in the unit that shares are of.
     # Left in, it would shorten every step, and the fit would end before it is where the gradient vanishes.
