@@ -34,6 +34,7 @@ def decoder_of(compressor: Any, filters: Any) -> Decoder:
 
     Raises:
         CacheError: a codec that is not on the list, or with settings that it cannot have.
+        MissingExtraError: one that numcodecs unpacks, which is not installed.
     """
     if filters is not None and not isinstance(filters, list):
         raise CacheError(f"its filters must be a list, got {type(filters).__name__}")
@@ -101,10 +102,12 @@ def _claiming(name: str, claimed: Callable[[bytes], int]) -> Callable[[dict[str,
     """Return a codec of numcodecs whose chunks say how many bytes they stand for."""
 
     def build(config: dict[str, Any]) -> Decoder:
+        codec = require("numcodecs").get_codec({"id": name})
+
         def decode(content: bytes, most: int) -> bytes:
             if not 0 < (size := claimed(content)) <= most:
                 raise CacheError(f"claims to unpack to {size} bytes, but at most {most} are its size")
-            return bytes(require("numcodecs").get_codec({"id": name}).decode(content))
+            return bytes(codec.decode(content))
 
         return decode
 
@@ -193,8 +196,9 @@ def _filter(name: str) -> Callable[[dict[str, Any]], Decoder]:
             if key not in _SETTINGS[name] or not _SETTINGS[name][key](value):
                 raise CacheError(f"its filter {name} cannot have {key:.50} = {value!s:.100}")
 
+        codec = require("numcodecs").get_codec({"id": name, **settings})
+
         def decode(content: bytes, most: int) -> bytes:
-            codec = require("numcodecs").get_codec({"id": name, **settings})
             decoded = codec.decode(content)
             return decoded.tobytes() if isinstance(decoded, np.ndarray) else bytes(decoded)
 
