@@ -43,8 +43,6 @@ MOST_COMPARED = 4000
 
 def check_frame(folder: str, capture: str) -> dict[str, Any]:
     """Run all settings on one capture; return what differs from the reference."""
-    import torch
-
     import pcdata
     from pcdata import functional as F
     from pcdata.functional.grid import ImageGrid
@@ -53,17 +51,40 @@ def check_frame(folder: str, capture: str) -> dict[str, Any]:
         depth, intrinsics = read_image(Path(capture))
     else:
         frame = pcdata.open_source(folder).load(capture)
-        if not isinstance(frame, pcdata.DepthFrame):
-            return {"skipped": "not a depth frame"}
+        if isinstance(frame, pcdata.PointCloud):
+            return check_cloud(frame)
         depth, intrinsics = frame.depth, frame.camera.intrinsics
     points, ptr, pixel = F.deproject_depth(depth, intrinsics)
+    return compared(points, ptr, ImageGrid(pixel, (depth.shape[1], depth.shape[2]), intrinsics))
+
+
+def check_cloud(cloud: Any) -> dict[str, Any]:
+    """Check a cloud whose rows are the pixels of an image, with a Kinect's camera."""
+    import torch
+
+    from pcdata.functional.grid import ImageGrid
+
+    if "organised_size" not in cloud.meta[0]:
+        return {"skipped": "neither a depth frame nor an organised cloud"}
+    height, width = cloud.meta[0]["organised_size"]
+    camera = [[525.0, 0, (width - 1) / 2], [0, 525.0, (height - 1) / 2], [0, 0, 1]]
+    grid = ImageGrid(cloud.source_index, (height, width), torch.tensor([camera], dtype=torch.float64))
+    return compared(cloud.points, cloud.ptr, grid)
+
+
+def compared(points: Any, ptr: Any, grid: Any) -> dict[str, Any]:
+    """Run all settings with the grid, without it, and on a part by the reference."""
+    import torch
+
+    from pcdata import functional as F
+    from pcdata.functional.grid import ImageGrid
+
     if len(points) == 0:
         return {"points": 0, "differences": 0}
-    grid = ImageGrid(pixel, (depth.shape[1], depth.shape[2]), intrinsics)
     first = int(ptr[1]) // 2
     part = slice(max(0, first - MOST_COMPARED // 2), min(int(ptr[1]), first + MOST_COMPARED // 2))
     some, some_ptr = points[part], torch.tensor([0, part.stop - part.start])
-    some_grid = ImageGrid(pixel[part], grid.size, grid.intrinsics[:1])
+    some_grid = ImageGrid(grid.pixel_index[part], grid.size, grid.intrinsics[:1])
     differences = 0
     for name, settings in SETTINGS.items():
         function = getattr(F, name)
