@@ -56,6 +56,22 @@ def ripples(xy: Tensor) -> Tensor:
     return 0.05 * torch.sin(12 * x) + 0.04 * torch.cos(10 * y + 3 * x)
 
 
+def mounds(xy: Tensor) -> Tensor:
+    """Twelve round heaps of different widths; played no part when the method was tuned, as the next."""
+    generator = torch.Generator().manual_seed(2026)
+    places = 1.6 * torch.rand(12, 2, generator=generator) - 0.8
+    widths = 0.08 + 0.2 * torch.rand(12, generator=generator)
+    heights = 0.05 + 0.15 * torch.rand(12, generator=generator)
+    squares = (xy[:, None] - places).square().sum(2) / widths.square()
+    return (heights * torch.exp(-squares)).sum(1)
+
+
+def terraces(xy: Tensor) -> Tensor:
+    """Three levels with slopes in between, along a line that is no axis."""
+    along = 0.8 * xy[:, 0] + 0.5 * xy[:, 1] + 0.1 * torch.sin(5 * xy[:, 1])
+    return 0.06 * (torch.tanh(20 * (along + 0.3)) + torch.tanh(12 * (along - 0.25)))
+
+
 def graph_of(height: Callable[[Tensor], Tensor]) -> Callable[[int, torch.Generator], Tensor]:
     def sample(count: int, generator: torch.Generator) -> Tensor:
         xy = 1.6 * torch.rand(count, 2, generator=generator) - 0.8
@@ -75,6 +91,8 @@ SURFACES = {
     "hills": graph_of(hills),
     "ripples": graph_of(ripples),
     "box corner": box_corner,
+    "mounds": graph_of(mounds),
+    "terraces": graph_of(terraces),
 }
 Clouds = tuple[Tensor, Tensor, Tensor, Tensor]  # source, its normals, target, its normals
 
