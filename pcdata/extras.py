@@ -29,7 +29,12 @@ EXTRAS = {
         Extra("matplotlib", "viz", "pictures (pcdata demo, pcdata.report)", 'pip install "pcdata[viz]"'),
         Extra("cv2", "calib", "calibration boards and InpaintDepth", 'pip install "pcdata[calib]"'),
         Extra("small_gicp", "calib", "refining camera poses from clouds", 'pip install "pcdata[calib]"'),
-        Extra("numcodecs", "zarr", "zarr chunks packed with Blosc, Zstandard or LZ4, or filtered", 'pip install "pcdata[zarr]"'),
+        Extra(
+            "numcodecs",
+            "zarr",
+            "zarr chunks packed with Blosc, Zstandard or LZ4",
+            'pip install "pcdata[zarr]"',
+        ),
         Extra("rosbags", "ros", "RealSense recordings (.bag)", 'pip install "pcdata[ros]"'),
         Extra("open3d", "open3d", "viewing and comparing with Open3D", 'pip install "pcdata[open3d]"'),
         Extra(
