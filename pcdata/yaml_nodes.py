@@ -13,7 +13,8 @@ from pcdata.errors import ConfigError, PcdataError, first_lines
 from pcdata.sensors import SensorProfile
 
 _MAX_CHARACTERS = 1_000_000  # a configuration is written by hand
-_MAX_NODES = 50_000  # 1,000 pairs of poses; PyYAML takes some 100 microseconds for each value
+_MAX_NODES = 30_000  # 1,000 pairs of poses; PyYAML takes some 100 microseconds for each value
+_MAX_FAULTS = 200  # the file is none of its kind then; finding every one can take a minute
 _MAX_DEPTH = 50  # pipelines nest a few levels deep
 _MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
 _LONGEST_NAME = 60  # characters of a name that a message repeats
@@ -125,8 +126,10 @@ class YamlDocument:
         self.fault_at(node.start_mark if node is not None else None, message)
 
     def fault_at(self, mark: yaml.Mark | None, message: str) -> None:
-        """Note a fault at a place in the file."""
+        """Note a fault at a place in the file; one too many raises them all."""
         self.faults.append((mark, message))
+        if len(self.faults) > _MAX_FAULTS:
+            self.raise_faults()
 
     def raise_faults(self) -> None:
         """Raise one error with every fault in file order, if there are any."""

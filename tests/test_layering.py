@@ -16,7 +16,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "array_files"},
+    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "array_files", "strict_json"},
     {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -44,6 +44,7 @@ OUTSIDE = {
     "files": {"numpy"},
     "inputs": set(),
     "interrupts": set(),
+    "strict_json": set(),
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},
     "lengths": {"numpy"},

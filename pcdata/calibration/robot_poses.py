@@ -27,6 +27,8 @@ from pcdata.yaml_nodes import YamlDocument
 ROBOT, TARGET, IMAGE = "base_from_gripper", "camera_from_target", "image"
 _PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT_QUATERNION = 1e-3
+_MAX_COLUMNS = 100  # of a table; 15 are known
+_MAX_LINES = 5000  # of a table; some 20 poses calibrate a camera
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,6 +129,11 @@ def _from_csv(text: str, name: str) -> RobotPoses:
     except csv.Error as error:
         raise CalibrationError(f"{name}: not a table of comma-separated values: {error}") from error
     header = [column.strip() for column in lines[0]] if lines else []
+    if len(header) > _MAX_COLUMNS or len(lines) > _MAX_LINES:
+        raise CalibrationError(
+            f"{name}: a table of {len(lines)} lines, {len(header)} columns in the first, is none of poses; at most "
+            f"{_MAX_LINES} lines of {_MAX_COLUMNS} columns are read"
+        )
     wanted = [f"{pose}.{part}" for pose in (ROBOT, TARGET) for part in _PARTS]
     faults = [f"{name}:1: column {column!r} is missing" for column in wanted if column not in header]
     known = ["name", *wanted]

@@ -18,8 +18,8 @@ from pcdata.files import map_npy, read_text, replacing
 from pcdata.functional import rigid
 from pcdata.functional.depth_unit import DepthEncoding, check_depth_encoding
 from pcdata.io.option_checks import check_invalid_values
-from pcdata.io.strict_json import json_object
 from pcdata.lengths import check_metres_per_unit
+from pcdata.strict_json import json_object
 from pcdata.structures import Camera
 
 _SHOWN = 8  # faults of a file in one message
@@ -67,7 +67,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         UnitError: ``metres_per_unit`` is not a number above 0 and at most 1, or ``depth_encoding`` is not known.
     """
     where = f"read_capture_camera: {path}"
-    data = json_object(where, read_text(where, path))
+    data = json_object(where, read_text(where, path), error=CaptureError)
     _check_keys(where, data)
     width, height = (_whole(where, data, key) for key in ("width", "height"))
     fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))

@@ -19,6 +19,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError, DTypeError, FrameError, PcdataError, UnitError
 from pcdata.functional import rigid
 from pcdata.lengths import UNITS
+from pcdata.strict_json import parse_json
 from pcdata.structures import CAMERA_FRAME, METRE, NORMALIZED, Kind, PointCloud
 
 _MARK = "pcdata "
@@ -149,8 +150,8 @@ def read_statement(where: str, comments: Iterable[str]) -> CloudStatement:
         try:
             if key in seen:
                 raise ValueError("it is there twice")
-            _take(found, key, json.loads(text))
-        except (ValueError, TypeError, KeyError, RecursionError, PcdataError) as error:
+            _take(found, key, parse_json(text))
+        except (ValueError, TypeError, KeyError, PcdataError) as error:
             raise CaptureError(
                 f"{where}: the comment {comment!r:.120} is damaged ({error!s:.120}); correct it, or delete every "
                 "comment that begins with 'pcdata' and state frame and unit when reading"

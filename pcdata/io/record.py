@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CacheError, PcdataError
+from pcdata.strict_json import json_object, parse_json
 from pcdata.structures import PointCloud
 
 SCHEMA = "pcdata.cloud/1"
@@ -133,25 +134,15 @@ def parse_info(text: str | bytes) -> dict[str, Any]:
     """Parse the facts of a record or manifest; it takes at most about 30 times the memory of the text.
 
     Raises:
-        CacheError: not a JSON object; or more lists and objects than numbers and names in them could fill.
+        CacheError: not a JSON object, as :func:`pcdata.strict_json.parse_json` takes them.
     """
-    brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
-    # An empty one takes 60 bytes of memory for 3 of text; facts have a name or several numbers in each.
-    if brackets > 10_000 + len(text) // 6:
-        raise CacheError(f"the JSON part has {brackets} lists and objects in {len(text)} bytes: damaged or hostile")
-    try:
-        info = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CacheError(f"the JSON part cannot be read: {error}") from error
-    if not isinstance(info, dict):
-        raise CacheError(f"the JSON part must be an object, got {type(info).__name__}")
-    return info
+    return json_object("the JSON part", text, error=CacheError)
 
 
 def _as_json(info: dict[str, Any]) -> dict[str, Any]:
     """Return the facts as JSON gives them back, so that what is read has the digest of what was written."""
     try:
-        plain: dict[str, Any] = json.loads(json.dumps(info, allow_nan=False))
+        plain: dict[str, Any] = parse_json(json.dumps(info, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise CacheError(
             f"meta and history must hold plain finite numbers, texts, lists and dicts to be stored: {error}; convert "

@@ -8,7 +8,7 @@ from pathlib import Path
 from pcdata.errors import CaptureError
 from pcdata.files import read_text
 from pcdata.io.source import check_partners
-from pcdata.io.strict_json import json_object
+from pcdata.strict_json import json_object
 
 _MAX_BYTES = 1 << 26  # two million names
 _LONGEST = 1e12  # seconds, 30,000 years: more are microseconds or nanoseconds
@@ -23,7 +23,7 @@ def read_timestamps(path: Path, ids: Iterable[str]) -> dict[str, float]:
         CaptureError: the file is no such JSON object, or names other samples than there are.
     """
     where = f"read_timestamps: {path}"
-    times = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES))
+    times = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES), error=CaptureError)
     if not all(_is_time(time) for time in times.values()):
         raise CaptureError(f'{where}: must be a JSON object of seconds by name, such as {{"0001": 12.033}}')
     check_partners(where, ids, {"timestamp": times})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from pcdata.errors import CacheError, MissingExtraError
 from pcdata.files import check_inside, open_input, read_text
 from pcdata.io.chunk_grid import ChunkGrid
 from pcdata.io.zarr_codecs import Decoder, decoder_of
+from pcdata.strict_json import parse_json
 
 _MAX_CHUNK = 1 << 31  # bytes; Blosc's own limit
 _MAX_HEADER = 1 << 16  # bytes
@@ -74,7 +74,7 @@ class ZarrArray(ChunkGrid):
         _check_inside(folder / ".zarray", root)
         text = read_text("zarr", folder / ".zarray", max_bytes=_MAX_HEADER, error=CacheError)
         try:
-            header: dict[str, Any] = json.loads(text)
+            header: dict[str, Any] = parse_json(text)
             shape, chunks = tuple(header["shape"]), tuple(header["chunks"])
             if not all(type(size) is int and 0 <= size < 1 << 62 for size in (*shape, *chunks)) or len(shape) > 32:
                 raise ValueError(f"sizes must be whole numbers, got shape {shape}, chunks {chunks}")
@@ -89,7 +89,7 @@ class ZarrArray(ChunkGrid):
             self._decode: Decoder | None = None
         except CacheError:
             raise
-        except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise CacheError(f"{folder}: its .zarray cannot be read ({type(error).__name__}: {error})") from error
         if self.chunk_bytes > _MAX_CHUNK:
             raise CacheError(

@@ -17,6 +17,7 @@ from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeEr
 from pcdata.files import MAX_STREAMED_BYTES, open_input, replacing
 from pcdata.functional.tsdf.blocks import CHUNK, Chunk, Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS
+from pcdata.strict_json import json_object
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.tsdf_volume import TSDFVolume
 
@@ -170,8 +171,8 @@ def _about(where: str, archive: ZipArchive) -> dict[str, Any]:
     header = _header(archive, "about")
     if header.dtype != np.uint8 or len(header.shape) != 1 or header.shape[0] > _LONGEST_TEXT:
         raise CacheError("it does not describe itself as a TSDFVolume")
-    about = json.loads(read_array(archive, archive.members["about.npy"]).tobytes())
-    if not isinstance(about, dict) or about.get("format") != _FORMAT:
+    about = json_object("its text", read_array(archive, archive.members["about.npy"]).tobytes(), error=CacheError)
+    if about.get("format") != _FORMAT:
         raise CacheError(f"{where}: its format is not {_FORMAT!r}; was it written by another version?")
     return about
 

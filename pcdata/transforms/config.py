@@ -19,6 +19,8 @@ from pcdata.transforms.compose import Compose
 from pcdata.transforms.sensor_words import is_sensor_word, sensor_hint, sensor_value
 from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
+_MAX_STEPS = 1000  # of one list; each is built, which takes some 200 microseconds
+
 
 def pipeline_from_yaml(text: str, *, name: str = "<yaml>") -> Compose:
     """Build a pipeline from a YAML list of steps.
@@ -61,7 +63,11 @@ def read_config(path: str | Path) -> str:
 
 def steps_from_node(document: YamlDocument, node: yaml.Node | None, what: str) -> list[Transform]:
     """Build every step of a list; faults are noted in the document and the faulty steps left out."""
-    built = [_step_from_node(document, item) for item in document.sequence(node, what)]
+    items = document.sequence(node, what)
+    if len(items) > _MAX_STEPS:
+        document.fault(node, f"{what} has {len(items)} steps; at most {_MAX_STEPS} are read")
+        return []
+    built = [_step_from_node(document, item) for item in items]
     return [step for step in built if step is not None]
 
 

@@ -150,3 +150,12 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text("unit: metre\nposes: []\n")
     with pytest.raises(CalibrationError, match="holds no pose"):
         read_robot_poses(tmp_path / "p.yaml")
+
+
+@pytest.mark.parametrize(
+    "text", ["," * 900_000, ",".join(f"base_from_grippe{n}" for n in range(40_000)), "name\n" + "a\n" * 400_000]
+)
+def test_a_table_beyond_every_calibration_is_refused_at_once(tmp_path, text):
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(CalibrationError, match="is none of poses; at most 5000 lines of 100 columns"):
+        read_robot_poses(tmp_path / "p.csv")

@@ -1,0 +1,86 @@
+"""JSON from files: nothing in it is passed over, and nothing in it ends in a traceback.
+
+Python's parser takes the last of two entries with one name, NaN and 1e999 as numbers, and lists within lists until the
+stack ends, which then ends whatever walks over them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from pcdata.errors import PcdataError
+
+_MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
+_CONTAINERS = (dict, list)
+_MAX_DEPTH = 100  # a pipeline may have 50 levels as YAML, and each is two here
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON; it takes at most about 30 times the memory of the text.
+
+    Raises:
+        ValueError: no JSON, a name given twice, a number that is not finite, nested too deeply, or more lists and
+            objects than numbers and names in them could fill.
+    """
+    brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    # An empty one takes 60 bytes of memory for 3 of text; facts have a name or several numbers in each.
+    if brackets > 10_000 + len(text) // 6:
+        raise ValueError(f"it has {brackets} lists and objects in {len(text)} bytes: damaged or hostile")
+    try:
+        data = json.loads(
+            text, object_pairs_hook=_unique, parse_constant=_refused, parse_float=_finite, parse_int=_whole
+        )
+    except RecursionError as cause:
+        raise ValueError("nested too deeply") from cause
+    except MemoryError as cause:
+        raise ValueError("it does not fit into the memory") from cause
+    level = [data] if type(data) in _CONTAINERS else []
+    for _ in range(_MAX_DEPTH + 1):
+        if not level:
+            return data
+        values = (parent.values() if type(parent) is dict else parent for parent in level)
+        level = [part for some in values for part in some if type(part) in _CONTAINERS]
+    raise ValueError(f"nested too deeply, more than {_MAX_DEPTH} levels")
+
+
+def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> dict[str, Any]:
+    """Parse a JSON object.
+
+    Raises:
+        PcdataError: of the type ``error``: not what :func:`parse_json` takes, or no object.
+    """
+    try:
+        data = parse_json(text)
+    except ValueError as cause:
+        raise error(f"{where}: not valid JSON: {str(cause)[:300]}") from cause
+    if not isinstance(data, dict):
+        raise error(f"{where}: must be a JSON object, got a {type(data).__name__}")
+    return data
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = dict(pairs)
+    if len(found) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"{twice!r:.200} is given twice in one object")
+    return found
+
+
+def _refused(name: str) -> None:
+    raise ValueError(f"{name} is not a finite number")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"{digits[:30]} is not a finite number")
+    return value
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > _MAX_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits is none that can be meant")
+    return int(digits)
