@@ -43,7 +43,7 @@ _NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame
 MARKS = {65535: "the highest 16-bit number", 32767: "the highest 15-bit number", 4095: "the highest 12-bit number"}
 _FEW = 1000  # fewer readings may hold any number by chance
 _MARKED = 0.002  # of the readings: a single depth holds less of any real scene
-_NAMED = 0.02  # probability above which a unit is named as one that the numbers fit
+_NAMED = 0.001  # probability above which a unit is named: without the camera even the right one may look unlikely
 
 
 def read_depth(
