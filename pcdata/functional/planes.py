@@ -266,21 +266,23 @@ def _refine(
     unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
     rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(_MAX_REFINEMENTS):
-        if len(unsettled) == 0:
-            break
         refitted = work.fit(own, own_ptr, before)
         fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
         after = work.inlier_mask(own, own_ptr, refitted, distance)
         fits &= count_per_cloud(after, own_ptr) >= 3
         settled = fits & (count_per_cloud(after != before, own_ptr) == 0)
         planes[unsettled[fits]] = refitted[fits]
-        taken = fits.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
-        chosen = torch.where(taken, after, before)
+        chosen = after
+        if not bool(fits.all()):
+            taken = fits.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
+            chosen = torch.where(taken, after, before)
         if rows is None:
             inliers = chosen
         else:
             inliers[rows] = chosen
         open_ = fits & ~settled
+        if not bool(open_.any()):
+            break
         if not bool(open_.all()):
             kept = open_.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
             rows = kept.nonzero().squeeze(1) if rows is None else rows[kept]
