@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pcdata.dispatch import OPERATIONS, kernel
 from pcdata.functional.parameters import require_count
-from pcdata.functional.planes import FLAT, PlaneWork, plane_of_moments, search_planes
+from pcdata.functional.plane_fit import FLAT, plane_of_moments
+from pcdata.functional.planes import PlaneWork, search_planes
 from pcdata.functional.ragged import counts_from_ptr, first_per_cloud, ptr_from_counts
 from pcdata.functional.sampling import check_available, counts_per_cloud
 from pcdata.functional.voxels import SIZE_TOLERANCE, sizes_per_cloud

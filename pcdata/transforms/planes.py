@@ -12,7 +12,8 @@ from torch import Tensor
 from pcdata.checks import negated
 from pcdata.errors import ConfigError
 from pcdata.functional import rigid
-from pcdata.functional.planes import ransac_plane, through_origin
+from pcdata.functional.plane_fit import through_origin
+from pcdata.functional.planes import ransac_plane
 from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud

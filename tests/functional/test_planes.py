@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional import planes as planes_module
 from pcdata.functional.depth import deproject_depth
-from pcdata.functional.planes import fit_plane, plane_distance, ransac_plane
+from pcdata.functional.plane_fit import fit_plane, plane_distance, planes_through
+from pcdata.functional.planes import ransac_plane
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +100,7 @@ def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
 def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
     monkeypatch.setitem(planes_module._BLOCK, "cpu", (3, 7))
     points = scene()
-    hypotheses = planes_module.planes_through(points[planes_module._triples_of(len(points), 50, seed=0)])
+    hypotheses = planes_through(points[planes_module._triples_of(len(points), 50, seed=0)])
     counts = planes_module._count_near(points, hypotheses, 0.01)
     expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
     assert torch.equal(counts, expected)
