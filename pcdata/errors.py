@@ -65,6 +65,10 @@ class CaptureError(PcdataError, ValueError):
     """A raw capture (depth, colour, intrinsics, pose, cloud file) cannot be trusted."""
 
 
+class WriteError(CaptureError):
+    """A single file cannot be written: its folder or the disk is at fault, not what goes into it."""
+
+
 class IntrinsicsError(CaptureError):
     """Camera intrinsics cannot belong to the image they are given for."""
 

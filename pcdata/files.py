@@ -11,7 +11,6 @@ import errno
 import mmap
 import os
 import stat
-import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,9 +20,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, write_fault
+from pcdata.errors import CaptureError, PcdataError, WriteError, write_fault
 from pcdata.inputs import note_input
 from pcdata.interrupts import shielded
+from pcdata.part_files import part_file
 
 MAX_TEXT_BYTES = 1 << 20  # a calibration or pose file holds a few hundred bytes
 MAX_STREAMED_BYTES = 1 << 42  # 4 TB: a file that is read in parts, whose claims are checked before each part is read
@@ -87,7 +87,11 @@ def open_input(
         if isinstance(cause, OSError) and not isinstance(cause, PcdataError):
             raise error(f"{where}: {file}: cannot be examined: {cause}") from cause
         raise
-    note_input(file, status)
+    try:
+        note_input(file, stream)
+    except OSError as cause:
+        stream.close()
+        raise error(f"{where}: {file}: cannot be read: {cause}") from cause
     return stream
 
 
@@ -204,10 +208,10 @@ def check_inside(
 
 
 @contextmanager
-def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataError] = CaptureError) -> Iterator[Path]:
+def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataError] = WriteError) -> Iterator[Path]:
     """Give a temporary name beside ``path`` to write to; on success it becomes ``path`` at once, else it is removed.
 
-    A link is followed: it stays, and its file is replaced.
+    A link is followed: it stays, and its file is replaced. What a killed writer of the same file left is removed.
 
     Raises:
         PcdataError: of the type ``error``: the folder is missing, ``path`` is no regular file, or it cannot be written.
@@ -215,21 +219,17 @@ def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataErr
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise error(f"{where}: {path}: the folder {target.parent} does not exist; create it first")
-    # Of fixed length: a name may use up the 255 bytes that file systems allow.
-    temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix if len(target.suffix) < 8 else ''}")
     try:
         with suppress(FileNotFoundError):
-            _check_kind(where, target, os.stat(target), error)  # a rename would put a file where a device was
-        yield temporary
-        with shielded():
-            os.replace(temporary, target)
+            _check_kind(where, Path(path), os.stat(target), error)  # a rename would put a file where a device was
+        with part_file(target) as temporary:
+            yield temporary
+            with shielded():
+                os.replace(temporary, target)
     except OSError as cause:
         if isinstance(cause, PcdataError):
             raise
         raise error(f"{where}: {path}: cannot be written: {write_fault(cause)}") from cause
-    finally:
-        with shielded(), suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 # Absent on Windows, where none of these kinds of files has a name in the file system.

@@ -16,7 +16,8 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "array_files", "strict_json"},
+    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "locks", "array_files", "strict_json"},
+    {"part_files"},
     {"files", "dispatch"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
@@ -45,6 +46,8 @@ OUTSIDE = {
     "inputs": set(),
     "interrupts": set(),
     "strict_json": set(),
+    "locks": set(),
+    "part_files": set(),
     "yaml_nodes": {"yaml"},
     "checks": {"torch", "numpy"},
     "lengths": {"numpy"},

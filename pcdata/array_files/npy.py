@@ -7,10 +7,12 @@ Source: NumPy enhancement proposal 1 (a simple file format for NumPy arrays).
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -28,6 +30,17 @@ _ITEM = (
 )
 _ITEMS = re.compile(rf"\s*{_ITEM}\s*(?:,|(?=\}}))", re.ASCII)
 _LARGEST = 1 << 62  # bytes: beyond it, products of sizes overflow in NumPy
+
+
+def write_npy(path: Path, array: NDArray) -> None:
+    """Write a ``.npy`` file, through memory: NumPy itself does not say why a disk takes no more.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    packed = io.BytesIO()
+    np.save(packed, array, allow_pickle=False)
+    path.write_bytes(packed.getbuffer())
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import pcdata
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
-from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note, write_fault
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, WriteError, add_note, write_fault
 from pcdata.imports import imported_files, step_names
 from pcdata.inputs import recording
 from pcdata.io.manifest import Manifest, Sample, key_of
@@ -220,7 +220,10 @@ def _with_sample_id(cloud: PointCloud, sample_id: str) -> PointCloud:
 def _keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:
     if not isinstance(capture, DepthFrame):
         raise CaptureError("output.keep_raw is on, but this source gives clouds: there is no depth image to keep")
-    write_capture(capture, folder)
+    try:
+        write_capture(capture, folder)
+    except WriteError as error:
+        raise CacheError(str(error)) from error
 
 
 def _built_sample(sample_id: str, capture: Any, cloud: PointCloud, seconds: float) -> BuiltSample:

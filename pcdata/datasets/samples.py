@@ -23,7 +23,8 @@ class SampleDataset(Dataset[PointCloud]):
 
     So the same sample comes out of the main process, or of any worker of any number of workers. With ``repeats`` every
     sample is in the dataset so often: index ``i + copy * len(ids)`` is copy number ``copy`` of sample ``i``, with draws
-    of its own. ``dataset[index, copy]``, which :class:`~pcdata.datasets.CountedSampler` asks for, counts on from there.
+    of its own, which those of ``ConcatDataset([dataset, dataset])`` do not have. ``dataset[index, copy]``, which
+    :class:`~pcdata.datasets.CountedSampler` asks for, counts on from there.
     """
 
     gives: type = PointCloud  # what every sample must be in the end

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CacheError, ConfigError, PcdataError, add_note, write_fault
+from pcdata.errors import CacheError, ConfigError, PcdataError, WriteError, add_note, write_fault
 from pcdata.exports.record import FILE_NAME, ExportRecord, check_only_export, files_of
 from pcdata.exports.registry import target_named
 from pcdata.exports.sources import identity_of, open_for
@@ -19,7 +19,7 @@ from pcdata.inputs import recording
 from pcdata.interrupts import shielded
 from pcdata.io.scratch import scratch_beside
 from pcdata.io.source import CaptureSource, inputs_of
-from pcdata.io.whole_folders import complete_or_nothing, is_free, restore_retired
+from pcdata.io.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 
@@ -146,11 +146,10 @@ def _continue(run: _Run, plan: ExportRecord, folder: Path) -> None:
     with scratch_beside(folder, alone=True, note=run.report.notes.append) as scratch:
         restore_retired(folder, check_only_export, run.report.notes.append)
         if is_free(folder):
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise CacheError(f"{folder}: cannot write there: {write_fault(error)}") from error
-            plan.write(folder)
+            # At once, with its plan: one killed between the two would leave a folder that nothing is known about.
+            with _part(scratch, "start") as start, _writing(folder):
+                plan.write(start)
+                rename_to_free(start, folder)
         else:
             _refuse_links(folder, [FILE_NAME])
             found = ExportRecord.read(folder)
@@ -228,6 +227,8 @@ def _writing(folder: Path) -> Iterator[None]:
     """Name the folder in what a full disk or a missing permission raises."""
     try:
         yield
+    except WriteError as error:
+        raise CacheError(str(error)) from error
     except OSError as error:
         if isinstance(error, PcdataError):
             raise

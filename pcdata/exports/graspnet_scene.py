@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import annotated_types
-import numpy as np
 import torch
 
+from pcdata.array_files.npy import write_npy
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError
 from pcdata.exports.checks import colors_of
 from pcdata.exports.graspnet import GraspNetImages, meta_bytes
@@ -97,6 +97,6 @@ class GraspNetScenes(GraspNetImages):
         table_from_camera = torch.stack(poses)
         first_from_table = rigid.invert_rigid(table_from_camera[:1])
         assert matrix is not None
-        np.save(scene / "camK.npy", matrix.numpy())
-        np.save(scene / "camera_poses.npy", (first_from_table @ table_from_camera).numpy())
-        np.save(scene / "cam0_wrt_table.npy", table_from_camera[0].numpy())
+        write_npy(scene / "camK.npy", matrix.numpy())
+        write_npy(scene / "camera_poses.npy", (first_from_table @ table_from_camera).numpy())
+        write_npy(scene / "cam0_wrt_table.npy", table_from_camera[0].numpy())

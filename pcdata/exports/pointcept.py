@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pcdata.array_files.npy import write_npy
 from pcdata.errors import CaptureError
 from pcdata.exports.checks import check_channels, one_cloud
 from pcdata.exports.contracts import require_cloud
@@ -77,7 +78,7 @@ class Pointcept(Target):
             scene = folder / item.paths[0]
             scene.mkdir(parents=True)
             for key, array in arrays.items():
-                np.save(scene / f"{key}.npy", array, allow_pickle=False)
+                write_npy(scene / f"{key}.npy", array)
 
 
 def _integers(where: str, key: str, cloud: PointCloud, name: str) -> NDArray[np.int32]:

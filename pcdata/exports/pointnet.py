@@ -5,7 +5,8 @@ Source: charlesq34/pointnet, ``provider.py`` (getDataFiles, loadDataFile), ``tra
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,8 @@ from pcdata.exports.checks import one_cloud
 from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
+from pcdata.interrupts import shielded
+from pcdata.io.hdf5_writing import FaultKeepingFile, new_hdf5
 from pcdata.structures import PointCloud
 
 NUM_POINTS = 2048
@@ -78,16 +81,18 @@ class PointNet(Target):
             lines = "".join(f"{self.listed(name)}\n" for name in names)
             (folder / self.list_name(split)).write_text(lines, encoding="utf-8")
         for name, chunk in files.items():
-            with _open(folder / name, len(chunk), self.arrays()) as file:
+            with _open(folder / name, len(chunk), self.arrays()) as (file, disk):
                 for number, (sample_id, data) in enumerate(islice(samples, len(chunk))):
                     where = f"{self.name}: sample {sample_id!r}"
                     cloud = one_cloud(where, data)
                     class_name = rows[sample_id].class_name
                     assert class_name is not None
                     require_cloud(where, self, cloud, **self.choices(classes.index(class_name)))
-                    file["data"][number] = cloud.points.numpy()
-                    file["label"][number] = classes.index(class_name)
-                    self.add_shape(where, cloud, class_name, file, number, class_of_part)
+                    with shielded():
+                        file["data"][number] = cloud.points.numpy()
+                        file["label"][number] = classes.index(class_name)
+                        self.add_shape(where, cloud, class_name, file, number, class_of_part)
+                    disk.check()
         next(samples, None)  # at its end the last sample is counted
         self.write_names(folder, classes, class_of_part)
 
@@ -130,21 +135,23 @@ class PointNet(Target):
         return files
 
 
-def _open(path: Path, num_rows: int, arrays: Mapping[str, tuple[tuple[int, ...], str, int]]) -> Any:
+@contextmanager
+def _open(
+    path: Path, num_rows: int, arrays: Mapping[str, tuple[tuple[int, ...], str, int]]
+) -> Iterator[tuple[Any, FaultKeepingFile]]:
     """Create a file with its arrays; a chunk is a row, so that rows are written one by one."""
-    import h5py
-
-    file = h5py.File(path, "x")
-    for name, (shape, dtype, level) in arrays.items():
-        # Many labels in a chunk, where a row is a few bytes.
-        rows_per_chunk = 1 if int(np.prod(shape)) > 1 else min(num_rows, 1024)
-        file.create_dataset(
-            name,
-            (num_rows, *shape),
-            dtype,
-            chunks=(rows_per_chunk, *shape),
-            compression="gzip",
-            compression_opts=level,
-            track_times=False,
-        )
-    return file
+    with new_hdf5(path) as (file, disk):
+        with shielded():
+            for name, (shape, dtype, level) in arrays.items():
+                # Many labels in a chunk, where a row is a few bytes.
+                rows_per_chunk = 1 if int(np.prod(shape)) > 1 else min(num_rows, 1024)
+                file.create_dataset(
+                    name,
+                    (num_rows, *shape),
+                    dtype,
+                    chunks=(rows_per_chunk, *shape),
+                    compression="gzip",
+                    compression_opts=level,
+                    track_times=False,
+                )
+        yield file, disk

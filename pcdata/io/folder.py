@@ -23,9 +23,9 @@ from pcdata.io.listing import (
     absolute,
     by_stem,
     check_links,
-    entries,
     has_file,
     link_targets,
+    links_in,
     unread_entries,
 )
 from pcdata.io.option_checks import check_invalid_values, check_label, check_name
@@ -134,7 +134,7 @@ class FolderSource(Source):
                 "one"
             )
         self.background_label = stated.background_label if background_label is None else background_label
-        check_links(entry for folder in roles.values() for entry in entries(folder))  # all of them in one message
+        check_links(link for folder in roles.values() for link in links_in(folder))  # all of them in one message
         self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
         self._used = {present[0], *roles.values()}
         super().__init__(path, self._files["depth"], links_to)

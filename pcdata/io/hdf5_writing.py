@@ -9,8 +9,38 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from pcdata.interrupts import shielded
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[tuple[Any, FaultKeepingFile]]:
+    """Make a file and close it; with it comes what to ask for faults after every write, which is to be shielded.
+
+    HDF5 calls back into Python, where a signal must not raise.
+
+    Raises:
+        OSError: it cannot be made, or something that HDF5 wrote is not in it.
+    """
+    import h5py
+
+    disk = FaultKeepingFile(path)
+    try:
+        with shielded():
+            file = h5py.File(disk, "w")
+        try:
+            yield file, disk
+        finally:
+            with shielded():
+                file.close()
+    except BaseException:
+        disk.abandon()
+        raise
+    disk.close()
 
 
 class FaultKeepingFile:
@@ -53,6 +83,10 @@ class FaultKeepingFile:
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file, whatever is in it."""
+        self._file.close()
 
     # -- what h5py calls; positions are absolute since HDF5 seeks before every access ------------------------------
 

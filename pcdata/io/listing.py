@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pcdata.errors import CaptureError, ConfigError
@@ -55,11 +55,7 @@ def entries(folder: Path) -> list[Path]:
     Raises:
         CaptureError: the folder cannot be listed.
     """
-    try:
-        names = os.listdir(folder)
-    except OSError as error:
-        raise CaptureError(f"{folder}: cannot be listed: {error.strerror or error}") from error
-    return [folder / name for name in sorted(names) if not name.startswith(".") and name.lower() not in _LITTER]
+    return [folder / entry.name for entry in _scanned(folder)]
 
 
 def visible_files(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Path]:
@@ -72,18 +68,44 @@ def visible_files(folder: Path, wanted: Callable[[str], bool] = lambda name: Tru
     Raises:
         CaptureError: the folder cannot be listed, or a wanted entry is no file: a link to nothing, a folder, a device.
     """
-    found = {file.name: file for file in _files(folder, wanted)}
-    return [found[name] for name in in_order(found)]
+    return [folder / name for name in in_order(_file_names(folder, wanted))]
 
 
-def _files(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Path]:
-    chosen = [entry for entry in entries(folder) if wanted(entry.name)]
-    check_links(chosen)
-    others = [entry.name for entry in chosen if not is_file(entry)]
+def _file_names(folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[str]:
+    chosen = [entry for entry in _scanned(folder) if wanted(entry.name)]
+    check_links(folder / entry.name for entry in chosen if entry.is_symlink())
+    others = [entry.name for entry in chosen if not _is_file_entry(entry)]
     if others:
         raise CaptureError(f"{folder}: {name_some(others)} cannot be read as files; move them out")
-    check_utf8(str(folder), [entry.name for entry in chosen])
-    return chosen
+    names = [entry.name for entry in chosen]
+    check_utf8(str(folder), names)
+    return names
+
+
+def _scanned(folder: Path) -> list[os.DirEntry[str]]:
+    """Return what :func:`entries` does, with the kind of every entry: to ask for it again takes long where many lie."""
+    try:
+        with os.scandir(folder) as found:
+            listed = sorted(found, key=lambda entry: entry.name)
+    except OSError as error:
+        raise CaptureError(f"{folder}: cannot be listed: {error.strerror or error}") from error
+    return [entry for entry in listed if not entry.name.startswith(".") and entry.name.lower() not in _LITTER]
+
+
+def _is_file_entry(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_file()
+    except OSError:
+        return False
+
+
+def links_in(folder: Path) -> list[Path]:
+    """Return the links among the entries of a folder.
+
+    Raises:
+        CaptureError: the folder cannot be listed.
+    """
+    return [folder / entry.name for entry in _scanned(folder) if entry.is_symlink()]
 
 
 def check_links(paths: Iterable[Path]) -> None:
@@ -126,20 +148,40 @@ def has_folder(path: Path) -> bool:
     return _there(path, is_folder, "folder")
 
 
-def by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+class FilesByStem(Mapping[str, Path]):
+    """Files of one folder by name without suffix; a path is made when it is asked for, which most never are."""
+
+    def __init__(self, folder: Path, names: Mapping[str, str]) -> None:
+        self._folder, self._names = folder, names
+
+    def __getitem__(self, stem: str) -> Path:
+        return self._folder / self._names[stem]
+
+    def __contains__(self, stem: object) -> bool:
+        return stem in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def by_stem(folder: Path, suffixes: Sequence[str]) -> FilesByStem:
     """Return the files of a folder by name without suffix.
 
     Raises:
         CaptureError: an entry has another suffix or is no file, or two differ in the suffix alone.
     """
-    found: dict[str, Path] = {}
-    for file in _files(folder):
-        if file.suffix.lower() not in suffixes:
-            raise CaptureError(f"{folder}: may hold {', '.join(suffixes)} only, but there is {file.name}; move it out")
-        if file.stem in found:
-            raise CaptureError(f"{folder}: {found[file.stem].name} and {file.name} are both {file.stem!r}; remove one")
-        found[file.stem] = file
-    return found
+    found: dict[str, str] = {}
+    for name in _file_names(folder):
+        stem, _, suffix = name.rpartition(".")
+        if not stem or f".{suffix.lower()}" not in suffixes:
+            raise CaptureError(f"{folder}: may hold {', '.join(suffixes)} only, but there is {name}; move it out")
+        if stem in found:
+            raise CaptureError(f"{folder}: {found[stem]} and {name} are both {stem!r}; remove one")
+        found[stem] = name
+    return FilesByStem(folder, found)
 
 
 def unread_entries(path: Path, read: set[Path]) -> list[str]:

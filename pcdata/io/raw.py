@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from pcdata.errors import CaptureError
+from pcdata.array_files.npy import write_npy
+from pcdata.errors import CaptureError, WriteError, write_fault
 from pcdata.io.capture_camera import CaptureCamera, write_capture_camera, write_pose
 from pcdata.io.confidence import write_confidence
 from pcdata.io.image_writing import write_color, write_depth, write_labels, write_mask
@@ -20,13 +21,13 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
     Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
 
     Raises:
-        CaptureError: a file cannot be written.
+        WriteError: a file cannot be written.
     """
     try:
         for v in range(frame.num_views):
             _write_view(frame, v, folder / f"view{v}")
     except OSError as error:
-        raise CaptureError(f"{folder}: cannot be written: {error}") from error
+        raise WriteError(f"{folder}: cannot be written: {write_fault(error)}") from error
 
 
 def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
@@ -68,11 +69,13 @@ def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
     if unit is not None and np.array_equal(_whole_units(metres, float(unit)), metres):
         try:
             write_depth(folder / "0.png", depth, metres_per_unit=unit)
+        except WriteError:
+            raise
         except CaptureError:  # more than 65535 units
             pass
         else:
             return unit
-    np.save(folder / "0.npy", metres, allow_pickle=False)
+    write_npy(folder / "0.npy", metres)
     return 1.0
 
 

@@ -20,6 +20,11 @@ _DECIMAL = re.compile(r"-?[0-9]+\.[0-9]+")
 _PART = re.compile(r"((?:(?<![^_ =])-)?[0-9]+)")
 _LAST = re.compile(r"[0-9]+\Z")
 _HEX = re.compile(r"[0-9a-f]+|[0-9A-F]+")
+_DIGITS = "0123456789"
+# A name with its digits, what makes a minus one, and everything else made alike.
+_SHAPES = {code: "0" if chr(code) in _DIGITS else "_" if chr(code) in "_ =" else "x" for code in range(128)}
+_SHAPES[ord("-")] = "-"
+_MINUS = re.compile(r"(^|_)-0")
 _MAX_POSITION = 10**18  # what fits into 64 bits
 
 _Token = tuple[int, int | Decimal, str]  # numbers before texts
@@ -33,6 +38,8 @@ def in_order(names: Iterable[str]) -> list[str]:
     Names that count in hexadecimal digits (``9, a, 10``, or all of one length) stand in that order.
     """
     names = list(names)
+    if _stand_in_text_order(names):
+        return sorted(names)
     keys = _keys(names)
     return sorted(sorted(names), key=keys.__getitem__)
 
@@ -42,6 +49,13 @@ def positions(names: Sequence[str]) -> dict[str, int]:
 
     That is the number the names end in where they are alike before it, else the place in order.
     """
+    if _stand_in_text_order(names) and not _DECIMAL.fullmatch(names[0]):
+        last = _LAST.search(names[0])
+        before = names[0][: last.start()] if last else ""
+        counted = last and len(last[0]) <= 18 and _hex_prefix(names) is None
+        if counted and all(name.startswith(before) for name in names):
+            return {name: int(name[len(before) :]) for name in names}
+        return {name: place for place, name in enumerate(sorted(names))}
     keys = _keys(names)
     alike = len({key[:-1] for key in keys.values()}) == 1 and _hex_prefix(names) is None
     if alike and all(key and _is_position(key[-1]) for key in keys.values()):
@@ -64,6 +78,8 @@ def check_names(where: str, names: Iterable[str]) -> None:
     """
     names = list(names)
     check_utf8(where, names)
+    if _stand_in_text_order(names):  # then no two are one
+        return
     seen: dict[_Key, str] = {}
     for name, key in _keys(names).items():
         if key in seen:
@@ -117,12 +133,33 @@ def _keys(names: Sequence[str]) -> dict[str, _Key]:
     decimals = {name: Decimal(name) for name in {*names} if _DECIMAL.fullmatch(name)}
     if len(set(decimals.values())) < len(decimals):
         decimals = {}
-    return {name: ((0, decimals[name], ""),) if name in decimals else _parts(name) for name in names}
+    tokens = _Tokens()
+    return {name: ((0, decimals[name], ""),) if name in decimals else tokens.of(name) for name in names}
 
 
-def _parts(name: str) -> _Key:
-    parts = _PART.split(name if name.isascii() else unicodedata.normalize("NFC", name))
-    return tuple(_number(part) if place % 2 else _text(part) for place, part in enumerate(parts) if part)
+def _stand_in_text_order(names: Sequence[str]) -> bool:
+    """Say whether all names have digits at the same places, so that the order of the text is that of the numbers.
+
+    That is so for padded names, of which there may be hundreds of thousands: their keys take a hundred times as long.
+    Hexadecimal and decimal numbers of one length stand in the order of their text too.
+    """
+    if not names or not all(map(str.isascii, names)):  # Unicode writes some letters in two ways
+        return False
+    shape = names[0].translate(_SHAPES)
+    return not _MINUS.search(shape) and all(name.translate(_SHAPES) == shape for name in names)
+
+
+class _Tokens(dict[str, _Token]):
+    """Numbers and texts by how they are written; most names of a capture share all but one."""
+
+    def of(self, name: str) -> _Key:
+        """Return what a name consists of."""
+        parts = _PART.split(name if name.isascii() else unicodedata.normalize("NFC", name))
+        return tuple(map(self.__getitem__, filter(None, parts)))
+
+    def __missing__(self, part: str) -> _Token:
+        token = self[part] = _number(part) if part[-1] in _DIGITS else _text(part)
+        return token
 
 
 def _number(digits: str | int) -> _Token:

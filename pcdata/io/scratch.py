@@ -22,9 +22,7 @@ from typing import Literal
 
 from pcdata.errors import CacheError, write_fault
 from pcdata.interrupts import shielded
-
-if sys.platform != "win32":
-    import fcntl
+from pcdata.locks import try_lock
 
 Note = Callable[[str], None]  # tell the user what is no error
 
@@ -61,7 +59,7 @@ def scratch_beside(folder: Path, *, alone: bool = False, note: Note = silent) ->
             partial.mkdir(parents=True)
         except OSError as error:
             raise CacheError(f"{folder}: cannot write there: {write_fault(error)}") from error
-        lock = _lock(partial)
+        lock, _ = try_lock(partial)
         _settle_others(folder, partial, alone, note)
         yield partial
     except BaseException:
@@ -136,13 +134,13 @@ def _owner(scratch: Path, made_by: str) -> tuple[Literal["alive", "dead", "unkno
         return "unknown", None
     if not here:
         # Whether locks reach across machines depends on the file system: one that is held is sure, a free one is not.
-        lock, held = _try_lock(scratch)
+        lock, held = try_lock(scratch)
         if lock is not None:
             os.close(lock)
         return ("alive" if held else "unknown"), None
     deadline = time.monotonic() + _LOCKING
     while True:
-        lock, held = _try_lock(scratch)
+        lock, held = try_lock(scratch)
         if held:
             return "alive", None
         if not _runs(number):
@@ -156,26 +154,6 @@ def _owner(scratch: Path, made_by: str) -> tuple[Literal["alive", "dead", "unkno
         if time.monotonic() > deadline:
             return "unknown", None
         time.sleep(_LOCKING / 10)
-
-
-def _lock(scratch: Path) -> int | None:
-    return _try_lock(scratch)[0]
-
-
-def _try_lock(scratch: Path) -> tuple[int | None, bool]:
-    """Lock a folder: the descriptor that holds it, or None, and whether another process does."""
-    if sys.platform == "win32":
-        return None, False
-    try:
-        descriptor = os.open(scratch, os.O_RDONLY)
-    except OSError:
-        return None, False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        return None, isinstance(error, BlockingIOError)
-    return descriptor, False
 
 
 def _runs(pid: int) -> bool:

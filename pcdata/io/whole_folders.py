@@ -122,7 +122,7 @@ def _identity(folder: Path) -> object:
 def _put_into_place(partial: Path, folder: Path, replaced: object, owned: Owned, note: Note) -> None:
     try:
         if is_free(folder):
-            _rename_to_free(partial, folder)
+            rename_to_free(partial, folder)
         else:
             if replaced is None or _identity(folder) != replaced:
                 raise CacheError(
@@ -136,7 +136,7 @@ def _put_into_place(partial: Path, folder: Path, replaced: object, owned: Owned,
         raise CacheError(f"{folder}: cannot be put into place: {write_fault(error)}") from error
 
 
-def _rename_to_free(partial: Path, folder: Path) -> None:
+def rename_to_free(partial: Path, folder: Path) -> None:
     """Rename a folder to a name that nothing has, or an empty folder: POSIX lets a folder replace nothing else."""
     if os.name == "nt":
         with suppress(FileNotFoundError):
@@ -164,7 +164,7 @@ def _swap(partial: Path, folder: Path) -> Path:
     retired = folder.with_name(hidden_name(folder, RETIRED))
     os.rename(folder, retired)
     try:
-        _rename_to_free(partial, folder)
+        rename_to_free(partial, folder)
     except BaseException:
         if not os.path.lexists(folder):
             os.rename(retired, folder)

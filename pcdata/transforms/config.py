@@ -16,7 +16,7 @@ from pcdata.errors import ConfigError, near_matches
 from pcdata.files import read_text
 from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
 from pcdata.transforms.compose import Compose
-from pcdata.transforms.sensor_words import is_sensor_word, sensor_hint, sensor_value
+from pcdata.transforms.sensor_words import check_sensor_unit, is_sensor_word, sensor_hint, sensor_value
 from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
 _MAX_STEPS = 1000  # of one list; each is built, which takes some 200 microseconds
@@ -106,6 +106,7 @@ def _build(
         read = _field_value(document, cls, key, value)
         if len(document.faults) == known:
             fields[key] = read
+    check_sensor_unit(document, cls, {key: node for key, (_, node) in entries.items()}, fields)
     for path, message in field_faults(cls, fields):
         if str(path[0]) in entries and str(path[0]) not in fields:
             continue  # not missing: it could not be read, and that was said

@@ -9,12 +9,14 @@ histories hold the number.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, get_args, get_origin
 
 import yaml
 
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
+from pcdata.structures import METRE
 from pcdata.transforms.base import REGISTRY, Transform, field_types
 from pcdata.transforms.fields import FromSensor
 from pcdata.yaml_nodes import SensorChoice, YamlDocument
@@ -70,6 +72,20 @@ def sensor_value(document: YamlDocument, node: yaml.Node, cls: type[Transform], 
         return None
     value = mark.figure(document.sensor.profile, document.sensor.depth)
     return value if isinstance(value, str) else float(f"{value:.{_DIGITS}g}")
+
+
+def check_sensor_unit(
+    document: YamlDocument, cls: type[Transform], nodes: Mapping[str, yaml.Node], fields: Mapping[str, Any]
+) -> None:
+    """Note a fault where a step says ``sensor``, which means metres, for a length in another unit."""
+    unit = fields.get("unit", METRE)
+    for key, node in nodes.items():
+        if unit != METRE and is_sensor_word(node, _types(cls).get(key)):
+            document.fault(
+                node,
+                f"{cls.__name__}.{key}: a sensor's figures are in metres, but unit is {unit!r}; give a number in that "
+                f"unit, or put {cls.__name__} before the step that normalizes, without unit",
+            )
 
 
 def sensor_hint(value: Any) -> str:

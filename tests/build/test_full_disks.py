@@ -56,6 +56,17 @@ def test_a_file_that_cannot_grow_is_one_error_and_leaves_nothing(tmp_path, form,
     assert tree(tmp_path) == {}
 
 
+@pytest.mark.parametrize("size", [0, 300])
+def test_raw_captures_that_do_not_fit_are_no_reason_to_leave_captures_out(tmp_path, source, configure, size):
+    config = configure("output: {format: hdf5, keep_raw: true}")
+    with largest_file(100_000):
+        build_dataset(config, source, tmp_path / "fits")
+    with largest_file(size), pytest.raises(CacheError, match="cannot be written: a file may not become so large") as e:
+        build_dataset(config, source, tmp_path / "out", skip_refused=False)
+    assert "--skip" not in str(getattr(e.value, "__notes__", ""))
+    assert [path.name for path in tmp_path.iterdir()] == ["fits"]
+
+
 @pytest.mark.parametrize("size", range(2_000, 130_000, 16_411))
 def test_hdf5_survives_a_fault_at_any_offset_and_the_process_goes_on(tmp_path, size):
     from pcdata.build import config_from_yaml

@@ -8,7 +8,7 @@ import warnings
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, RandomSampler, Subset, WeightedRandomSampler
+from torch.utils.data import ConcatDataset, DataLoader, RandomSampler, Subset, WeightedRandomSampler
 
 from pcdata import CloudDataset, CountedSampler, PointCloud, collate_packed
 from pcdata.datasets import RepeatedEpochWarning
@@ -52,6 +52,17 @@ def test_a_second_pass_in_one_epoch_is_said_once(count):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read(dataset, range(count))
+
+
+def test_a_dataset_beside_itself_gives_the_same_copies_which_repeats_does_not():
+    dataset = dataset_of(8)
+    both = ConcatDataset([dataset, dataset])
+    with pytest.warns(RepeatedEpochWarning, match=r"ConcatDataset.*repeats=2"):
+        found = [both[index].points for index in range(16)]
+    assert all(torch.equal(found[index], found[index + 8]) for index in range(8))
+    twice = dataset_of(8, repeats=2)
+    found = [twice[index].points for index in range(16)]
+    assert not any(torch.equal(found[index], found[index + 8]) for index in range(8))
 
 
 def test_passes_with_their_own_epochs_say_nothing():

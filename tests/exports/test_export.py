@@ -166,6 +166,49 @@ def test_an_item_that_was_moved_by_half_is_written_again(tmp_path, monkeypatch):
     assert tree(tmp_path / "out") == tree(tmp_path / "one go")
 
 
+@pytest.mark.parametrize("exists", [True, False], ids=["to a file", "to nothing"])
+@pytest.mark.parametrize(
+    ("target", "options", "place"),
+    [
+        ("contact_graspnet", {}, "f1.npz"),
+        ("contact_graspnet", {}, "pcdata_export.json"),
+        ("ggcnn", {"any_size": True}, "01/pcd0101r.png"),
+        ("ggcnn", {"any_size": True}, "01"),
+        ("graspnet", {"any_size": True}, "f1"),
+    ],
+)
+def test_a_continued_export_writes_through_no_link(tmp_path, target, options, place, exists):
+    source = captures()
+    source.samples["f1"] = stop
+    with pytest.raises(KeyboardInterrupt):
+        export_dataset(source, target, tmp_path / "out", resume=True, **options)
+    link, elsewhere = tmp_path / "out" / place, tmp_path / "elsewhere"
+    if link.exists():
+        link.rename(elsewhere)
+    elif exists:
+        elsewhere.mkdir()
+    if not exists:
+        elsewhere = tmp_path / "nowhere"
+    link.symlink_to(elsewhere)
+    before = tree(tmp_path)
+    with pytest.raises(CacheError, match=r"is a link to .*writes into its own folder only") as caught:
+        export_dataset(captures(), target, tmp_path / "out", resume=True, **options)
+    assert str(link) in str(caught.value)
+    assert tree(tmp_path) == before
+
+
+def test_an_export_killed_at_its_start_can_be_continued(tmp_path, monkeypatch):
+    def stop_here(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pcdata.exports.export.rename_to_free", stop_here)
+        with pytest.raises(KeyboardInterrupt):
+            export_dataset(captures(), "contact_graspnet", tmp_path / "out", resume=True)
+    assert not (tmp_path / "out").exists()  # never without its plan
+    export_dataset(captures(), "contact_graspnet", tmp_path / "out", resume=True)
+
+
 def test_only_the_same_export_is_continued(tmp_path):
     out = tmp_path / "out"
     export_dataset(captures(3), "contact_graspnet", out, resume=True)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import random
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError
+from pcdata.io import sample_names
 from pcdata.io.sample_names import check_names, in_order, in_order_of_last_number, name_some, positions
 
 
@@ -33,6 +36,35 @@ def test_names_stand_as_a_person_counts_whatever_order_they_come_in(ordered: lis
     random.Random(0).shuffle(shuffled)
     assert in_order(shuffled) == ordered
     check_names("here", ordered)
+
+
+PADDED = st.tuples(
+    st.sampled_from(["", "frame-", "t_-", "-", "a=-", "0a", "scene 1_", "2024-01-", "ü", "1."]),
+    st.integers(1, 4),
+    st.sampled_from(["", "-", "_-", ".", "a", "b0"]),
+    st.sampled_from(["", ".color", "f", "-"]),
+).flatmap(
+    lambda parts: st.lists(
+        st.builds(
+            lambda one, two: f"{parts[0]}{one:0{parts[1]}}{parts[2]}{two}{parts[3]}",
+            st.integers(0, 10 ** parts[1] - 1),
+            st.integers(0, 9),
+        ),
+        min_size=1,
+        max_size=8,
+        unique=True,
+    )
+)
+
+
+@given(PADDED)
+def test_padded_names_which_are_not_split_stand_as_if_they_were(names: list[str]) -> None:
+    """Names with digits at the same places are sorted as texts, since there may be hundreds of thousands of them."""
+    fast = in_order(names), positions(names)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sample_names, "_stand_in_text_order", lambda names: False)
+        assert fast == (in_order(names), positions(names))
+        check_names("here", names)  # no two of one shape are one name
 
 
 def test_a_position_is_the_number_at_the_end_only_where_names_are_alike_before_it() -> None:

@@ -69,6 +69,10 @@ def test_a_name_may_still_be_called_sensor():
         ("sensor: realsense_d345", "c.yaml:1:9: unknown sensor 'realsense_d345'; did you mean"),
         ("sensor: [kinect_v1]", "c.yaml:1:9: sensor must be a name that `pcdata profiles` lists (got ['kinect_v1'])"),
         ("sensor: {depth: 1.0}", "c.yaml:1:9: sensor.name: Field required"),
+        (
+            "sensor: kinect_v1\ncloud: [VoxelDownsample: {unit: normalized, voxel_size: sensor}]",
+            "c.yaml:2:57: VoxelDownsample.voxel_size: a sensor's figures are in metres, but unit is 'normalized'",
+        ),
         ("sensor: {name: kinect_v1, dept: 1}", "c.yaml:1:27: sensor.dept: no such setting; known: name, depth"),
         ("sensor: {name: kinect_v1, depth: 0}", "c.yaml:1:34: sensor.depth: must be a positive number of metres"),
         ("sensor: {name: kinect_v1, depth: .nan}", "c.yaml:1:34: sensor.depth: must be a positive number of metres"),
