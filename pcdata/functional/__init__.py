@@ -18,6 +18,7 @@ from pcdata.functional.edge_offset import EdgeOffset, EdgeVotes, edge_votes, off
 from pcdata.functional.extremes import pile_at_extreme
 from pcdata.functional.flying_pixels import flying_pixel_mask
 from pcdata.functional.grid import ImageGrid
+from pcdata.functional.icp import Alignment, icp_point_to_plane
 from pcdata.functional.lens import distort_normalized, undistort_normalized
 from pcdata.functional.metrics import chamfer_distance
 from pcdata.functional.missing_region import largest_missing_block, largest_missing_region
@@ -25,13 +26,8 @@ from pcdata.functional.neighbors import ball_query, knn
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.occlusion_edges import occlusion_edges
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
+from pcdata.functional.plane_residuals import PlaneResiduals, point_to_plane_residuals
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.registration import (
-    PlaneResiduals,
-    Registration,
-    icp_point_to_plane,
-    point_to_plane_residuals,
-)
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.view_agreement import view_agreement
 from pcdata.functional.voxels import (
@@ -44,13 +40,13 @@ from pcdata.functional.voxels import (
 )
 
 __all__ = [
+    "Alignment",
     "DepthAverage",
     "EdgeOffset",
     "EdgeVotes",
     "ImageGrid",
     "PlaneResiduals",
     "RegisteredDepth",
-    "Registration",
     "TemporalState",
     "average_depth",
     "ball_query",
