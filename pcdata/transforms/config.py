@@ -14,8 +14,9 @@ import yaml
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.files import read_text
-from pcdata.transforms.base import REGISTRY, Transform, field_faults, field_names, field_types
+from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.compose import Compose
+from pcdata.transforms.field_checks import field_faults, field_names, field_types
 from pcdata.transforms.sensor_words import check_sensor_unit, is_sensor_word, sensor_hint, sensor_value
 from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 

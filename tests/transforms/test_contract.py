@@ -15,8 +15,8 @@ from pcdata import transforms as T
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataError, UnitError
 from pcdata.rng import seeded
 from pcdata.structures import METRE, NORMALIZED, DepthFrame, PointCloud
-from pcdata.transforms.base import field_names, length_fields
 from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
+from pcdata.transforms.field_checks import field_names, length_fields
 from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, torch_defaults, tree
 from tests.messages import told
 from tests.transforms.examples import ALL, EXAMPLES, NAMES, Example
