@@ -18,7 +18,8 @@ from pcdata.io.cloud_columns import arrays_of_columns
 from pcdata.io.cloud_statement import read_statement, statement_lines
 from pcdata.io.numbers_as_text import format_rows
 from pcdata.io.ply_header import TYPE_NAMES, check_header_size, parse_header
-from pcdata.io.ply_rows import vertices_of_bytes, vertices_of_text
+from pcdata.io.ply_rows import vertices_of_bytes
+from pcdata.io.ply_text import vertices_of_text
 from pcdata.structures import PointCloud, SurfaceMesh
 
 _MAX_BYTES = 1 << 32

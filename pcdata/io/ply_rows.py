@@ -1,4 +1,4 @@
-"""The rows behind a PLY header: the columns of the vertices, with everything else in the file accounted for.
+"""The binary rows behind a PLY header: the columns of the vertices, with everything else in the file accounted for.
 
 Rows without lists are one block of memory. Where rows hold lists, each begins where the one before ends: runs of rows
 with lists of equal lengths (triangles) are found by comparing whole blocks, the others are stepped over one by one.
@@ -17,16 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
-from pcdata.io.numbers_as_text import TextLines, line_of, table_columns, text_blocks, typed
+from pcdata.io.ply_elements import (
+    CORNERS,
+    Columns,
+    check_corners,
+    counts_in_words,
+    places_in_lists,
+    truncated,
+    vertex_of,
+)
 from pcdata.io.ply_header import Element
-
-Columns = dict[str, NDArray[Any]]
 
 _RUN = 1 << 12  # rows compared at once
 _ALONE = 64  # rows stepped over before another run is tried
 _GATHER = 1 << 20  # bytes picked at once
 _FACES = 1 << 16  # checked at once
-_CORNERS = ("vertex_indices", "vertex_index")
 
 
 def vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> Columns:
@@ -39,11 +44,11 @@ def vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> 
     for element in elements:
         dtype = element.row_dtype
         if dtype is None:
-            columns, offset = _rows_with_lists(where, element, body, offset, _vertex(elements).count)
+            columns, offset = _rows_with_lists(where, element, body, offset, vertex_of(elements).count)
         else:
             end = offset + element.count * dtype.itemsize
             if end > len(body):
-                raise _truncated(where, element, f"needs {end - offset} bytes but only {len(body) - offset} are left")
+                raise truncated(where, element, f"needs {end - offset} bytes but only {len(body) - offset} are left")
             columns = {}
             if element.name == "vertex" and dtype.names:
                 rows = np.frombuffer(body[offset:end], dtype)
@@ -53,36 +58,6 @@ def vertices_of_bytes(where: str, elements: list[Element], body: memoryview) -> 
             found = columns
     _check_end(where, elements, body[offset:])
     return found
-
-
-def vertices_of_text(where: str, elements: list[Element], body: memoryview) -> Columns:
-    """Return the single values of the vertices, one line each, and check that no other line is left."""
-    single = [entry for entry in _vertex(elements).properties if entry.length_dtype is None]
-    parts: list[list[NDArray[Any]]] = []
-    waiting = [(element, element.count if element.properties else 0) for element in elements]
-    for block in text_blocks(where, body):
-        lines = block
-        while len(lines.bounds) > 1:
-            while waiting and not waiting[0][1]:
-                waiting.pop(0)
-            if not waiting:
-                raise CaptureError(
-                    f"{where}: a line is left that no element of the header explains: {line_of(lines, 0)!r:.100}; is a "
-                    f"count too small? It has {_counts(elements)}"
-                )
-            element, missing = waiting[0]
-            taken = min(missing, len(lines.bounds) - 1)
-            mine, lines = _split(lines, taken)
-            columns = _columns_of_text(where, element, mine, _vertex(elements).count)
-            if element.name == "vertex":
-                parts.append(columns)
-            waiting[0] = element, missing - taken
-    for element, missing in waiting:
-        if missing:
-            raise _truncated(where, element, f"has {element.count - missing} lines")
-    if not parts:
-        return {entry.name: np.zeros(0, entry.dtype) for entry in single}
-    return {entry.name: np.concatenate([part[i] for part in parts]) for i, entry in enumerate(single)}
 
 
 # -- binary rows with lists --------------------------------------------------------------------------------------------
@@ -114,7 +89,7 @@ def _segments(element: Element) -> list[_Segment]:
         segments.append(
             _Segment(
                 names, np.dtype(fixed), length_of, entry.length_dtype, entry.dtype, entry.dtype.itemsize,
-                entry.name in _CORNERS and entry.dtype.kind in "iu",
+                entry.name in CORNERS and entry.dtype.kind in "iu",
             )
         )  # fmt: skip
         fixed = []
@@ -128,7 +103,7 @@ def _rows_with_lists(
     least = sum(one.dtype.itemsize + (one.length_dtype.itemsize if one.length_dtype else 0) for one in segments)
     if element.count * least > len(body) - offset:
         needed = element.count * least
-        raise _truncated(where, element, f"needs {needed} bytes or more but only {len(body) - offset} are left")
+        raise truncated(where, element, f"needs {needed} bytes or more but only {len(body) - offset} are left")
     kept = [array("q") if element.name == "vertex" and one.names else None for one in segments]
     corners = [one for one in segments if element.name == "face" and one.is_corners]
     if corners:
@@ -145,7 +120,7 @@ def _rows_with_lists(
     columns: Columns = {}
     for one, starts in zip(segments, kept):
         if starts is not None and one in corners:
-            _check_corners(where, element, one, np.frombuffer(starts, np.int64), body, num_vertices)
+            _check_faces(where, element, one, np.frombuffer(starts, np.int64), body, num_vertices)
         elif starts is not None:
             rows_of_segment = _gather(body, np.frombuffer(starts, np.int64), one.dtype)
             columns |= {name: rows_of_segment[name] for name in one.names}
@@ -181,9 +156,9 @@ def _one_by_one(
                         raise CaptureError(f"{where}: a list of element {element.name!r} has length {length}")
                     offset += length_bytes + length * item_bytes
     except (struct.error, IndexError):
-        raise _truncated(where, element, "ends within a list") from None
+        raise truncated(where, element, "ends within a list") from None
     if offset > len(body):
-        raise _truncated(where, element, f"ends {offset - len(body)} bytes early")
+        raise truncated(where, element, f"ends {offset - len(body)} bytes early")
     return offset
 
 
@@ -222,7 +197,7 @@ def _run(
     return rows, offset + rows * size
 
 
-def _check_corners(
+def _check_faces(
     where: str,
     element: Element,
     segment: _Segment,
@@ -242,20 +217,12 @@ def _check_corners(
         if (lengths == lengths[0]).all() and (np.diff(places) == pitch).all():  # triangles: no need to pick them
             shape, strides = (len(places), int(lengths[0])), (pitch, segment.item_bytes)
             corners = np.ndarray(shape, segment.item, body, int(places[0]) if lengths[0] else 0, strides)
-            _check_named(where, element, corners, num_vertices)
+            check_corners(where, element, corners, num_vertices)
             continue
         for part in _in_parts(lengths, _GATHER // segment.item_bytes):
-            at = _of_lists(places[part], lengths[part], segment.item_bytes)
+            at = places_in_lists(places[part], lengths[part], segment.item_bytes)
             corners = raw[at[:, None] + np.arange(segment.item_bytes)].reshape(-1).view(segment.item)
-            _check_named(where, element, corners, num_vertices)
-
-
-def _check_named(where: str, element: Element, corners: NDArray[Any], num_vertices: int) -> None:
-    if corners.size and not 0 <= int(corners.min()) <= int(corners.max()) < num_vertices:
-        raise CaptureError(
-            f"{where}: element {element.name!r} names the vertices {int(corners.min())} to {int(corners.max())}, but "
-            f"there are {num_vertices}; is a count wrong, or the file damaged?"
-        )
+            check_corners(where, element, corners, num_vertices)
 
 
 def _in_parts(lengths: NDArray[np.int64], most: int) -> list[slice]:
@@ -263,13 +230,6 @@ def _in_parts(lengths: NDArray[np.int64], most: int) -> list[slice]:
     part = np.cumsum(lengths) // most
     cuts = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(lengths)]
     return [slice(a, b) for a, b in pairwise(cuts)]
-
-
-def _of_lists(starts: NDArray[np.int64], lengths: NDArray[np.int64], step: int) -> NDArray[np.int64]:
-    """Return where every item of lists lies, by where the lists start."""
-    ends = np.cumsum(lengths)
-    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
-    return np.repeat(starts, lengths) + step * within
 
 
 def _gather(body: memoryview, starts: NDArray[np.int64], dtype: np.dtype) -> NDArray[Any]:
@@ -292,61 +252,5 @@ def _check_end(where: str, elements: list[Element], rest: memoryview) -> None:
         return
     raise CaptureError(
         f"{where}: {len(rest)} bytes are left that no element of the header explains; is a count too small? It has "
-        f"{_counts(elements)}"
+        f"{counts_in_words(elements)}"
     )
-
-
-# -- text --------------------------------------------------------------------------------------------------------------
-
-
-def _columns_of_text(where: str, element: Element, lines: TextLines, num_vertices: int) -> list[NDArray[Any]]:
-    if element.row_dtype is not None:
-        names, dtypes = [e.name for e in element.properties], [e.dtype for e in element.properties]
-        return table_columns(where, names, dtypes, lines)
-    place, ends = lines.bounds[:-1].copy(), lines.bounds[1:]
-    columns = []
-    for entry in element.properties:
-        _check_lines(where, element, lines, place < ends)
-        found = lines.values[place]
-        if entry.length_dtype is None:
-            columns.append(typed(f"{where}: {entry.name}", found, entry.dtype, list))  # PLY has no 64-bit integers
-            place += 1
-        else:
-            _check_lines(where, element, lines, (found >= 0) & (found == np.rint(found)) & (found <= ends - place))
-            lengths = found.astype(np.int64)
-            if element.name == "face" and entry.name in _CORNERS:
-                _check_named(where, element, lines.values[_of_lists(place + 1, lengths, 1)], num_vertices)
-            place += 1 + lengths
-    _check_lines(where, element, lines, place == ends)
-    return columns
-
-
-def _check_lines(where: str, element: Element, lines: TextLines, good: NDArray[np.bool_]) -> None:
-    if not good.all():
-        line = line_of(lines, int(np.argmin(good)))
-        raise CaptureError(f"{where}: a line of element {element.name!r} does not fit its properties: {line!r:.200}")
-
-
-def _split(lines: TextLines, count: int) -> tuple[TextLines, TextLines]:
-    """Cut a block behind its first ``count`` lines."""
-    if count == len(lines.bounds) - 1:
-        return lines, TextLines(b"", lines.values[:0], np.zeros(1, np.int64))
-    words = int(lines.bounds[count])
-    head = TextLines(lines.text, lines.values[:words], lines.bounds[: count + 1], lines.first)
-    tail = TextLines(lines.text, lines.values[words:], lines.bounds[count:] - words, lines.first + count)
-    return head, tail
-
-
-# -- shared ------------------------------------------------------------------------------------------------------------
-
-
-def _vertex(elements: list[Element]) -> Element:
-    return next(element for element in elements if element.name == "vertex")
-
-
-def _counts(elements: list[Element]) -> str:
-    return ", ".join(f"element {element.name[:40]} {element.count}" for element in elements[:8])
-
-
-def _truncated(where: str, element: Element, found: str) -> CaptureError:
-    return CaptureError(f"{where}: element {element.name!r} of {element.count} rows {found}; is the file truncated?")
