@@ -11,6 +11,8 @@ import pytest
 
 from pcdata.cli import main
 from pcdata.cli.printable import PrintableStream, printable
+from pcdata.errors import CacheError
+from pcdata.io.manifest import key_of
 
 ORDERS = {
     "escape": "\x1b]0;title\x07",
@@ -59,6 +61,17 @@ def test_names_in_errors_are_printable(tmp_path, capsys, command, name):
     assert main([command, str(folder)]) != 0
     told = capsys.readouterr()
     assert (told.out + told.err).replace("\n", "").replace("\t", "").isprintable()
+
+
+@pytest.mark.parametrize("name", ["1\npcdata: passed", "1\r", "1\x1b[2J", "1\u2028"])
+def test_a_sample_whose_name_could_write_lines_of_its_own_is_refused(tmp_path, capsys, name):
+    (tmp_path / f"{name}.ply").write_text("bad")
+    assert main(["inspect", str(tmp_path)]) == 1
+    told = capsys.readouterr().err
+    assert "must not have control characters" in told
+    assert told.count("\n") == 1
+    with pytest.raises(CacheError, match="in one line"):
+        key_of("1\npcdata: passed")
 
 
 def test_a_name_that_is_no_utf8_is_told(tmp_path):

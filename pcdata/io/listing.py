@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.io.sample_names import check_utf8, in_order, name_some
+from pcdata.io.sample_names import check_text, in_order, name_some
 
 # What desktops, servers and archivers leave behind, in lower case; hidden entries are litter too.
 _LITTER = {"thumbs.db", "ehthumbs.db", "desktop.ini", "icon\r", "__macosx", "@eadir", "lost+found", "$recycle.bin"}
@@ -78,7 +78,7 @@ def _file_names(folder: Path, wanted: Callable[[str], bool] = lambda name: True)
     if others:
         raise CaptureError(f"{folder}: {name_some(others)} cannot be read as files; move them out")
     names = [entry.name for entry in chosen]
-    check_utf8(str(folder), names)
+    check_text(str(folder), names)
     return names
 
 

@@ -164,10 +164,10 @@ def key_of(sample_id: str) -> str:
     name ends in ``~`` and a hash instead.
 
     Raises:
-        CacheError: the id is empty, or no text.
+        CacheError: the id is empty, or no text in one line.
     """
-    if not isinstance(sample_id, str) or not sample_id:
-        raise CacheError(f"a sample id must be a text that is not empty, got {sample_id!r:.100}")
+    if not isinstance(sample_id, str) or not sample_id or len(sample_id.splitlines()) > 1:
+        raise CacheError(f"a sample id must be a text in one line that is not empty, got {sample_id!r:.100}")
     # surrogatepass: file names that are not UTF-8 reach Python as lone surrogates.
     key = quote(sample_id, safe="", errors="surrogatepass").replace("~", "%7E")
     key = "%2E" + key[1:] if key.startswith(".") else key

@@ -19,6 +19,7 @@ _LONGEST = 200  # characters of a name in a message
 _DECIMAL = re.compile(r"-?[0-9]+\.[0-9]+")
 _PART = re.compile(r"((?:(?<![^_ =])-)?[0-9]+)")
 _LAST = re.compile(r"[0-9]+\Z")
+_CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # and separators of lines
 _HEX = re.compile(r"[0-9a-f]+|[0-9A-F]+")
 _DIGITS = "0123456789"
 # A name with its digits, what makes a minus one, and everything else made alike.
@@ -74,10 +75,11 @@ def check_names(where: str, names: Iterable[str]) -> None:
     """Require names that can be stored, shown and told apart.
 
     Raises:
-        CaptureError: a name is no UTF-8, or two differ only in leading zeros or in how Unicode writes a letter.
+        CaptureError: a name is no UTF-8 text in one line, or two differ only in leading zeros or in how Unicode writes
+            a letter.
     """
     names = list(names)
-    check_utf8(where, names)
+    check_text(where, names)
     if _stand_in_text_order(names):  # then no two are one
         return
     seen: dict[_Key, str] = {}
@@ -90,12 +92,18 @@ def check_names(where: str, names: Iterable[str]) -> None:
         seen[key] = name
 
 
-def check_utf8(where: str, names: Iterable[str]) -> None:
-    """Require texts of UTF-8, which every file that lists names is written in.
+def check_text(where: str, names: Iterable[str]) -> None:
+    """Require texts of UTF-8 in one line, which every list of names and every message takes for granted.
 
     Raises:
-        CaptureError: a file or folder has a name of other bytes, which Python holds as lone surrogates.
+        CaptureError: a file or folder has a name of other bytes, which Python holds as lone surrogates, or one with
+            control characters: what follows a line feed reads as a line of ours.
     """
+    names = list(names)
+    controlling = [name for name in names if _CONTROLS.search(name)]
+    if controlling:
+        shown = ", ".join(ascii(name[:_LONGEST]) for name in controlling[:_SHOWN])
+        raise CaptureError(f"{where}: names must not have control characters, but {shown}{_more(controlling)}: rename")
     broken = [name for name in names if not _is_utf8(name)]
     if broken:
         shown = ", ".join(str(os.fsencode(name)) if _from_bytes(name) else ascii(name) for name in broken[:_SHOWN])

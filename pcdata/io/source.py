@@ -24,7 +24,7 @@ from pcdata.errors import (
 from pcdata.files import check_inside
 from pcdata.inputs import Inputs, recording
 from pcdata.io.listing import LinkTargets, absolute, is_folder, link_targets
-from pcdata.io.sample_names import check_names, check_utf8, in_order, name_some, same_but_for_writing
+from pcdata.io.sample_names import check_names, check_text, in_order, name_some, same_but_for_writing
 from pcdata.structures import DepthFrame, PointCloud
 
 # What is wrong with one capture, not with what is asked of all of them.
@@ -60,7 +60,7 @@ def checked_ids(where: str, source: Any) -> list[str]:
     if len(set(ids)) != len(ids):
         twice = next(name for name in ids if ids.count(name) > 1)
         raise CaptureError(f"{where}: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
-    check_utf8(where, ids)
+    check_text(where, ids)
     return ids
 
 

@@ -11,6 +11,7 @@ import torch
 
 from pcdata import extras
 from pcdata.files import replacing
+from pcdata.report.labels import label_text
 from pcdata.structures import METRE, DepthFrame, PointCloud
 
 _PALETTE = (
@@ -43,7 +44,7 @@ def save_pipeline_figure(
     figure = Figure(figsize=(4.2 * _COLUMNS, 3.6 * rows), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     if title:
-        figure.suptitle(title, fontsize=15, fontweight="bold")
+        figure.suptitle(label_text(title), fontsize=15, fontweight="bold")
     axes = iter(figure.subplots(rows, _COLUMNS, squeeze=False).flatten())
     if isinstance(capture, PointCloud):
         _draw_cloud(next(axes), "capture", capture)
@@ -81,11 +82,11 @@ def _draw_distances(axis: Any, capture: PointCloud) -> None:
     away = capture.points if seen_from is None else capture.points - seen_from
     axis.set_title("points by distance from the " + ("origin" if seen_from is None else "sensor"))
     axis.hist(away.norm(dim=1).cpu().numpy(), bins=60, color=_PALETTE[0])
-    axis.set_xlabel("metres" if capture.unit == METRE else capture.unit)
+    axis.set_xlabel("metres" if capture.unit == METRE else label_text(capture.unit))
 
 
 def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
-    names = [caption for caption, _ in stages]
+    names = [label_text(caption) for caption, _ in stages]
     counts = [cloud.num_points for _, cloud in stages]
     axis.set_title("points left after each step")
     axis.barh(range(len(counts)), counts, color=_PALETTE[0], log=any(counts))  # by position: captions may repeat
@@ -100,7 +101,7 @@ def _draw_counts(axis: Any, stages: Sequence[tuple[str, PointCloud]]) -> None:
 
 def _draw_cloud(axis: Any, caption: str, cloud: PointCloud) -> None:
     """Draw an oblique orthographic view, far points first."""
-    axis.set_title(f"{caption}: {cloud.num_points:,} points", fontsize=10)
+    axis.set_title(f"{label_text(caption)}: {cloud.num_points:,} points", fontsize=10)
     axis.set_axis_off()
     stride = max(1, cloud.num_points // _MAX_DRAWN)
     points = cloud.points[::stride].cpu().double()

@@ -13,6 +13,7 @@ from pcdata.files import replacing
 from pcdata.functional import rigid
 from pcdata.functional.depth import deproject_depth
 from pcdata.functional.ragged import cloud_of_rows
+from pcdata.report.labels import label_text
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import OverlapResult
 
@@ -50,9 +51,11 @@ def save_overlap_figure(
 
     figure = Figure(figsize=(12, 8), dpi=80, layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{title + ': ' if title else ''}overlap {result.verdict}", fontsize=14, fontweight="bold")
+    figure.suptitle(
+        f"{label_text(title) + ': ' if title else ''}overlap {result.verdict}", fontsize=14, fontweight="bold"
+    )
     (above, side), (cut, gaps) = figure.subplots(2, 2)
-    names = [camera.name for camera in result.cameras]
+    names = [label_text(camera.name) for camera in result.cameras]
     _draw(above, points, view, (0, 1), "from above", names)
     _draw(side, points, view, (0, 2), "from the side", names)
     thin = ((points[:, 1] - center[1]).abs() < _SLICE / 2) & ((points[:, 0] - center[0]).abs() < _REACH / 3)
@@ -98,16 +101,18 @@ def _draw_gaps(axis: Any, result: OverlapResult) -> None:
         if pair.num_samples:
             share = np.array(pair.histogram) / pair.num_samples
             line = "-" if pair.verdict == "pass" else "--"
-            axis.stairs(share, edges, label=f"{pair.first} - {pair.second}: {1e3 * pair.median:.1f} mm", linestyle=line)
+            label = label_text(f"{pair.first} - {pair.second}: {1e3 * pair.median:.1f} mm")
+            axis.stairs(share, edges, label=label, linestyle=line)
     axis.axvspan(-1e3 * result.limits.residual[0], 1e3 * result.limits.residual[0], color="#3ca951", alpha=0.12)
     axis.set_xlabel("mm, positive: the first lies in front")
     axis.set_yticks([])
     axis.legend(loc="upper right", fontsize=7)
     for row, camera in enumerate(result.cameras):
+        moved = f"{1e3 * camera.shift:.1f} mm, {camera.rotation_degrees:.2f} degrees"
         axis.text(
             0.01,
             0.97 - 0.06 * row,
-            f"{camera.name}: {1e3 * camera.shift:.1f} mm, {camera.rotation_degrees:.2f} degrees, {camera.verdict}",
+            f"{label_text(camera.name)}: {moved}, {camera.verdict}",
             transform=axis.transAxes,
             va="top",
             fontsize=8,
