@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from itertools import permutations
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from pcdata.functional.tsdf.grid import unpack_keys
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, TSDFVolume
 from tests.factories import tabletop_frame
+from tests.warm import run_python
 
 VOXEL = 1 / 64  # metres; binary, so that moving by whole voxels rounds nothing
 CAMERA = Camera.pinhole(fx=40.0, fy=41.0, cx=15.6, cy=11.3, size=(24, 32))
@@ -171,6 +170,7 @@ import json, torch
 from fusion_memory import Growth
 from pcdata.errors import VolumeTooLargeError
 from pcdata.structures import Camera, DepthFrame, TSDFVolume
+from tests.warm import run_python
 
 torch.set_num_threads(2)
 size = 480, 640
@@ -200,7 +200,7 @@ print(json.dumps({"refused": refused, "estimate": estimate, "grown": growth.peak
 def test_the_estimate_is_within_a_fifth_of_what_the_process_grows_by():
     root = Path(__file__).parents[2]
     script = f"import sys; sys.path[:0] = [{str(root)!r}, {str(root / 'benchmarks')!r}]\n{MEMORY}"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    done = run_python(script)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["estimate"] > 100 << 20

@@ -20,6 +20,7 @@ from pcdata.io.hdf5_arrays import fletcher32
 from pcdata.io.stored_arrays import stored_arrays
 from pcdata.io.stores import STORES
 from tests.io.forged import dataset, foreign, foreign_refused, refused, stored
+from tests.warm import run_python
 
 # -- HDF5 ----------------------------------------------------------------------------------------------------------
 
@@ -204,7 +205,7 @@ def test_the_advice_for_file_systems_without_locks_opens_the_file(tmp_path):
     path = dataset(tmp_path, "hdf5")
     read = f"from pcdata import CachedCloudDataset; print(CachedCloudDataset({str(tmp_path)!r})[0].num_points)"
     with h5py.File(path, "r+"):  # holds the lock, as a file system without locks would refuse it
-        told = subprocess.run([sys.executable, "-c", read], capture_output=True, text=True, check=False)
+        told = run_python(read)
         assert "is in use" in told.stderr
         without = {**os.environ, "HDF5_USE_FILE_LOCKING": "FALSE"}
         told = subprocess.run([sys.executable, "-c", read], capture_output=True, text=True, check=False, env=without)

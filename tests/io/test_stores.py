@@ -9,8 +9,6 @@ import os
 import pickle
 import resource
 import struct
-import subprocess
-import sys
 import time
 import zipfile
 from collections import OrderedDict
@@ -28,6 +26,7 @@ from pcdata.errors import CacheError
 from pcdata.io.record import Record, cloud_from_record, record_from_cloud
 from pcdata.io.stores import COMPRESSIONS, INFO, STORES
 from tests.io.memory import memory_limit
+from tests.warm import run_python
 
 KINDS = [(form, compression) for form, known in COMPRESSIONS.items() for compression in known]
 FORMATS = list(STORES)
@@ -312,6 +311,7 @@ import resource, numpy as np
 from pcdata.errors import CacheError
 from pcdata.io.record import Record
 from pcdata.io.stores import Hdf5Store
+from tests.warm import run_python
 store = Hdf5Store({str(tmp_path)!r})
 if {disk_is_full}:
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
@@ -322,8 +322,7 @@ except CacheError as error:
     kept = error
     print(error)
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    done = run_python(code)
     assert done.returncode == 0, (done.returncode, done.stderr)
     assert done.stdout.count("cannot be written") == disk_is_full
 

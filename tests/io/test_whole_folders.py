@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-import signal
-import subprocess
-import sys
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -15,27 +14,28 @@ from pcdata.io.whole_folders import complete_or_nothing, scratch_beside
 
 pytest.importorskip("fcntl")
 
-WRITER = """
-import sys, time
-from pathlib import Path
-from pcdata.io.whole_folders import scratch_beside
-with scratch_beside(Path(sys.argv[1])) as scratch:
-    (scratch / "half").write_text("written")
-    print("ready", flush=True)
-    time.sleep(60)
-"""
+
+def hold_half(target: Path, ready: Connection) -> None:
+    """Be in the middle of writing until killed."""
+    with scratch_beside(target) as scratch:
+        (scratch / "half").write_text("written")
+        ready.send("ready")
+        time.sleep(60)
 
 
 @pytest.fixture
 def writer(tmp_path):
     """A process that is in the middle of writing ``out``."""
-    process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "out")], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
+    context = multiprocessing.get_context("fork")
+    ready, told = context.Pipe()
+    process = context.Process(target=hold_half, args=(tmp_path / "out", told))
+    process.start()
+    assert ready.recv() == "ready"
     yield process
     process.kill()
-    process.wait()
-    process.stdout.close()
+    process.join()
+    ready.close()
+    told.close()
 
 
 def scratches(folder: Path) -> list[Path]:
@@ -48,8 +48,8 @@ def age(folder: Path, seconds: float) -> None:
 
 
 def test_what_a_killed_writer_left_is_removed_by_the_next_one(tmp_path, writer):
-    writer.send_signal(signal.SIGKILL)
-    writer.wait()
+    writer.kill()
+    writer.join()
     assert len(scratches(tmp_path)) == 1
     age(tmp_path, 3600)
     with complete_or_nothing(tmp_path / "out") as partial:
