@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
 
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.synthetic import SyntheticSource
+
+# Workers that are forked from a server get their dataset pickled, as spawned ones do; only the server loads torch.
+multiprocessing.set_forkserver_preload(["torch", "pcdata", "pcdata.build", "h5py"])
 
 PIPELINE = """
 depth: [MaskDepth: {near: 0.1, far: 3.0}, Deproject]
