@@ -14,13 +14,13 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tokenize import TokenError
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, WriteError, write_fault
+from pcdata.array_files.npy import PREFIX, header_length, parse_header
+from pcdata.errors import CacheError, CaptureError, PcdataError, WriteError, write_fault
 from pcdata.inputs import note_input
 from pcdata.interrupts import shielded
 from pcdata.part_files import part_file
@@ -160,36 +160,21 @@ def map_npy(
     """
     with open_input(where, path, max_bytes=max_bytes, inside=inside, error=error) as stream:
         try:
-            shape, by_columns, dtype = _npy_header(stream)
-            start, size = stream.tell(), os.fstat(stream.fileno()).st_size
-            claimed = dtype.itemsize
-            for length in shape:
-                claimed *= length
-            if claimed != size - start:
-                raise ValueError(f"its header claims {shape} of {dtype}, {claimed} bytes, but it holds {size - start}")
-            if not claimed:
-                return np.empty(shape, dtype)
-            content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-            return np.ndarray(shape, dtype, content, start, order="F" if by_columns else "C")
-        except (
-            OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError, RecursionError,
-            TokenError, KeyError, IndexError, AttributeError,
-        ) as cause:  # fmt: skip  # NumPy parses the header as Python source text
+            start = stream.read(PREFIX)
+            start += stream.read(header_length(start) - len(start))
+            header = parse_header(start, os.fstat(stream.fileno()).st_size)
+            if header.dtype.kind not in "biufc":
+                raise CacheError(f"it must hold plain numbers, got {header.dtype}")
+        except CacheError as cause:
             raise error(f"{where}: {path}: not a readable .npy file of numbers: {cause}") from cause
-
-
-def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):  # 3.0 is for names beyond Latin-1, which plain numbers do not have
-        raise ValueError(f"version {version} is not for arrays of plain numbers")
-    # A header has two bytes of length in version 1 and four in version 2: 10,000 characters are enough, says NumPy too.
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_columns, dtype = read(stream)
-    if dtype.hasobject or dtype.kind not in "biufc":
-        raise ValueError(f"must hold plain numbers, got {dtype}; Python objects are never unpickled")
-    if any(isinstance(length, bool) or not 0 <= length < 1 << 62 for length in shape) or len(shape) > 32:
-        raise ValueError(f"no array has the shape {shape!s:.200}")
-    return shape, by_columns, dtype
+        if not header.nbytes:
+            return np.empty(header.shape, header.dtype)
+        order: Literal["C", "F"] = "F" if header.by_columns else "C"
+        try:
+            content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            return np.ndarray(header.shape, header.dtype, content, header.begin, order=order)
+        except (OSError, ValueError, TypeError) as cause:  # it has become shorter, or its file system maps none
+            raise error(f"{where}: {path}: cannot be read: {cause}") from cause
 
 
 def check_inside(
