@@ -172,7 +172,7 @@ def test_objects_and_structures_are_never_read(tmp_path):
     np.save(tmp_path / "s.npy", np.zeros(3, dtype=[("a", "f4")]))
     np.save(tmp_path / "t.npy", np.array(["text"]))
     for name in ("o", "s", "t"):
-        with pytest.raises(CaptureError, match="plain numbers|never unpickled"):
+        with pytest.raises(CaptureError, match=r"plain numbers|never unpickled"):
             files.map_npy("here", tmp_path / f"{name}.npy", max_bytes=1 << 20)
 
 
