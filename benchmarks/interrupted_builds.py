@@ -117,29 +117,35 @@ def main() -> None:
     parser.add_argument("--signals", type=int, default=1, help="bursts of each signal, of each command")
     parser.add_argument("--only", default="", help="commands whose name holds this")
     arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         server = Server(work)
         try:
             prepare(server, work)
-            chosen = [case for case in cases(work) if arguments.only in case.name]
-            rows = [row for case in chosen for row in trials(server, case, work, arguments)]
+            for case in cases(work):
+                if arguments.only in case.name:
+                    rows += trials(server, case, work, arguments)
+                    result = summary(rows, arguments.seed)
+                    if not arguments.only:  # after every command: a run takes minutes
+                        (RESULTS / "interrupted_builds.json").write_text(json.dumps(result, indent=1) + "\n")
         finally:
             server.close()
-    faults = [row for row in rows if row["faults"]]
+    print(json.dumps({key: value for key, value in result.items() if key != "left"}, indent=1))
+    sys.exit(bool(result["faults"]))
+
+
+def summary(rows: list[dict[str, Any]], seed: int) -> dict[str, Any]:
+    """Count what became of the commands so far."""
     counts = Counter((row["case"], row["signal"], row["left"]) for row in rows)
-    result = {
-        "seed": arguments.seed,
+    return {
+        "seed": seed,
         "kills": sum(row["signal"] == "SIGKILL" for row in rows),
         "bursts": sum(row["signal"] != "SIGKILL" for row in rows),
         "stopped": sum(row["stopped"] for row in rows),  # the others had ended before
-        "faults": faults,
+        "faults": [row for row in rows if row["faults"]],
         "left": [{"case": a, "signal": b, "left": c, "count": n} for (a, b, c), n in sorted(counts.items())],
     }
-    if not arguments.only:
-        (RESULTS / "interrupted_builds.json").write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps({key: value for key, value in result.items() if key != "left"}, indent=1))
-    sys.exit(bool(faults))
 
 
 def trials(server: Server, case: Case, work: Path, arguments: argparse.Namespace) -> list[dict[str, Any]]:

@@ -317,7 +317,7 @@ def test_the_signal_handler_before_the_call_is_the_one_after_it(capsys, captures
     def mine(number: int, frame: object) -> None:
         pass
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         before = signal.signal(number, mine)
         try:
             main(["inspect", str(captures.parent / path)])
@@ -337,7 +337,7 @@ def test_ctrl_c_is_exit_130_in_words(capsys, captures, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_that_arrives_inside_a_destructor_is_not_lost(config, captures, tmp_path, monkeypatch, number):
     class Dropped:
         def __del__(self) -> None:
@@ -357,7 +357,7 @@ def test_a_signal_that_arrives_inside_a_destructor_is_not_lost(config, captures,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_killed_build_leaves_nothing(config, tmp_path, number):
     many = tmp_path / "many"
     many.mkdir()
