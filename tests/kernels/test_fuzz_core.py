@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(w
 
 # Compared in ways of their own: a direction may be free, a fit may add in another order.
 OWN_CHECKS = {"estimate_normals", "ransac_plane"}
-CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "40"))
+CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
 
 
 @pytest.fixture(params=native.INSTRUCTION_SETS)
