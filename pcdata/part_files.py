@@ -39,7 +39,8 @@ def part_file(target: Path) -> Iterator[Path]:
         yield part
     finally:
         with shielded():
-            if part is not None:
+            # Once it has been renamed, another writer may have a file of that name.
+            if part is not None and (descriptor is None or _is_same(descriptor, part)):
                 with suppress(OSError):
                     part.unlink(missing_ok=True)
             if descriptor is not None:

@@ -48,10 +48,8 @@ print(json.dumps(sorted(set(sys.modules) - before)))
     assert not packages & set(HEAVY)
 
 
-def test_transforms_are_imported_in_a_blink(tmp_path, monkeypatch):
-    # Compiling to bytecode is not what is measured: it happens once, and some machines never keep it.
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
-    monkeypatch.setenv("PYTHONPYCACHEPREFIX", str(tmp_path))
+def test_transforms_are_imported_in_a_blink():
+    # Compiling to bytecode is not what is measured: the first process does it, conftest.py lets it keep what it made.
     code = """
 import time
 start = time.process_time()
@@ -61,7 +59,9 @@ import pcdata, pcdata.transforms
 print(loaded - start, time.process_time() - loaded)
 """
     # Beside torch, which has to come first: a slow or busy machine is slow for both. One quick import is proof enough.
-    times = [tuple(map(float, in_a_new_process(code).split())) for _ in range(4)]
+    times = []
+    while len(times) < 4 and not any(ours < torchs / 5 for torchs, ours in times):
+        times.append(tuple(map(float, in_a_new_process(code).split())))
     assert any(ours < torchs / 5 for torchs, ours in times), times
 
 

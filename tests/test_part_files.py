@@ -7,12 +7,13 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import pytest
 
 from pcdata.errors import CaptureError
 from pcdata.files import replacing
-from pcdata.part_files import part_name
+from pcdata.part_files import part_file, part_name
 
 KILLED = """
 import os, signal, sys
@@ -117,3 +118,12 @@ def test_what_is_no_file_is_not_replaced(tmp_path, make, words):
     assert str(tmp_path / "out") in str(caught.value)
     assert os.path.samestat(os.lstat(tmp_path / "out"), before)
     assert names(tmp_path) == ["out"]
+
+
+def test_a_writer_that_ends_leaves_the_file_of_the_next_one_alone(tmp_path):
+    with ExitStack() as later, ExitStack() as first:
+        os.replace(first.enter_context(part_file(tmp_path / "a.json")), tmp_path / "a.json")
+        part = later.enter_context(part_file(tmp_path / "a.json"))  # the name is free again
+        first.close()
+        assert part.exists()
+    assert names(tmp_path) == ["a.json"]

@@ -166,7 +166,7 @@ def key_of(sample_id: str) -> str:
     Raises:
         CacheError: the id is empty, or no text in one line.
     """
-    if not isinstance(sample_id, str) or not sample_id or len(sample_id.splitlines()) > 1:
+    if not isinstance(sample_id, str) or sample_id.splitlines() != [sample_id]:
         raise CacheError(f"a sample id must be a text in one line that is not empty, got {sample_id!r:.100}")
     # surrogatepass: file names that are not UTF-8 reach Python as lone surrogates.
     key = quote(sample_id, safe="", errors="surrogatepass").replace("~", "%7E")
