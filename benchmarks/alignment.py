@@ -1,6 +1,6 @@
 """From how far away two clouds find each other, beside point-to-plane ICP of small_gicp (and Open3D) on the same input.
 
-    PCDATA_TEST_DATA=... python benchmarks/alignment.py        # prints a table, writes results/alignment.json
+    PCDATA_TEST_DATA=... python benchmarks/alignment.py        # prints a table, writes results/ and docs/
 
 Surfaces with known truth: two independent samplings of one surface, with noise, the source off by up to 0.3 m and 30
 degrees in random directions. Real pairs: neighbouring frames of the 7-Scenes recording, off as much from their recorded
@@ -34,6 +34,8 @@ from pcdata.report import text_table
 from pcdata.structures import DepthFrame
 
 RESULT = Path(__file__).parent / "results" / "alignment.json"
+PAGE = Path(__file__).parents[1] / "docs" / "multi_view.md"
+MARKS = ("<!-- alignment table: made by benchmarks/alignment.py -->", "<!-- end of alignment table -->")
 MAX_SHIFT, MAX_DEGREES = 0.3, 30.0
 FIRST_DISTANCE = 0.4  # metres: wider than the largest offset
 SCHEDULE = (0.4, 0.2, 0.1, 0.05, 0.02)
@@ -248,13 +250,32 @@ def compare(
     return row
 
 
+def write_page(rows: list[dict[str, Any]]) -> None:
+    """Put the table into the page, between its marks."""
+    peers = [name for name in rows[0]["cpu_seconds"] if name != "pcdata"]
+    head = ["clouds", "starts", "pcdata", *peers, "wrong, but called converged", "CPU seconds: pcdata", *peers]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for row in rows:
+        seconds = row["cpu_seconds"]
+        cells = [row["clouds"], row["starts"], row["pcdata"], *(row[peer] for peer in peers)]
+        cells += [row["wrong_but_converged"], seconds["pcdata"], *(seconds[peer] for peer in peers)]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    text = PAGE.read_text(encoding="utf-8")
+    before, rest = text.split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    PAGE.write_text("\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]), encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--starts", type=int, default=200, help="per surface; a quarter of them per real pair")
     parser.add_argument("--points", type=int, default=2500, help="of the source; the target has twice as many")
     parser.add_argument("--pairs", type=int, nargs="*", default=(0, 8, 16, 24), help="first frames of real pairs")
     parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--kept", action="store_true", help="measure nothing; write the page from the kept results")
     arguments = parser.parse_args()
+    if arguments.kept:
+        return write_page(json.loads(arguments.out.read_text())["rows"])
     seeds = range(arguments.starts)
     rows = [compare(name, synthetic(name, arguments.points), seeds) for name in SURFACES]
     if "PCDATA_TEST_DATA" in os.environ:
@@ -275,6 +296,8 @@ def main() -> None:
     arguments.out.parent.mkdir(exist_ok=True)
     arguments.out.write_text(json.dumps(text, indent=1) + "\n", encoding="utf-8")
     print(f"\nwritten to {arguments.out}")
+    if arguments.out == RESULT:
+        write_page(rows)
 
 
 if __name__ == "__main__":
