@@ -11,9 +11,10 @@ from typing import Any
 from pcdata.errors import CacheError
 from pcdata.files import read_bytes, replacing
 from pcdata.io.record import parse_info
+from pcdata.io.whole_folders import EXPORT
 
 _MAX_BYTES = 1 << 28  # about a million samples
-FILE_NAME = "pcdata_export.json"
+FILE_NAME = EXPORT
 SCHEMA = "pcdata.export/1"
 
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}

@@ -16,9 +16,10 @@ from pcdata.files import read_bytes
 from pcdata.io.record import parse_info
 from pcdata.io.scratch import retired_of
 from pcdata.io.stores import COMPRESSIONS, STORES, Compression, Format
+from pcdata.io.whole_folders import DATASET
 
 SCHEMA = "pcdata.dataset/1"
-FILE_NAME = "dataset.json"
+FILE_NAME = DATASET
 
 _CHECKSUM = "checksum"
 _MAX_BYTES = 256 * 2**20  # about a million samples

@@ -102,7 +102,7 @@ def test_progress_is_told_after_every_sample(tmp_path, source, configure):
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_any_sample_id_can_be_stored(tmp_path, configure, form):
-    ids = ["a/b/c", "../up", "..", ".hidden", "with space", "ünïcode-点", "x" * 300, "%2F", "a.b.c", "~", "new\nline"]
+    ids = ["a/b/c", "../up", "..", ".hidden", "with space", "ünïcode-点", "x" * 300, "%2F", "a.b.c", "~"]
     build_dataset(configure(f"output: {{format: {form}}}"), Clouds({name: cloud() for name in ids}), tmp_path / "out")
     dataset = CachedCloudDataset(tmp_path / "out", augment=None)
     assert dataset.ids == ids
