@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, PcdataWarning
 from pcdata.files import read_bytes
 from pcdata.io.record import parse_info
 from pcdata.io.scratch import retired_of
@@ -88,12 +89,7 @@ class Manifest:
                 listed["imports"] = tuple(content["imports"])
             manifest = cls(**{**content, **listed})
             _check(manifest)
-            if found is None:
-                raise CacheError(
-                    "has no checksum, which every build writes, so it was made or changed by other means and may not "
-                    "fit its clouds; copy it again from where the dataset was built, or rebuild the dataset"
-                )
-            if found != checksum_of(content):
+            if found is not None and found != checksum_of(content):
                 raise CacheError(
                     "was changed after it was written: its checksum does not fit its contents; copy it again from "
                     "where the dataset was built, or rebuild the dataset"
@@ -103,6 +99,13 @@ class Manifest:
         except (TypeError, ValueError, KeyError, OverflowError, RecursionError, MemoryError) as error:
             kind = type(error).__name__
             raise CacheError(f"{path}: cannot be read ({kind}: {error!s:.500}); rebuild the dataset") from error
+        if found is None:
+            warnings.warn(
+                f"{path}: has no checksum, which every build writes, so it was made or changed by other means, and "
+                "edits cannot be told; rebuild the dataset to have one",
+                PcdataWarning,
+                stacklevel=2,
+            )
         return manifest
 
 
