@@ -184,3 +184,12 @@ def test_reading_a_small_file_takes_little_memory_whatever_its_kind_may_hold(tmp
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 65535])
+def test_a_npy_header_of_an_impossible_length_is_told(tmp_path, length):
+    content = bytearray((np.save(tmp_path / "a.npy", np.zeros(3)), (tmp_path / "a.npy").read_bytes())[1])
+    content[8:10] = length.to_bytes(2, "little")
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(CaptureError, match=r"not a readable \.npy"):
+        files.map_npy("here", tmp_path / "a.npy", max_bytes=1 << 20)

@@ -71,8 +71,8 @@ def header_length(start: bytes) -> int:
         raise CacheError(f"it has npy version {version[0]}.{version[1]}; 1.0 to 3.0 are known")
     wide = version != (1, 0)
     length: int = 12 + struct.unpack_from("<I", start, 8)[0] if wide else 10 + struct.unpack_from("<H", start, 8)[0]
-    if length > MAX_HEADER:
-        raise CacheError(f"its header claims {length} bytes, more than {MAX_HEADER}")
+    if not PREFIX <= length <= MAX_HEADER:
+        raise CacheError(f"its header claims {length} bytes; there are {PREFIX} to {MAX_HEADER}")
     return length
 
 
