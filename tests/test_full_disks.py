@@ -18,7 +18,7 @@ from pcdata.io.confidence import write_confidence
 from pcdata.io.raw import write_capture
 from pcdata.report.figure import save_pipeline_figure
 from pcdata.structures import TSDFVolume
-from tests.build.test_full_disks import largest_file
+from tests.disk_limits import largest_file
 from tests.exports.samples import Samples, cloud, frame, tree
 
 VIEW = frame((24, 32))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
-from contextlib import contextmanager
 
 import pytest
 import torch
@@ -16,25 +14,16 @@ from pcdata.build import build_dataset
 from pcdata.errors import CacheError
 from pcdata.io.ply import write_ply
 from tests.build.test_builder import FORMATS, Clouds, tree
+from tests.disk_limits import largest_file
 
 CHILD = """
-import resource, sys
+import sys
 from pcdata.cli import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+from tests.disk_limits import limit_files
+limit_files(int(sys.argv[1]))
 sys.argv = ["pcdata", *sys.argv[2:]]
 sys.exit(main())
 """
-
-
-@contextmanager
-def largest_file(size: int):
-    """Let every file end at a size, as a full disk would end it; Python ignores the signal, so writing fails."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def clouds(count: int) -> Clouds:

@@ -6,7 +6,7 @@ import pytest
 
 from pcdata.errors import CacheError
 from pcdata.exports import export_dataset
-from tests.build.test_full_disks import largest_file
+from tests.disk_limits import largest_file
 from tests.exports.samples import Samples, cloud, frame, shape, tree
 
 TABLE = {name: {"class": "mug"} for name in "abc"}

@@ -7,7 +7,6 @@ import io
 import json
 import os
 import pickle
-import resource
 import struct
 import time
 import zipfile
@@ -25,6 +24,7 @@ from pcdata import PointCloud
 from pcdata.errors import CacheError
 from pcdata.io.record import Record, cloud_from_record, record_from_cloud
 from pcdata.io.stores import COMPRESSIONS, INFO, STORES
+from tests.disk_limits import largest_file
 from tests.io.memory import memory_limit
 from tests.warm import run_python
 
@@ -294,27 +294,22 @@ def test_a_folder_that_cannot_be_written_to_is_a_cache_error(tmp_path, form):
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_full_disk_is_a_cache_error_that_names_the_file(tmp_path, form):
     big = PointCloud(points=torch.rand(100_000, 3), frame_id="base")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))  # Python ignores SIGXFSZ: writing fails instead
-    try:
-        with pytest.raises(CacheError, match="cannot be written") as caught:
-            write(tmp_path, big, form)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with largest_file(200_000), pytest.raises(CacheError, match="cannot be written") as caught:
+        write(tmp_path, big, form)
     assert str(STORES[form](tmp_path).path_of("a")) in str(caught.value)
 
 
 @pytest.mark.parametrize("disk_is_full", [True, False])
 def test_an_hdf5_store_that_is_left_open_lets_the_process_end(tmp_path, disk_is_full):
     code = f"""
-import resource, numpy as np
+import numpy as np
 from pcdata.errors import CacheError
 from pcdata.io.record import Record
 from pcdata.io.stores import Hdf5Store
-from tests.warm import run_python
+from tests.disk_limits import limit_files
 store = Hdf5Store({str(tmp_path)!r})
 if {disk_is_full}:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    limit_files(200_000)
 try:
     store.write("a", Record({{"points": np.zeros((100_000, 3), np.float32)}}, {{"frame_id": "base", "unit": "m"}}))
     print("written")
