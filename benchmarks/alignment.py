@@ -27,8 +27,9 @@ from torch import Tensor
 
 import pcdata
 from pcdata import functional as F
-from pcdata.functional import rigid
-from pcdata.functional.small_motions import motion_from_twist, twist_from_motion
+from pcdata.alignment import icp_point_to_plane
+from pcdata.functional.rows import transform_points
+from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
 from pcdata.io import open_source
 from pcdata.report import text_table
 from pcdata.structures import DepthFrame
@@ -127,7 +128,7 @@ def real(first: int) -> Clouds:
         assert isinstance(frame, DepthFrame)
         assert frame.world_from_camera is not None
         points, ptr, _ = F.deproject_depth(frame.depth, frame.camera.intrinsics)
-        points = rigid.transform_points(points, ptr, frame.world_from_camera)
+        points = transform_points(points, ptr, frame.world_from_camera)
         clouds.append(F.voxel_downsample(points, ptr, voxel_size=0.04)[0])
     return with_normals(*clouds, radius=0.12)
 
@@ -143,7 +144,7 @@ def start_of(seed: int, middle: Tensor, reach: float = 1.0) -> Tensor:
 
 def by_pcdata(clouds: Clouds, start: Tensor) -> Found:
     source, source_normals, target, target_normals = clouds
-    found = F.icp_point_to_plane(
+    found = icp_point_to_plane(
         source,
         target,
         source_normals=source_normals,

@@ -27,7 +27,7 @@ import torch
 
 import pcdata
 from pcdata import functional as F
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.report import text_table
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import tabletop

@@ -26,12 +26,12 @@ import torch
 from faults import DIRECTIONS, FAULTS, FILE_FAULTS, Captures, Recording, real, store, synthetic
 
 from pcdata.errors import PcdataError, UnitError
-from pcdata.functional import edge_votes, offset_from_votes
 from pcdata.io import open_source
 from pcdata.report import text_table
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
 from pcdata.validation import Check, Verdict, check_of_error, validate_frame, validate_source
+from pcdata.validation.measures import edge_votes, offset_from_votes
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "fault_injection.json"

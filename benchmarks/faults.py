@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.io import open_source, read_depth, read_pcd, write_color, write_depth, write_pose
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
-from pcdata.functional.depth import deproject_depth
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.neighbors import knn
+from pcdata.functional.rows import transform_points
 from pcdata.structures import DepthFrame, PointCloud, TSDFVolume
 from pcdata.synthetic import Tabletop, tabletop
 from pcdata.transforms import MaskDepth
@@ -81,7 +81,7 @@ def visible_surface(scene: Tabletop) -> Tensor:
     """(N, 3): the true surface at every pixel of every view."""
     truth = scene.truth
     points, ptr, _ = deproject_depth(truth.depth.float(), truth.camera.intrinsics)
-    return rigid.transform_points(points, ptr, truth.world_from_camera)
+    return transform_points(points, ptr, truth.world_from_camera)
 
 
 def workspace_rate() -> dict[str, Any]:

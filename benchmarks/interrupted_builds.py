@@ -234,7 +234,7 @@ def prepare(server: Server, work: Path) -> None:
     """Write captures, configurations, datasets and side files."""
     import numpy as np
 
-    from pcdata.io.raw import write_capture
+    from pcdata.io.writers.capture import write_capture
     from pcdata.synthetic import SyntheticSource
 
     source = SyntheticSource(num_scenes=NUM_CAPTURES, num_objects=2, num_views=1, size=(60, 80))
@@ -274,7 +274,7 @@ def robot_poses() -> list[dict[str, Any]]:
     """A robot that looks at a board from twelve sides, exact to a tenth of a millimetre."""
     import torch
 
-    from pcdata.functional import rigid
+    from pcdata.geometry import rigid
 
     draw = torch.Generator().manual_seed(0)
 

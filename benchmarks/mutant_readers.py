@@ -68,7 +68,7 @@ def _foreign(pattern: str, *names: str) -> tuple[str, Callable[[Path], Any]]:
 
     def read(folder: Path) -> Any:
         from pcdata.errors import PcdataError
-        from pcdata.io.stored_arrays import stored_arrays
+        from pcdata.io.arrays.stored_arrays import stored_arrays
 
         path = folder / "a.zarr" if "zarr" in pattern else next(folder.glob(pattern))
         for name in names:

@@ -29,8 +29,8 @@ import numpy as np
 import torch
 
 import pcdata
-from pcdata import dispatch
 from pcdata import functional as F
+from pcdata.contracts import dispatch
 from pcdata.report import text_table
 
 RESULTS = Path(__file__).parent / "results"

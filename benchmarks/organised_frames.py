@@ -45,7 +45,7 @@ def check_frame(folder: str, capture: str) -> dict[str, Any]:
     """Run all settings on one capture; return what differs from the reference."""
     import pcdata
     from pcdata import functional as F
-    from pcdata.functional.grid import ImageGrid
+    from pcdata.functional.image_grid import ImageGrid
 
     if Path(capture).is_file():
         depth, intrinsics = read_image(Path(capture))
@@ -62,7 +62,7 @@ def check_cloud(cloud: Any) -> dict[str, Any]:
     """Check a cloud whose rows are the pixels of an image, with a Kinect's camera."""
     import torch
 
-    from pcdata.functional.grid import ImageGrid
+    from pcdata.functional.image_grid import ImageGrid
 
     if "organised_size" not in cloud.meta[0]:
         return {"skipped": "neither a depth frame nor an organised cloud"}
@@ -77,7 +77,7 @@ def compared(points: Any, ptr: Any, grid: Any) -> dict[str, Any]:
     import torch
 
     from pcdata import functional as F
-    from pcdata.functional.grid import ImageGrid
+    from pcdata.functional.image_grid import ImageGrid
 
     if len(points) == 0:
         return {"points": 0, "differences": 0}

@@ -26,18 +26,20 @@ import torch
 
 import pcdata
 from pcdata import functional as F
+from pcdata.alignment import icp_point_to_plane
+from pcdata.alignment.cross_validation import held_out_change
+from pcdata.alignment.view_alignment import align_views
 from pcdata.calibration import refine_extrinsics
 from pcdata.errors import CalibrationError
-from pcdata.functional import rigid
-from pcdata.functional.held_out import held_out_change
-from pcdata.functional.small_motions import twist_from_motion
-from pcdata.functional.view_alignment import align_views
+from pcdata.functional.rows import transform_points
+from pcdata.geometry import rigid
+from pcdata.geometry.small_motions import twist_from_motion
 from pcdata.io import open_source
 from pcdata.report import text_table
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from pcdata.validation import verify_overlap
-from pcdata.validation.surfaces import surfaces_of
+from pcdata.validation.measures.surfaces import surfaces_of
 
 RESULT = Path(__file__).parent / "results" / "overlap.json"
 ERRORS = ((0, 0), (2, 0), (4, 0), (6, 0), (10, 0), (0, 0.25), (0, 0.5), (0, 1.0))  # mm, degrees
@@ -243,7 +245,7 @@ def against_open3d(repeats: int = 3) -> list[dict[str, Any]]:
         for frame in (frames[index + 1], frames[index]):
             points, ptr, _ = F.deproject_depth(frame.depth, frame.camera.intrinsics)
             assert frame.world_from_camera is not None
-            points = rigid.transform_points(points, ptr, frame.world_from_camera)
+            points = transform_points(points, ptr, frame.world_from_camera)
             clouds.append(F.voxel_downsample(points, ptr, voxel_size=0.02)[0])
         source, target = clouds
         normals = F.estimate_normals(target, radius=0.06)
@@ -252,7 +254,7 @@ def against_open3d(repeats: int = 3) -> list[dict[str, Any]]:
         theirs_in[1].normals = open3d.utility.Vector3dVector(normals.double().numpy())
 
         def ours(source: Any = source, target: Any = target, normals: Any = normals, own: Any = own) -> Any:
-            return F.icp_point_to_plane(
+            return icp_point_to_plane(
                 source,
                 target,
                 target_normals=normals,

@@ -28,7 +28,7 @@ import torch
 
 import pcdata
 from pcdata import functional as F
-from pcdata.functional.ragged import ptr_after_mask, ptr_from_counts
+from pcdata.functional.rows import ptr_after_mask, ptr_from_counts
 from pcdata.report import text_table
 
 RESULTS = Path(__file__).parent / "results"

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import PcdataError
-from pcdata.functional.depth_unit import DepthUnit, decoded, encoded
+from pcdata.functional.depth.unit_fit import DepthUnit, decoded, encoded
 from pcdata.io import read_pcd
-from pcdata.io.images import check_plausible
+from pcdata.io.images.reading import check_plausible
 from pcdata.report import text_table
 from pcdata.synthetic import look_at, tabletop
 from pcdata.validation import Limits, Verdict
-from pcdata.validation.depth_unit import depth_unit_check
+from pcdata.validation.checks.depth_unit import depth_unit_check
 
 RESULTS = Path(__file__).parent / "results" / "unit_advice.json"
 UNITS = [

@@ -99,12 +99,14 @@ _HOMES = {
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _SUBMODULES = [
+    "alignment",
     "build",
     "calibration",
     "datasets",
     "errors",
     "exports",
     "functional",
+    "geometry",
     "io",
     "models",
     "report",

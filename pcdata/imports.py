@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import Any
 
 from pcdata.errors import ConfigError, PcdataError
-from pcdata.files import read_bytes
-from pcdata.io.detect import LAYOUTS
+from pcdata.files.opening import read_bytes
+from pcdata.io.sources.detect import LAYOUTS
 from pcdata.transforms.base import REGISTRY
 
 _MAX_BYTES = 1 << 20

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
-from pcdata.functional.ragged import ptr_from_counts
-from pcdata.functional.sensor_noise import facing_depth
+from pcdata.functional.depth.sensor_noise import facing_depth
+from pcdata.functional.rows import ptr_from_counts, transform_points
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, Kind, PointCloud
 from pcdata.synthetic import tabletop
@@ -56,7 +56,7 @@ def cloud_in_camera(counts: Sequence[int] = (120, 90, 150), *, seed: int = 0) ->
     generator = seeded(seed + 100)
     normals = torch.nn.functional.normalize(torch.randn(total, 3, generator=generator), dim=1)
     pose = base_from_camera(len(counts), seed=seed)
-    points = rigid.transform_points(in_base, ptr, rigid.invert_rigid(pose))
+    points = transform_points(in_base, ptr, rigid.invert_rigid(pose))
     row = torch.arange(total)
     return PointCloud(
         points=points,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pcdata.checks import check_ptr_values, check_tensors, parse_spec
+from pcdata.contracts.tensors import check_ptr_values, check_tensors, parse_spec
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
 
 SPECS = {"points": "N 3", "labels": "N : int64", "image": "V H W : uint8", "matrix": "B 4 4 : float", "ptr": "ptr N B"}

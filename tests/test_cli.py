@@ -27,7 +27,7 @@ import pcdata
 from pcdata import CachedCloudDataset, PointCloud
 from pcdata.cli import main
 from pcdata.io import write_ply
-from pcdata.io.cloud_files import CloudFilesSource
+from pcdata.io.sources.cloud_files import CloudFilesSource
 from pcdata.synthetic import SyntheticSource
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -276,7 +276,7 @@ def test_an_error_of_the_system_is_exit_1_without_traceback(capsys, captures, mo
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", "captures")
 
-    monkeypatch.setattr("pcdata.io.selection.open_source", refuse)
+    monkeypatch.setattr("pcdata.io.sources.selection.open_source", refuse)
     code, out, err = run(capsys, "inspect", captures)
     assert (code, out) == (1, "")
     assert "Permission denied" in err
@@ -288,7 +288,7 @@ def test_an_error_of_the_system_is_exit_1_without_traceback(capsys, captures, mo
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="matplotlib is absent")
 def test_the_demo_command_ends_with_dataset_picture_and_table(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr("pcdata.demo.SyntheticSource", functools.partial(SyntheticSource, size=(120, 160)))
+    monkeypatch.setattr("pcdata.cli.demo.SyntheticSource", functools.partial(SyntheticSource, size=(120, 160)))
     code, out, err = run(capsys, "demo", tmp_path / "demo", "--scenes", 2)
     assert code == 0, err
     assert (tmp_path / "demo" / "demo.png").read_bytes().startswith(b"\x89PNG")
@@ -330,7 +330,7 @@ def test_ctrl_c_is_exit_130_in_words(capsys, captures, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pcdata.io.selection.open_source", interrupt)
+    monkeypatch.setattr("pcdata.io.sources.selection.open_source", interrupt)
     code, _, err = run(capsys, "inspect", captures)
     assert code == 130
     assert "interrupted" in err

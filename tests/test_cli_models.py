@@ -21,9 +21,9 @@ from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import export_dataset
 from pcdata.exports.registry import TARGETS
 from pcdata.io import CaptureCamera, open_selected, write_capture_camera, write_color, write_depth, write_pose
-from pcdata.io.detect import LAYOUTS, open_source
-from pcdata.io.manifest import FILE_NAME, Manifest, checksum_of
-from pcdata.io.stores import STORES
+from pcdata.io.sources.detect import LAYOUTS, open_source
+from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
+from pcdata.io.store.stores import STORES
 from pcdata.models import CONTRACTS, check, check_files, contract, preset
 from pcdata.models.catalogue import CHOICES, EXAMPLES
 from pcdata.models.check import require

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pcdata import CachedCloudDataset
-from pcdata.demo import run_demo
+from pcdata.cli.demo import run_demo
 from pcdata.errors import CacheError, MissingExtraError
 from pcdata.synthetic import SyntheticSource
 
@@ -20,7 +20,7 @@ needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:  # a quarter of the width and height: the full size takes a minute
-        patch.setattr("pcdata.demo.SyntheticSource", functools.partial(SyntheticSource, size=(120, 160)))
+        patch.setattr("pcdata.cli.demo.SyntheticSource", functools.partial(SyntheticSource, size=(120, 160)))
         return run_demo(tmp_path_factory.mktemp("demo") / "new" / "folder", num_scenes=2, num_workers=1)
 
 

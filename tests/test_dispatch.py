@@ -7,7 +7,7 @@ import types
 import pytest
 import torch
 
-from pcdata import dispatch
+from pcdata.contracts import dispatch
 from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, ShapeError
 
 
@@ -145,7 +145,7 @@ def test_a_wanted_gradient_is_computed_by_the_reference():
 
 SLOW = """
 import sys, warnings, torch
-from pcdata.kernels import native
+from pcdata.kernels.cpu import native
 def absent():
     raise OSError("there is no core")
 native.library = absent

@@ -10,8 +10,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from pcdata import files
 from pcdata.errors import CacheError, CaptureError
+from pcdata.files.opening import opening as files
 
 DOORS = {
     "open_input": lambda path, **options: files.open_input("here", path, **options).close(),

@@ -12,10 +12,10 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import PcdataError
 from pcdata.io import write_color, write_depth, write_labels, write_mask, write_pcd, write_ply
-from pcdata.io.calibration import Calibration
-from pcdata.io.capture_camera import write_pose
-from pcdata.io.confidence import write_confidence
-from pcdata.io.raw import write_capture
+from pcdata.io.calibration.calibration import Calibration
+from pcdata.io.calibration.capture_camera import write_pose
+from pcdata.io.images.confidence import write_confidence
+from pcdata.io.writers.capture import write_capture
 from pcdata.report.figure import save_pipeline_figure
 from pcdata.structures import TSDFVolume
 from tests.disk_limits import largest_file

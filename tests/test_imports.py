@@ -19,8 +19,8 @@ from pcdata import imports
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError, PcdataWarning
-from pcdata.io.detect import LAYOUTS
-from pcdata.io.manifest import FILE_NAME, Manifest, checksum_of
+from pcdata.io.sources.detect import LAYOUTS
+from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
 from pcdata.synthetic import SyntheticSource
 from pcdata.transforms.base import REGISTRY
 
@@ -40,7 +40,7 @@ class OwnThird(Transform):
 RANDOM = STEP.replace("class OwnThird(Transform):", "class OwnThird(Transform):\n    is_random = True")
 READER = """
 from pcdata import register_layout
-from pcdata.io.folder import FolderSource
+from pcdata.io.sources.folder import FolderSource
 
 @register_layout
 class OwnFolder(FolderSource):

@@ -16,13 +16,13 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"checks", "lengths", "rng", "threads", "extras", "inputs", "interrupts", "locks", "array_files", "strict_json"},
-    {"part_files"},
-    {"files", "dispatch"},
+    {"rng", "threads", "extras", "files"},
+    {"contracts"},
+    {"geometry"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
     {"structures"},
-    {"sensors"},
+    {"alignment", "sensors"},
     {"yaml_nodes"},
     {"io", "transforms", "synthetic"},
     {"imports"},
@@ -31,32 +31,25 @@ LAYERS = [
     {"build"},  # datasets for a model are built by its preset
     {"exports"},  # holds samples to the contracts of models
     {"report"},
-    {"demo", "cli", "__main__"},
+    {"cli", "__main__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
-# checks raises the errors of the layer before; the thin command line starts the demo.
-ALLOWED_SIBLINGS = {("cli", "demo"), ("__main__", "cli")}
+ALLOWED_SIBLINGS = {("__main__", "cli")}
 
 # What may be imported besides pcdata and the standard library, by package; everywhere else nothing is limited here.
 OUTSIDE = {
     "errors": set(),
     "extras": set(),
-    "array_files": {"numpy"},
     "files": {"numpy"},
-    "inputs": set(),
-    "interrupts": set(),
-    "strict_json": set(),
-    "locks": set(),
-    "part_files": set(),
-    "yaml_nodes": {"yaml"},
-    "checks": {"torch", "numpy"},
-    "lengths": {"numpy"},
     "rng": {"torch", "numpy"},
     "threads": {"torch"},
-    "dispatch": {"torch", "numpy", "typing_extensions"},
+    "contracts": {"torch", "numpy", "typing_extensions"},
+    "geometry": {"torch", "numpy"},
     "functional": {"torch", "numpy"},
     "kernels": {"torch", "numpy"},
     "structures": {"torch", "numpy"},
+    "alignment": {"torch", "numpy"},
+    "yaml_nodes": {"yaml"},
 }
 OUTSIDE_OF_ONE_MODULE = {"kernels/torch_cluster.py": {"torch_cluster"}}
 

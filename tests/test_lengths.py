@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
+from pcdata.contracts.lengths import check_metres, plausible_units, width_of_points
 from pcdata.errors import UnitError
-from pcdata.lengths import check_metres, plausible_units, width_of_points
 
 # Longest sides in metres of things that cameras and robots see.
 OBJECTS = {"nut": 0.025, "cup": 0.08, "box": 0.15, "bottle": 0.25, "tray": 0.6, "table": 1.8}

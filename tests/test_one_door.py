@@ -1,4 +1,4 @@
-"""Files are read through pcdata.files alone: nothing else opens a path."""
+"""Files are read through pcdata.files.opening alone: nothing else opens a path."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def reads(module: str) -> set[str]:
         if name not in OPENS or (name == "load" and not called.startswith(("np.", "numpy.", "torch."))):
             continue
         if name in ("read_bytes", "read_text") and "." not in called:
-            continue  # those of pcdata.files
+            continue  # those of pcdata.files.opening
         modes = [argument.value for argument in node.args if isinstance(argument, ast.Constant)]
         if any(isinstance(mode, str) and mode[:1] in ("w", "x", "a", "r") and "r" not in mode[:1] for mode in modes):
             continue
@@ -57,7 +57,7 @@ def reads(module: str) -> set[str]:
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_opens_a_file_by_itself(module):
     others = reads(module) - set(ALLOWED.get(module, ()))
-    assert not others, f"{module}: open files through pcdata.files, not with {sorted(others)}"
+    assert not others, f"{module}: open files through pcdata.files.opening, not with {sorted(others)}"
 
 
 def test_what_is_allowed_is_there():

@@ -12,12 +12,12 @@ from contextlib import ExitStack
 import pytest
 
 from pcdata.errors import CaptureError
-from pcdata.files import replacing
-from pcdata.part_files import part_file, part_name
+from pcdata.files.opening import replacing
+from pcdata.files.part_files import part_file, part_name
 
 KILLED = """
 import os, signal, sys
-from pcdata.files import replacing
+from pcdata.files.opening import replacing
 with replacing("killed", sys.argv[1]) as part:
     part.write_text("half of")
     os.kill(os.getpid(), signal.SIGKILL)

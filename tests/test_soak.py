@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 

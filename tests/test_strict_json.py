@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from pcdata import Camera, DepthFrame, PointCloud, TSDFVolume, read_ply, write_ply
-from pcdata.array_files.npz import write_npz
 from pcdata.errors import CacheError, CaptureError, PcdataError
 from pcdata.exports.record import FILE_NAME, ExportRecord
-from pcdata.io.manifest import Manifest
-from pcdata.io.record import Record, cloud_from_record, parse_info, record_from_cloud
-from pcdata.io.stored_arrays import stored_arrays
-from pcdata.strict_json import json_object, parse_json
+from pcdata.files.npz import write_npz
+from pcdata.files.strict_json import json_object, parse_json
+from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.store.manifest import Manifest
+from pcdata.io.store.record import Record, cloud_from_record, parse_info, record_from_cloud
 
 WRONG = {
     "nesting": "[" * 100_000,

@@ -8,7 +8,7 @@ import pytest
 
 from pcdata.build import config_from_yaml
 from pcdata.errors import CalibrationError, ConfigError
-from pcdata.io.calibration_yaml import calibration_from_yaml
+from pcdata.io.calibration.calibration_yaml import calibration_from_yaml
 
 PIPELINE = "depth:\n  - MaskDepth: {{near: 0.2, far: {}}}\n  - Deproject\n"
 

@@ -20,8 +20,8 @@ from pathlib import Path
 SERVER = """
 import json, os, sys
 import torch
-import pcdata.functional, pcdata.build, pcdata.io.stores, pcdata.structures
-from pcdata.kernels import native
+import pcdata.functional, pcdata.build, pcdata.io.store.stores, pcdata.structures
+from pcdata.kernels.cpu import native
 torch.set_num_threads(1)
 answers = os.fdopen(os.dup(1), "w")
 calls = os.fdopen(os.dup(0))

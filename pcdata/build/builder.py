@@ -18,14 +18,14 @@ from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, WriteError, add_note, write_fault
+from pcdata.files.inputs import recording
+from pcdata.files.whole_folders import complete_or_nothing
 from pcdata.imports import imported_files, step_names
-from pcdata.inputs import recording
-from pcdata.io.manifest import Manifest, Sample, key_of
-from pcdata.io.raw import write_capture
-from pcdata.io.record import record_from_cloud
-from pcdata.io.source import REFUSALS, CaptureSource, checked_ids, inputs_of, reason_of, skipped_of
-from pcdata.io.stores import STORES
-from pcdata.io.whole_folders import complete_or_nothing
+from pcdata.io.sources.source import REFUSALS, CaptureSource, checked_ids, inputs_of, reason_of, skipped_of
+from pcdata.io.store.manifest import Manifest, Sample, key_of
+from pcdata.io.store.record import record_from_cloud
+from pcdata.io.store.stores import STORES
+from pcdata.io.writers.capture import write_capture
 from pcdata.structures import DepthFrame, PointCloud
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one

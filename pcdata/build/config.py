@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pcdata.build.model_section import preset_of_section, with_model
 from pcdata.build.source_section import SourceSettings, source_settings
 from pcdata.errors import ConfigError, near_matches
-from pcdata.io.stores import COMPRESSIONS, Compression, Format
+from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
 from pcdata.models import Preset
 from pcdata.transforms.config import read_config
 from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document

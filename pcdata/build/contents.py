@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 from pcdata.errors import CacheError
-from pcdata.io.manifest import FILE_NAME, Manifest
-from pcdata.io.stores import STORES
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.stores import STORES
 
 _TOP = {FILE_NAME, "pipeline.yaml", "load.py"}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.io.averaged import AveragedSource
-from pcdata.io.detect import LAYOUTS
-from pcdata.io.selection import open_selected, read_skip_file
-from pcdata.io.source import Source
-from pcdata.io.temporal import TemporallyFilteredSource
+from pcdata.io.sources.averaged import AveragedSource
+from pcdata.io.sources.detect import LAYOUTS
+from pcdata.io.sources.selection import open_selected, read_skip_file
+from pcdata.io.sources.source import Source
+from pcdata.io.sources.temporal import TemporallyFilteredSource
 from pcdata.yaml_nodes import YamlDocument
 
 _OWN = ("path", "kind", "limit", "skip", "skip_file", "skip_refused", "average", "temporal")

@@ -12,8 +12,8 @@ import numpy as np
 from pcdata.calibration.boards import GreyImage
 from pcdata.errors import CaptureError
 from pcdata.extras import require
-from pcdata.files import read_bytes
-from pcdata.io.listing import absolute, visible_files
+from pcdata.files.opening import read_bytes
+from pcdata.io.sources.listing import absolute, visible_files
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _MAX_BYTES = 1 << 28

@@ -11,7 +11,7 @@ from torch import Tensor
 from pcdata.calibration.boards import BoardView
 from pcdata.errors import CalibrationError
 from pcdata.extras import require
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.structures import Camera
 
 _MIN_CORNERS = 6

@@ -16,7 +16,7 @@ from pcdata.calibration.boards import Board, BoardView, GreyImage
 from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
-from pcdata.io.calibration import Evidence
+from pcdata.io.calibration.calibration import Evidence
 from pcdata.structures import Camera
 
 COEFFICIENT_COUNTS = (0, 4, 5, 8)

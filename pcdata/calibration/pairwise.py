@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from pcdata import extras
-from pcdata.functional import rigid
-from pcdata.functional.depth import deproject_depth
+from pcdata.alignment.pose_graph import PairMotion
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.neighbors import knn
-from pcdata.functional.pose_graph import PairMotion
+from pcdata.functional.rows import transform_points
 from pcdata.functional.voxels import voxel_downsample
+from pcdata.geometry import rigid
 from pcdata.structures import DepthFrame
 
 _VOXEL = 0.006  # metres: finer costs time and gains nothing under 2 mm of noise
@@ -71,7 +72,7 @@ def _clouds_about(capture: DepthFrame, pivot: Tensor) -> list[Tensor]:
     points, ptr, _ = deproject_depth(capture.depth, camera.intrinsics, distortion=camera.distortion)
     shifted = poses.clone()
     shifted[:, :3, 3] -= pivot
-    thin, thin_ptr, _ = voxel_downsample(rigid.transform_points(points, ptr, shifted), ptr, voxel_size=_VOXEL)
+    thin, thin_ptr, _ = voxel_downsample(transform_points(points, ptr, shifted), ptr, voxel_size=_VOXEL)
     bounds = thin_ptr.tolist()
     return [thin[start:stop].cpu() for start, stop in itertools.pairwise(bounds)]
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
 from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.plane_fit import fit_plane
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.planes import ransac_plane
+from pcdata.geometry.plane_fit import fit_plane
 from pcdata.structures import DepthFrame
 
 Along = Literal["axis", "normal"]

@@ -9,17 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.alignment.cross_validation import GapChange, gap_change, held_out_change
+from pcdata.alignment.pose_graph import average_motions
+from pcdata.alignment.view_alignment import PairFit, ViewAlignment, align_views, assess_motions
 from pcdata.calibration.pairwise import pairwise_motions
 from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matches, told_apart
-from pcdata.functional import rigid
-from pcdata.functional.held_out import GapChange, gap_change, held_out_change
-from pcdata.functional.pose_graph import average_motions
-from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views, assess_motions
-from pcdata.io.calibration import Calibration, Evidence, FramePair
+from pcdata.geometry import rigid
+from pcdata.io.calibration.calibration import Calibration, Evidence, FramePair
 from pcdata.structures import DepthFrame
+from pcdata.validation.measures.surfaces import surfaces_of
 from pcdata.validation.overlap import judge_alignment
 from pcdata.validation.overlap_result import OverlapLimits, OverlapResult
-from pcdata.validation.surfaces import surfaces_of
 
 METHODS = ("pcdata", "small_gicp", "open3d")
 

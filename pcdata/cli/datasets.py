@@ -45,7 +45,7 @@ def add_to(commands: Any) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from pcdata.demo import run_demo
+    from pcdata.cli.demo import run_demo
 
     with Progress("demo") as progress:
         result = run_demo(arguments.out, num_scenes=arguments.scenes, progress=progress)
@@ -92,8 +92,8 @@ def _build(arguments: argparse.Namespace) -> None:
 
 
 def _inspect(arguments: argparse.Namespace) -> None:
-    from pcdata.io.listing import absolute
-    from pcdata.io.manifest import FILE_NAME
+    from pcdata.io.sources.listing import absolute
+    from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.inspection import capture_text, dataset_text
 
     if (absolute(arguments.path) / FILE_NAME).is_file():

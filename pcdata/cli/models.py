@@ -32,8 +32,8 @@ def add_to(commands: Any) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from pcdata.exports import is_export
-    from pcdata.files import replacing
-    from pcdata.io.manifest import FILE_NAME
+    from pcdata.files.opening import replacing
+    from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.validation import validation_text
     from pcdata.validation import Verdict
 

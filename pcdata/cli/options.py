@@ -161,7 +161,7 @@ def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
 
 def skip_list(arguments: argparse.Namespace) -> list[str]:
     """Return the ids that the command line leaves out."""
-    from pcdata.io.selection import read_skip_file
+    from pcdata.io.sources.selection import read_skip_file
 
     listed = list(arguments.skip or [])
     return listed + (read_skip_file(arguments.skip_file) if arguments.skip_file else [])
@@ -169,7 +169,7 @@ def skip_list(arguments: argparse.Namespace) -> list[str]:
 
 def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:
     """Open the captures at a path as the options say; captures that are left out are told on stderr."""
-    from pcdata.io.selection import open_selected
+    from pcdata.io.sources.selection import open_selected
 
     source = open_selected(
         path,

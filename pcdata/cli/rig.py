@@ -20,7 +20,7 @@ from pcdata.cli.options import (
 
 if TYPE_CHECKING:
     from pcdata.calibration import Calibration
-    from pcdata.io.rig import RigSource
+    from pcdata.io.sources.rig import RigSource
 
 FAILED = 1  # exit code of a step whose limits do not hold
 
@@ -59,7 +59,7 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
 
 
 def _overlap(arguments: argparse.Namespace) -> int | None:
-    from pcdata.files import replacing
+    from pcdata.files.opening import replacing
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
 
@@ -98,7 +98,7 @@ def _refine(arguments: argparse.Namespace) -> None:
 
 
 def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> RigSource:
-    from pcdata.io.selection import open_selected
+    from pcdata.io.sources.selection import open_selected
 
     options = given_options(arguments)
     options["frame_id"] = arguments.frame or (None if calibration is None else "base")

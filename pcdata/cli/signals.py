@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from pcdata.interrupts import ENDING
+from pcdata.files.interrupts import ENDING
 
 _REPEATED = 1.0  # seconds in which more signals are the same wish; a later one may be for a command that hangs
 

@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
 
 def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.errors import CaptureError, PoseError, UnitError
-    from pcdata.files import replacing
+    from pcdata.files.opening import replacing
     from pcdata.report.validation import validation_text
     from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict, check_of_error, validate_source
 

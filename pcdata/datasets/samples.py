@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from pcdata.contracts.dispatch import warn_if_slow
 from pcdata.datasets.passes import PassWatch, shared
-from pcdata.dispatch import warn_if_slow
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.rng import generator_for

@@ -13,11 +13,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.array_files.npz import write_npz
 from pcdata.exports.checks import object_ids, one_view
 from pcdata.exports.contracts import require_depth
 from pcdata.exports.target import Item, Note, Samples, Target
-from pcdata.io.manifest import key_of
+from pcdata.files.npz import write_npz
+from pcdata.io.store.manifest import key_of
 from pcdata.models import contract
 
 

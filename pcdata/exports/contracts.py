@@ -9,7 +9,7 @@ import torch
 
 from pcdata.errors import ContractError, PcdataError
 from pcdata.exports.target import Target
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.models import ModelBatch, contract, preset, require
 from pcdata.models.preset import batch_of
 from pcdata.structures import DepthFrame, PointCloud

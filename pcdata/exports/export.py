@@ -15,11 +15,11 @@ from pcdata.exports.record import FILE_NAME, ExportRecord, check_only_export, fi
 from pcdata.exports.registry import target_named
 from pcdata.exports.sources import identity_of, open_for
 from pcdata.exports.target import Item, Samples, Target
-from pcdata.inputs import recording
-from pcdata.interrupts import shielded
-from pcdata.io.scratch import scratch_beside
-from pcdata.io.source import CaptureSource, inputs_of
-from pcdata.io.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
+from pcdata.files.inputs import recording
+from pcdata.files.interrupts import shielded
+from pcdata.files.scratch import scratch_beside
+from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
+from pcdata.io.sources.source import CaptureSource, inputs_of
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 

@@ -20,9 +20,9 @@ from pcdata.errors import CaptureError, ConfigError
 from pcdata.exports.checks import check_size, colors_of, one_view
 from pcdata.exports.contracts import require_image
 from pcdata.exports.target import Item, Note, Samples, Target
-from pcdata.files import read_text
-from pcdata.io.image_writing import write_color
-from pcdata.io.manifest import key_of
+from pcdata.files.opening import read_text
+from pcdata.io.images.writing import write_color
+from pcdata.io.store.manifest import key_of
 from pcdata.structures import DepthFrame
 from pcdata.transforms import CompleteDepth, InpaintDepth
 

@@ -20,8 +20,8 @@ from pcdata.errors import CaptureError, add_note
 from pcdata.exports.checks import check_size, colors_of, object_ids, one_view
 from pcdata.exports.contracts import require_depth
 from pcdata.exports.target import Item, Note, Samples, Target
-from pcdata.io.image_writing import write_color, write_depth
-from pcdata.io.manifest import key_of
+from pcdata.io.images.writing import write_color, write_depth
+from pcdata.io.store.manifest import key_of
 from pcdata.structures import DepthFrame
 
 SIZE = (720, 1280)  # (height, width) that the loaders assert

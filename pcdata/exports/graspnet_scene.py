@@ -14,13 +14,13 @@ from typing import Annotated, ClassVar, Literal
 import annotated_types
 import torch
 
-from pcdata.array_files.npy import write_npy
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError
 from pcdata.exports.checks import colors_of
 from pcdata.exports.graspnet import GraspNetImages, meta_bytes
 from pcdata.exports.target import Item, Note, Samples
-from pcdata.functional import rigid
-from pcdata.io.image_writing import write_color
+from pcdata.files.npy import write_npy
+from pcdata.geometry import rigid
+from pcdata.io.images.writing import write_color
 
 _API_FACTOR = 1000  # units per metre, fixed in graspnetAPI's loadScenePointCloud
 

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pcdata.array_files.npy import write_npy
 from pcdata.errors import CaptureError
 from pcdata.exports.checks import check_channels, one_cloud
 from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, read_table
 from pcdata.exports.target import Item, Note, Samples, Target
-from pcdata.io.manifest import key_of
+from pcdata.files.npy import write_npy
+from pcdata.io.store.manifest import key_of
 from pcdata.structures import PointCloud
 
 

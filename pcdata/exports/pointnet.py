@@ -19,8 +19,8 @@ from pcdata.exports.checks import one_cloud
 from pcdata.exports.contracts import require_cloud
 from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
-from pcdata.interrupts import shielded
-from pcdata.io.hdf5_writing import FaultKeepingFile, new_hdf5
+from pcdata.files.interrupts import shielded
+from pcdata.io.arrays.hdf5_writing import FaultKeepingFile, new_hdf5
 from pcdata.structures import PointCloud
 
 NUM_POINTS = 2048

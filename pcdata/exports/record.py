@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CacheError
-from pcdata.files import read_bytes, replacing
-from pcdata.io.record import parse_info
-from pcdata.io.whole_folders import EXPORT
+from pcdata.files.opening import read_bytes, replacing
+from pcdata.files.whole_folders import EXPORT
+from pcdata.io.store.record import parse_info
 
 _MAX_BYTES = 1 << 28  # about a million samples
 FILE_NAME = EXPORT

@@ -9,9 +9,9 @@ from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import ConfigError
 from pcdata.exports.target import Target
 from pcdata.io import open_source
-from pcdata.io.listing import absolute
-from pcdata.io.manifest import FILE_NAME
-from pcdata.io.source import CaptureSource, checked_ids
+from pcdata.io.sources.listing import absolute
+from pcdata.io.sources.source import CaptureSource, checked_ids
+from pcdata.io.store.manifest import FILE_NAME
 from pcdata.structures import PointCloud
 
 

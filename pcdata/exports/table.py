@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.files import read_bytes
+from pcdata.files.opening import read_bytes
 
 Given = Path | Mapping[str, Any]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask, ptr_from_counts
 
 LEAF_SIZE = 16
 FAN_OUT = 8

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError
 from pcdata.functional.boxtree import expand_ranges
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.rows import cloud_of_rows
 
 # The diagonal stays under the radius by far more than float32 distances (2e-7) and cell borders (2e-6) can err.
 _MARGIN = 1e-4

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count, require_length
 from pcdata.functional.boxtree import box_gap, expand_ranges, sum_of_squares
 from pcdata.functional.cells import Cells
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, check_grid
 from pcdata.functional.nearest import largest_squared, nearest_chunks
-from pcdata.functional.parameters import check_grid, require_count, require_length
-from pcdata.functional.ragged import cloud_of_rows, ptr_after_mask, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, ptr_after_mask, ptr_from_counts
 
 _SAMPLES = 4  # points per cell in the quick test; 16 distances join nearly all neighbouring cells
 _PAIRS_PER_CHUNK = 1 << 15
@@ -46,7 +46,7 @@ def dbscan(
         eps: in the unit of the points.
         min_points: neighbours that make a core point, itself included.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.

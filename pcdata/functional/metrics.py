@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
 from pcdata.errors import TooFewPointsError
 from pcdata.functional.boxtree import sum_of_squares
 from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
 
 @op(points_a="N 3", ptr_a="ptr N B", points_b="M 3", ptr_b="ptr M B")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.functional.rows import cloud_of_rows
 
 _GROUPS_PER_CHUNK = 512
 _MAX_PAIRS = 1 << 16  # (query, point) or (group, box) pairs alive at once: temporaries that stay in cache

@@ -11,11 +11,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count, require_length
 from pcdata.errors import ShapeError
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, check_grid
 from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.parameters import check_grid, require_count, require_length
 
 
 @op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", gradient=False)
@@ -40,7 +40,7 @@ def knn(
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
@@ -82,7 +82,7 @@ def ball_query(
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.

@@ -11,11 +11,11 @@ import math
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count, require_length
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, check_grid
 from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.parameters import check_grid, require_count, require_length
 
 
 @op(points="N 3", ptr="ptr N B", gradient=False)
@@ -43,7 +43,7 @@ def estimate_normals(
         radius: in the unit of the points.
         max_neighbors: nearest points used at most.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.

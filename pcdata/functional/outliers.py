@@ -9,12 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count, require_length, require_positive
 from pcdata.functional.cells import Cells
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, check_grid
 from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.parameters import check_grid, require_count, require_length, require_positive
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
 
 
 @op(points="N 3", ptr="ptr N B", gradient=False)
@@ -94,7 +94,7 @@ def radius_outlier_mask(
         min_neighbors: this many, the point itself included, are not yet enough.
         radius: in the unit of the points.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.

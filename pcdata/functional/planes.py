@@ -10,12 +10,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count, require_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
-from pcdata.functional.parameters import require_count, require_length
-from pcdata.functional.plane_fit import fit_plane, plane_distance, planes_through, through_origin
-from pcdata.functional.ragged import count_per_cloud, counts_from_ptr, ptr_from_counts
-from pcdata.functional.rigid import angle_between
+from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
+from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
+from pcdata.geometry.rigid import angle_between
 from pcdata.rng import seeded
 
 # The inlier set of real clouds settles in 3 to 8 rounds; the cap only stops a set that alternates for ever.
@@ -57,7 +57,7 @@ def ransac_plane(
         up: (3,) or one per cloud (B, 3); any length.
         max_tilt: radians; only planes whose normal is within this angle of up or -up compete. A refinement that would
             leave this cone is not taken.
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         TooFewPointsError: a cloud has fewer than 3 points.

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
-from pcdata.functional.ragged import counts_from_ptr, ptr_from_counts
+from pcdata.functional.rows import counts_from_ptr, ptr_from_counts
 from pcdata.rng import seeded
 
 # Points per tile in the search for the farthest one; near the square root of a large cloud.
@@ -33,7 +33,7 @@ def farthest_point_sample(
         points: the clouds, in any unit of length.
         ptr: row pointers.
         num_samples: one count for every cloud, or one per cloud (B,).
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         TooFewPointsError: a cloud has fewer points than asked for.

@@ -13,11 +13,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import op
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import require_count
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
-from pcdata.functional.groups import group_count, group_first, group_sum
-from pcdata.functional.parameters import require_count
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_from_counts, segment_max, segment_min
+from pcdata.functional.rows import (
+    cloud_of_rows,
+    counts_from_ptr,
+    group_count,
+    group_first,
+    group_sum,
+    ptr_from_counts,
+    segment_max,
+    segment_min,
+)
 
 # Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
 # A sum fits 63 bits for up to 2^32 points.
@@ -46,7 +54,7 @@ def voxel_downsample(
         points: the clouds, in any unit of length.
         ptr: row pointers.
         voxel_size: edge length in the unit of the points; one, or one per cloud (B,).
-        backend: which body to run; see :mod:`pcdata.dispatch`.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ConfigError: a voxel size that is not positive.

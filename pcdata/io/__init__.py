@@ -1,8 +1,7 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
-from pcdata.io.averaged import AveragedSource
-from pcdata.io.calibration import Calibration, Evidence
-from pcdata.io.capture_camera import (
+from pcdata.io.calibration.calibration import Calibration, Evidence
+from pcdata.io.calibration.capture_camera import (
     CaptureCamera,
     read_capture_camera,
     read_intrinsics,
@@ -10,15 +9,16 @@ from pcdata.io.capture_camera import (
     write_capture_camera,
     write_pose,
 )
-from pcdata.io.confidence import read_confidence, write_confidence
-from pcdata.io.detect import LAYOUTS, open_source, register_layout
-from pcdata.io.image_writing import write_color, write_depth, write_labels, write_mask
-from pcdata.io.images import read_color, read_depth, read_labels, read_mask
-from pcdata.io.pcd import read_pcd, write_pcd
-from pcdata.io.ply import read_ply, write_ply
-from pcdata.io.selection import open_selected
-from pcdata.io.source import Source, refused_captures
-from pcdata.io.temporal import TemporalFilterDepth, TemporallyFilteredSource
+from pcdata.io.clouds.pcd import read_pcd, write_pcd
+from pcdata.io.clouds.ply import read_ply, write_ply
+from pcdata.io.images.confidence import read_confidence, write_confidence
+from pcdata.io.images.reading import read_color, read_depth, read_labels, read_mask
+from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
+from pcdata.io.sources.averaged import AveragedSource
+from pcdata.io.sources.detect import LAYOUTS, open_source, register_layout
+from pcdata.io.sources.selection import open_selected
+from pcdata.io.sources.source import Source, refused_captures
+from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
 
 __all__ = [
     "LAYOUTS",

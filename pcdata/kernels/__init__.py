@@ -1,1 +1,1 @@
-"""Faster bodies of operations, one module per backend; loaded by :mod:`pcdata.dispatch` when first asked for."""
+"""Faster bodies of operations, one module per backend, loaded by :mod:`pcdata.contracts.dispatch` when first used."""

@@ -11,11 +11,11 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import kernel
+from pcdata.contracts.dispatch import kernel
 from pcdata.errors import BackendError
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.neighbors import check_ball_query
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.sampling import check_available, counts_per_cloud
 
 INSTALL = "pip install ninja && pip install --no-build-isolation torch-cluster"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pcdata.errors import ConfigError, ShapeError, near_matches
-from pcdata.io.stored_arrays import StoredArray, shown_names, stored_arrays, stored_names
+from pcdata.io.arrays.stored_arrays import StoredArray, shown_names, stored_arrays, stored_names
 from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
 
 # What the keys of a mapping may be called besides the model's own tensor names: the roles of channels.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.models.batch import ModelBatch
 from pcdata.structures import PaddedClouds, PointCloud
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, FrameError, ShapeError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows, pad_rows
+from pcdata.functional.rows import cloud_of_rows, pad_rows, transform_points
 from pcdata.functional.voxels import voxel_mean
 from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import METRE, PointCloud
@@ -125,7 +124,7 @@ def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor)
 
 def _xyz_in_frame(clouds: PointCloud, contract: ModelContract) -> Tensor:
     """The points before centring, in the contract's frame."""
-    return rigid.transform_points(clouds.points, clouds.ptr, frame_from_cloud(clouds, contract.frame))
+    return transform_points(clouds.points, clouds.ptr, frame_from_cloud(clouds, contract.frame))
 
 
 def frame_from_cloud(clouds: PointCloud, frame: str) -> Tensor:

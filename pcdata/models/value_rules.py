@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from pcdata.contracts.lengths import WIDEST, plausible_units
 from pcdata.functional.planes import ransac_plane
-from pcdata.lengths import WIDEST, plausible_units
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import is_camera
 from pcdata.models.contract import MIN_POINTS, Channel, InputTensor, ModelContract, Role

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pcdata import extras
-from pcdata.files import replacing
+from pcdata.files.opening import replacing
 from pcdata.report.labels import label_text
 from pcdata.structures import METRE, DepthFrame, PointCloud
 

@@ -9,7 +9,8 @@ import torch
 
 import pcdata
 import pcdata.functional
-from pcdata import dispatch, extras
+from pcdata import extras
+from pcdata.contracts import dispatch
 from pcdata.report.table import text_table
 
 

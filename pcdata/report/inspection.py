@@ -9,7 +9,7 @@ from statistics import median
 
 from pcdata.build import BuildReport
 from pcdata.datasets import CachedCloudDataset
-from pcdata.io.source import Source
+from pcdata.io.sources.source import Source
 from pcdata.report.table import text_table
 from pcdata.structures import DepthFrame, PointCloud
 

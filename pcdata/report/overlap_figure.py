@@ -9,10 +9,9 @@ import numpy as np
 import torch
 
 from pcdata import extras
-from pcdata.files import replacing
-from pcdata.functional import rigid
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.ragged import cloud_of_rows
+from pcdata.files.opening import replacing
+from pcdata.functional.depth.deproject import deproject_depth
+from pcdata.functional.rows import cloud_of_rows, transform_points
 from pcdata.report.labels import label_text
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import OverlapResult
@@ -73,7 +72,7 @@ def _points_of(capture: DepthFrame | PointCloud) -> tuple[torch.Tensor, torch.Te
         assert capture.world_from_camera is not None  # verify_overlap required it
         camera = capture.camera.to(capture.device)
         points, ptr, _ = deproject_depth(capture.depth, camera.intrinsics, distortion=camera.distortion)
-        points = rigid.transform_points(points, ptr, capture.world_from_camera)
+        points = transform_points(points, ptr, capture.world_from_camera)
     view = cloud_of_rows(ptr)
     stride = max(1, len(points) // (_MAX_DRAWN * (len(ptr) - 1)))
     return points[::stride].cpu().double(), view[::stride].cpu()

@@ -3,12 +3,12 @@
 from pcdata.structures.camera import Camera
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
-from pcdata.structures.fields import METRE, NORMALIZED, Kind
-from pcdata.structures.filled import confidence_of, with_filled_depth
+from pcdata.structures.depth_to_color import register_to_color
+from pcdata.structures.filled_depth import confidence_of, with_filled_depth
 from pcdata.structures.image_layout import ImageLayout
+from pcdata.structures.kinds import METRE, NORMALIZED, Kind
 from pcdata.structures.padded import PaddedClouds
 from pcdata.structures.point_cloud import PointCloud
-from pcdata.structures.registration import register_to_color
 from pcdata.structures.surface_mesh import SurfaceMesh
 from pcdata.structures.tsdf_volume import TSDFVolume
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.checks import check_tensors
+from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
 
 

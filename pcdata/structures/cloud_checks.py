@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from pcdata.checks import check_ptr_values, check_tensors
+from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
-from pcdata.structures.fields import CORE_KINDS, METRE, NORMALIZED, Kind
+from pcdata.structures.kinds import CORE_KINDS, METRE, NORMALIZED, Kind
 
 if TYPE_CHECKING:
     from pcdata.structures.point_cloud import PointCloud

@@ -9,11 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.checks import any_negative, check_tensors
+from pcdata.contracts.host import any_negative
+from pcdata.contracts.lengths import check_depth
+from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, ShapeError
-from pcdata.functional import rigid
-from pcdata.functional.depth import mask_depth
-from pcdata.lengths import check_depth
+from pcdata.functional.depth.deproject import mask_depth
+from pcdata.geometry import rigid
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.derive import derived

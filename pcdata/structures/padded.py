@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pcdata.structures.fields import CORE_KINDS
 from pcdata.structures.joining import joined_frames
+from pcdata.structures.kinds import CORE_KINDS
 
 if TYPE_CHECKING:
     from pcdata.structures.point_cloud import PointCloud

@@ -10,16 +10,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.checks import check_ptr_values, check_tensors
+from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
-from pcdata.functional import rigid
-from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.rows import (
+    cloud_of_rows,
+    counts_from_ptr,
+    join_rows,
+    pad_rows,
+    pick_rows,
+    ptr_from_counts,
+    transform_directions,
+    transform_points,
+)
+from pcdata.geometry import rigid
 from pcdata.structures.cloud_checks import check_cloud, check_names
 from pcdata.structures.derive import derived
-from pcdata.structures.fields import CORE_KINDS, METRE, Kind
 from pcdata.structures.image_layout import ImageLayout, joined_layout, within_image
 from pcdata.structures.joining import joinable_parts, joined_frames, rows_per_cloud
+from pcdata.structures.kinds import CORE_KINDS, METRE, Kind
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 
 Step = dict[str, Any]
@@ -195,14 +204,14 @@ class PointCloud:
         for name, value in self.fields().items():
             kind = self.kind(name)
             if kind is Kind.POSITION:
-                value = rigid.transform_points(value, self.ptr, matrix)
+                value = transform_points(value, self.ptr, matrix)
             elif kind is Kind.DIRECTION:
-                value = rigid.transform_directions(value, self.ptr, matrix)
+                value = transform_directions(value, self.ptr, matrix)
             moved[name] = value
         viewpoint = self.viewpoint
         if viewpoint is not None:
             per_cloud = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=self.device)
-            viewpoint = rigid.transform_points(viewpoint, per_cloud, matrix)
+            viewpoint = transform_points(viewpoint, per_cloud, matrix)
         source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
         result = self._with_rows(
             moved,

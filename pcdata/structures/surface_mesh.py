@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pcdata.checks import check_tensors
+from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ShapeError
 from pcdata.structures.point_cloud import PointCloud
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from pcdata.array_files.npy import NpyHeader
-from pcdata.array_files.npz import npy_header, read_array
-from pcdata.array_files.zip_archive import ZipArchive
 from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeError
-from pcdata.files import MAX_STREAMED_BYTES, open_input, replacing
+from pcdata.files.npy import NpyHeader
+from pcdata.files.npz import npy_header, read_array
+from pcdata.files.opening import MAX_STREAMED_BYTES, open_input, replacing
+from pcdata.files.strict_json import json_object
+from pcdata.files.zip_archive import ZipArchive
 from pcdata.functional.tsdf.blocks import CHUNK, Chunk, Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS
-from pcdata.strict_json import json_object
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.tsdf_volume import TSDFVolume
 

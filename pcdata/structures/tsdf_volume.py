@@ -12,11 +12,11 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, DeviceError, DTypeError, FrameError, VolumeTooLargeError
 from pcdata.functional import tsdf
-from pcdata.functional.depth import check_rays, pixel_rays
+from pcdata.functional.depth.deproject import check_rays, pixel_rays
 from pcdata.functional.tsdf.views import UNIT_WEIGHT
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import DepthFrame
-from pcdata.structures.fields import Kind
+from pcdata.structures.kinds import Kind
 from pcdata.structures.point_cloud import PointCloud
 from pcdata.structures.surface_mesh import SurfaceMesh
 
@@ -44,7 +44,7 @@ class TSDFVolume:
     min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
     max_bytes: int = 4 << 30  # refuse to grow beyond
     device: torch.device | str = "cpu"
-    backend: str = "auto"  # see pcdata.dispatch
+    backend: str = "auto"  # see pcdata.contracts.dispatch
     frame_id: str | None = None  # the frame of the surface; None = that of the first frame
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)

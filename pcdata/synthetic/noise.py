@@ -11,7 +11,7 @@ import torch
 from torch import Generator, Tensor
 
 from pcdata.errors import ConfigError, ShapeError, near_matches
-from pcdata.functional.sensor_noise import draw_sensor_noise, err_in_disparity, facing_depth, sensor_reading
+from pcdata.functional.depth.sensor_noise import draw_sensor_noise, err_in_disparity, facing_depth, sensor_reading
 
 
 @dataclass(frozen=True, kw_only=True)

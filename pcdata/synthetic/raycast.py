@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pcdata.functional.lens import undistort_normalized
+from pcdata.geometry.lens import undistort_normalized
 from pcdata.structures import Camera
 from pcdata.synthetic.shapes import Shape
 

@@ -9,7 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 from pcdata.errors import ConfigError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import generator_for
 from pcdata.synthetic.shapes import Box, Color, Cylinder, Shape, Sphere
 

@@ -9,8 +9,8 @@ from annotated_types import Interval
 from torch import Tensor
 
 from pcdata.errors import ConfigError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import segment_mean
+from pcdata.functional.rows import segment_mean
+from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SpatialTransform

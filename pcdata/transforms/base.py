@@ -20,7 +20,7 @@ from typing_extensions import dataclass_transform
 from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
-from pcdata.structures.fields import CORE_KINDS
+from pcdata.structures.kinds import CORE_KINDS
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
 Data = DepthFrame | PointCloud

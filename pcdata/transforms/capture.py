@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from pcdata.errors import PcdataError
-from pcdata.functional.depth import Deprojected, deproject_into_box
+from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace

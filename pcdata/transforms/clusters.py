@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, PcdataWarning, TooFewPointsError
 from pcdata.functional.clusters import dbscan
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import TooFewPointsError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import ptr_after_mask
+from pcdata.geometry import rigid
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, Transform, sample_name

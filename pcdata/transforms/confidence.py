@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.files import read_text
+from pcdata.files.opening import read_text
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.compose import Compose
 from pcdata.transforms.field_checks import field_faults, field_names, field_types

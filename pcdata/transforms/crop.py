@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, NonFiniteError, PcdataError
-from pcdata.functional import rigid
-from pcdata.functional.boxes import inside_box
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import inside_box, ptr_after_mask, transform_points
+from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
@@ -51,7 +50,7 @@ class CropWorkspace(SelectTransform):
         if self.frame_from_box is not None:
             pose = torch.tensor(self.frame_from_box, dtype=torch.float64, device=cloud.device)
             box_from_frame = rigid.invert_rigid(pose).repeat(cloud.num_clouds, 1, 1)
-            points = rigid.transform_points(points, cloud.ptr, box_from_frame)
+            points = transform_points(points, cloud.ptr, box_from_frame)
         inside = inside_box(points, self.lower, self.upper)
         if inside is None:
             raise NonFiniteError("CropWorkspace: the cloud has NaN or infinite coordinates; drop those points first")

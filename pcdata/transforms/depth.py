@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth import Deprojected, deproject_images
+from pcdata.functional.depth.deproject import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform

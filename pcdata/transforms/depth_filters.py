@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import torch
 from annotated_types import Ge, Gt, Interval, Le
 
-from pcdata.functional.depth_holes import fill_holes, fill_rows
-from pcdata.functional.disparity import depth_to_disparity, disparity_to_depth, spatial_filter
-from pcdata.functional.flying_pixels import flying_pixel_mask
+from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth, spatial_filter
+from pcdata.functional.depth.flying_pixels import flying_pixel_mask
+from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.structures import Confidence, DepthFrame
-from pcdata.structures.filled import with_filled_depth
+from pcdata.structures.filled_depth import with_filled_depth
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
 

@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool2d
 
 from pcdata.extras import require
 from pcdata.structures import DepthFrame
-from pcdata.structures.filled import with_filled_depth
+from pcdata.structures.filled_depth import with_filled_depth
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import Count
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from pcdata.errors import ShapeError
-from pcdata.functional.depth_resampling import MAX_FACTOR, decimate_depth, resize_depth
+from pcdata.functional.depth.resampling import MAX_FACTOR, decimate_depth, resize_depth
 from pcdata.structures import DepthFrame
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import Count, Positive

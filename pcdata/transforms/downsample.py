@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, TooFewPointsError
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import (
     find_voxel_size,

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, FrameError, PcdataError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample, voxel_majority
+from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, Transform

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from pcdata.errors import ConfigError, TooFewPointsError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import cloud_of_rows, segment_max, segment_mean
+from pcdata.functional.rows import cloud_of_rows, segment_max, segment_mean
+from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import NORMALIZED, PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, sample_name

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from torch import Tensor
 
-from pcdata.checks import negated
+from pcdata.contracts.host import negated
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
-from pcdata.functional.ragged import ptr_after_mask
+from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud

@@ -9,12 +9,12 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from pcdata.checks import negated
+from pcdata.contracts.host import negated
 from pcdata.errors import ConfigError
-from pcdata.functional import rigid
-from pcdata.functional.plane_fit import through_origin
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.ragged import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.geometry import rigid
+from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform, sample_name

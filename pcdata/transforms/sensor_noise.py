@@ -12,7 +12,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from pcdata.errors import ConfigError
-from pcdata.functional.sensor_noise import (
+from pcdata.functional.depth.sensor_noise import (
     draw_sensor_noise,
     err_in_disparity,
     facing_depth,

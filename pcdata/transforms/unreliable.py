@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.roughness import depth_roughness
+from pcdata.functional.depth.roughness import depth_roughness
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.fields import FromSensor, Name

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from pcdata.functional.ragged import cloud_of_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform

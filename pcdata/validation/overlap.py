@@ -9,15 +9,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pcdata.alignment.surfaces import Surface
+from pcdata.alignment.view_alignment import PairFit, ViewAlignment, align_views
+from pcdata.alignment.view_consensus import Consensus, find_consensus, measured_part, sigma_along
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional.small_motions import motion_from_twist
-from pcdata.functional.surfaces import Surface
-from pcdata.functional.view_alignment import PairFit, ViewAlignment, align_views
-from pcdata.functional.view_consensus import Consensus, find_consensus, measured_part, sigma_along
+from pcdata.geometry.small_motions import motion_from_twist
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
+from pcdata.validation.measures.surfaces import surfaces_of
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
-from pcdata.validation.surfaces import surfaces_of
 
 _MIN_MATCHES = 100  # samples; a smaller overlap says nothing about six unknowns
 _MAX_SAMPLES = 4000  # per view and capture: what two cores align well within a second

@@ -6,23 +6,23 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import Protocol
 
 from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
-from pcdata.functional.edge_offset import EdgeVotes
-from pcdata.io.source import Source, checked_ids
+from pcdata.io.sources.source import Source, checked_ids
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
-from pcdata.validation.cameras import intrinsics_checks, pose_checks
 from pcdata.validation.check import Check, Verdict, worst
-from pcdata.validation.clouds import cloud_checks
-from pcdata.validation.coverage import coverage_checks
+from pcdata.validation.checks.cameras import intrinsics_checks, pose_checks
+from pcdata.validation.checks.clouds import cloud_checks
+from pcdata.validation.checks.color_registration import frame_votes, registration_check
+from pcdata.validation.checks.coverage import coverage_checks
+from pcdata.validation.checks.pose_direction import direction_checks
+from pcdata.validation.checks.pose_direction_over_time import PoseDirectionOverTime
+from pcdata.validation.checks.readings import reading_checks
+from pcdata.validation.checks.sequence import ClockChecks, RepeatChecks
+from pcdata.validation.checks.stored_files import raw_value_checks
+from pcdata.validation.checks.view_overlap import overlap_checks
 from pcdata.validation.limits import Limits
-from pcdata.validation.pose_direction import direction_checks
-from pcdata.validation.pose_direction_over_time import PoseDirectionOverTime
-from pcdata.validation.raw_files import raw_value_checks
-from pcdata.validation.readings import reading_checks
-from pcdata.validation.registration import frame_votes, registration_check
+from pcdata.validation.measures.edge_offset import EdgeVotes
 from pcdata.validation.report import WHOLE, SampleReport
-from pcdata.validation.sequence import ClockChecks, RepeatChecks
-from pcdata.validation.view_overlap import overlap_checks
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
 READABLE = "readable"

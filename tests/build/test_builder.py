@@ -14,7 +14,7 @@ import torch
 from pcdata import CachedCloudDataset, PointCloud, open_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PcdataError
-from pcdata.io.manifest import Manifest, key_of
+from pcdata.io.store.manifest import Manifest, key_of
 from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "pt"]
@@ -311,9 +311,9 @@ def test_a_failure_while_the_datasets_are_swapped_brings_the_old_one_back(
             raise fault
         rename(a, b)
 
-    monkeypatch.setattr("pcdata.io.whole_folders.os.rename", failing)
+    monkeypatch.setattr("pcdata.files.whole_folders.os.rename", failing)
     if not swaps:
-        monkeypatch.setattr("pcdata.io.whole_folders.exchange", lambda one, other: False)
+        monkeypatch.setattr("pcdata.files.whole_folders.exchange", lambda one, other: False)
     with pytest.raises((CacheError, KeyboardInterrupt)):
         build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "out", overwrite=True)
     assert len(calls) >= failing_rename

@@ -11,9 +11,9 @@ from pcdata import AveragedSource, open_source
 from pcdata.build import build_dataset
 from pcdata.errors import CaptureError
 from pcdata.exports import export_dataset
-from pcdata.files import open_input, read_text
-from pcdata.inputs import Inputs, recording
-from pcdata.io.raw import write_capture
+from pcdata.files.inputs import Inputs, recording
+from pcdata.files.opening import open_input, read_text
+from pcdata.io.writers.capture import write_capture
 from tests.build.test_builder import tree
 from tests.build.test_shared_names import meanwhile
 

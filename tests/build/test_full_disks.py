@@ -12,7 +12,7 @@ import torch
 from pcdata import CachedCloudDataset, PointCloud
 from pcdata.build import build_dataset
 from pcdata.errors import CacheError
-from pcdata.io.ply import write_ply
+from pcdata.io.clouds.ply import write_ply
 from tests.build.test_builder import FORMATS, Clouds, tree
 from tests.disk_limits import largest_file
 

@@ -14,7 +14,7 @@ import pytest
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset
 from pcdata.errors import CacheError, CaptureError
-from pcdata.io import scratch, whole_folders
+from pcdata.files.opening import scratch, whole_folders
 from tests.build.test_builder import Clouds, cloud, tree
 
 
@@ -67,7 +67,7 @@ def test_a_folder_made_at_the_last_moment_keeps_its_files(tmp_path, source, conf
             make(tmp_path / "out")
         rename(a, b)
 
-    monkeypatch.setattr("pcdata.io.whole_folders.os.rename", late)
+    monkeypatch.setattr("pcdata.files.whole_folders.os.rename", late)
     with pytest.raises(CacheError, match="somebody else made"):
         build_dataset(configure(), source, tmp_path / "out")
     assert tree(tmp_path) == {"out": None, "out/thesis.tex": b"years"}
@@ -112,7 +112,7 @@ def test_a_file_put_into_the_old_dataset_while_it_is_deleted_is_kept_and_told(tm
             make(Path(path).parent)
         unlink(path)
 
-    monkeypatch.setattr("pcdata.io.whole_folders.os.unlink", late)
+    monkeypatch.setattr("pcdata.files.whole_folders.os.unlink", late)
     report = build_dataset(config, source, tmp_path / "out", overwrite=True)
     assert len(CachedCloudDataset(tmp_path / "out")) == 3
     (kept,) = tmp_path.rglob("thesis.tex")

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from pcdata.calibration.boards import BoardView, Charuco, Chessboard, GreyImage
-from pcdata.functional import rigid
-from pcdata.functional.depth import pixel_rays, project_points
+from pcdata.functional.depth.deproject import pixel_rays, project_points
+from pcdata.functional.rows import transform_points
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera
 
@@ -47,7 +48,7 @@ def corner_view(pose: Tensor, *, noise: float = 0.0, seed: int = 0, camera: Came
     board = CHESSBOARD
     row, column = np.divmod(np.arange(board.cols * board.rows), board.cols)
     points = torch.from_numpy(np.stack([column, row, 0 * row], axis=1) * board.square)
-    moved = rigid.transform_points(points, torch.tensor([0, len(points)]), pose[None])
+    moved = transform_points(points, torch.tensor([0, len(points)]), pose[None])
     pixels, _ = project_points(moved, intrinsics=camera.intrinsics, distortion=camera.distortion)
     pixels += noise * torch.randn(pixels.shape, dtype=torch.float64, generator=seeded(seed))
     return BoardView(points.numpy(), pixels.numpy())

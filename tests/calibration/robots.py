@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.calibration import RobotPoses, locate_board
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from tests.calibration.boards import CAMERA, board_pose, corner_view
 

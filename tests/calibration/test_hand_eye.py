@@ -16,7 +16,7 @@ from pcdata.calibration.hand_eye_refine import refine
 from pcdata.calibration.motions import motions_between
 from pcdata.calibration.park_martin import park_martin
 from pcdata.errors import CalibrationError, ConfigError, PoseError, ShapeError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from tests.calibration.robots import (
     HOLDER_FROM_TARGET,
     MOUNT_FROM_CAMERA,

@@ -16,7 +16,7 @@ from pcdata.calibration import (
 )
 from pcdata.calibration.boards import Board, BoardView
 from pcdata.errors import CalibrationError, CaptureError, ConfigError
-from pcdata.functional.depth import pixel_rays, project_points
+from pcdata.functional.depth.deproject import pixel_rays, project_points
 from tests.calibration.boards import CAMERA, CHARUCO, CHESSBOARD, SIZE, board_pose, corner_view, good_poses, rendered
 
 

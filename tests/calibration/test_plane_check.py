@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.calibration import PlaneLimits, check_plane
 from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
-from pcdata.functional.depth import pixel_rays
+from pcdata.functional.depth.deproject import pixel_rays
 from pcdata.structures import Camera, DepthFrame
 
 SIZE = (240, 320)

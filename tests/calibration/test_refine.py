@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from pcdata.alignment.pose_graph import PairMotion, average_motions
 from pcdata.calibration import Calibration, Evidence, refine_extrinsics
 from pcdata.calibration.refine import Refinement
 from pcdata.cli import main
 from pcdata.errors import CalibrationError, ConfigError
-from pcdata.functional import rigid
-from pcdata.functional.pose_graph import PairMotion, average_motions
-from pcdata.functional.small_motions import motion_from_twist, twist_from_motion
-from pcdata.io.capture_camera import CaptureCamera, write_capture_camera
-from pcdata.io.image_writing import write_depth
+from pcdata.geometry import rigid
+from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
+from pcdata.io.calibration.capture_camera import CaptureCamera, write_capture_camera
+from pcdata.io.images.writing import write_depth
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from tests.scenes import overlapping

@@ -13,7 +13,7 @@ from torch.utils.data import Subset
 
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataError
-from pcdata.io.manifest import checksum_of
+from pcdata.io.store.manifest import checksum_of
 from pcdata.transforms import MaskDepth, Pipeline, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
 from tests.messages import told
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, PointCloud
 from pcdata.transforms import NormalizeUnitSphere

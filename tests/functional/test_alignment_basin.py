@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 
+from pcdata.alignment import icp_point_to_plane
 from pcdata.errors import ConfigError, TooFewPointsError
-from pcdata.functional import estimate_normals, icp_point_to_plane, rigid
-from pcdata.functional.small_motions import motion_along, motion_from_twist, twist_from_motion
+from pcdata.functional import estimate_normals
+from pcdata.geometry import rigid
+from pcdata.geometry.small_motions import motion_along, motion_from_twist, twist_from_motion
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)
 

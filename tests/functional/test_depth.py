@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError, DTypeError, NonFiniteError, ShapeError
-from pcdata.functional.depth import deproject_depth, pixel_rays, project_points, range_to_depth
+from pcdata.functional.depth.deproject import deproject_depth, pixel_rays, project_points, range_to_depth
 
 LENS = torch.tensor([[0.12, -0.25, 0.0011, -0.0007, 0.09]], dtype=torch.float64)
 

@@ -9,7 +9,7 @@ import torch
 
 from pcdata.errors import CaptureError, ConfigError, NonFiniteError, ShapeError
 from pcdata.functional import average_depth
-from pcdata.functional.sorting import network, pick_image, sort_images
+from pcdata.functional.depth.pixel_sort import network, pick_image, sort_images
 from pcdata.rng import seeded
 from pcdata.synthetic import tabletop
 from tests.factories import depth_edges

@@ -7,7 +7,7 @@ import torch
 
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional import fill_holes, fill_rows
-from pcdata.functional.depth_holes import RULES
+from pcdata.functional.depth.holes import RULES
 from pcdata.rng import seeded
 
 

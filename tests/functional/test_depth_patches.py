@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from pcdata.functional.depth import pixel_rays
-from pcdata.functional.depth_patches import fit_depth_patches
+from pcdata.alignment.patches import fit_depth_patches
+from pcdata.functional.depth.deproject import pixel_rays
 
 SIZE = (120, 160)
 INTRINSICS = torch.tensor([[600.0, 0.0, 79.0], [0.0, 590.0, 61.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, PoseError
-from pcdata.functional import deproject_depth, project_points, register_depth, rigid
-from pcdata.functional.depth_registration import RegisteredDepth
+from pcdata.functional import deproject_depth, project_points, register_depth
+from pcdata.functional.depth.depth_to_color import RegisteredDepth
+from pcdata.functional.rows import transform_points
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera
 from pcdata.synthetic import tabletop
@@ -53,7 +55,7 @@ def seen_by_depth_camera(one: Pair) -> Tensor:
     """(Hc, Wc): the colour pixels whose true surface the depth camera measures too, clear of its edges."""
     camera, truth = one.color_camera, one.truth
     points, ptr, index = deproject_depth(truth, camera.intrinsics, distortion=camera.distortion)
-    there = rigid.transform_points(points, ptr, one.depth_from_color)
+    there = transform_points(points, ptr, one.depth_from_color)
     pixels, depth = project_points(there, ptr, intrinsics=DEPTH_CAMERA.intrinsics)
     # The 3 x 3 readings around must lie on one surface, as max_jump has it, and that must be the one looked at.
     far, near = torch.nn.functional.max_pool2d(one.depth, 3, 1, 1), -torch.nn.functional.max_pool2d(-one.depth, 3, 1, 1)
@@ -123,7 +125,7 @@ def test_hidden_readings_are_those_that_the_color_camera_cannot_see(pairs, size,
     one = pairs[size, at]
     camera = one.color_camera
     points, ptr, index = deproject_depth(one.depth, DEPTH_CAMERA.intrinsics)
-    there = rigid.transform_points(points, ptr, rigid.invert_rigid(one.depth_from_color))
+    there = transform_points(points, ptr, rigid.invert_rigid(one.depth_from_color))
     pixels, depth = project_points(there, ptr, intrinsics=camera.intrinsics, distortion=camera.distortion)
     u, v = (pixels + 0.5).floor().unbind(1)
     inside = (u >= 0) & (v >= 0) & (u < camera.size[1]) & (v < camera.size[0])

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.functional import EdgeOffset, edge_votes, offset_from_votes
 from pcdata.synthetic import tabletop
+from pcdata.validation.measures import EdgeOffset, edge_votes, offset_from_votes
 
 HEIGHT, WIDTH = 480, 640
 V, U = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")

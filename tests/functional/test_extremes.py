@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pcdata.functional import pile_at_extreme
+from pcdata.validation.measures import pile_at_extreme
 
 
 def readings(seed: int = 0) -> torch.Tensor:

@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from pcdata import functional as F
-from pcdata.dispatch import OPERATIONS
-from pcdata.functional import rigid
-from pcdata.functional.depth_resampling import decimate_depth, resize_depth
-from pcdata.functional.disparity import depth_to_disparity, disparity_to_depth
-from pcdata.functional.sensor_noise import err_in_disparity, surface_slope
-from pcdata.functional.small_motions import motion_from_twist, twist_from_motion
+from pcdata.contracts.dispatch import OPERATIONS
+from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth
+from pcdata.functional.depth.resampling import decimate_depth, resize_depth
+from pcdata.functional.depth.sensor_noise import err_in_disparity, surface_slope
+from pcdata.functional.rows import transform_directions
 from pcdata.functional.voxels import voxel_mean
+from pcdata.geometry import rigid
+from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
 from pcdata.rng import seeded
 
 # Decisions (indices, masks, labels, planes, sizes) have no derivative; normals, registered and smoothed depth are
@@ -140,7 +141,7 @@ def test_directions_of_length_zero_poison_no_gradient():
     turn = rigid.from_rotation_translation(
         rigid.rotation_about_axis(torch.tensor([0.0, 0, 1]), torch.tensor(0.3)), torch.ones(3)
     )
-    moved = rigid.transform_directions(directions, torch.tensor([0, 2]), turn[None])
+    moved = transform_directions(directions, torch.tensor([0, 2]), turn[None])
     assert torch.equal(moved[0].detach(), torch.zeros(3))
     moved.square().sum().backward()
     assert directions.grad is not None

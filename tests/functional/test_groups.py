@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.functional.groups import group_count, group_first, group_sum
+from pcdata.functional.rows import group_count, group_first, group_sum
 
 
 @settings(max_examples=30, deadline=None)

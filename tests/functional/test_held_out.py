@@ -1,9 +1,9 @@
 import torch
 
-from pcdata.functional.held_out import GapChange, gap_change, held_out_change
-from pcdata.functional.robust import unexplained_spread
-from pcdata.functional.small_motions import motion_from_twist
-from pcdata.functional.surfaces import DepthSurface
+from pcdata.alignment.cross_validation import GapChange, gap_change, held_out_change
+from pcdata.alignment.surfaces import DepthSurface
+from pcdata.geometry.robust import unexplained_spread
+from pcdata.geometry.small_motions import motion_from_twist
 from pcdata.synthetic import Tabletop, tabletop
 
 

@@ -3,9 +3,12 @@ import math
 import pytest
 import torch
 
+from pcdata.alignment import icp_point_to_plane, point_to_plane_residuals
 from pcdata.errors import ConfigError, PoseError, ShapeError, TooFewPointsError
-from pcdata.functional import estimate_normals, icp_point_to_plane, point_to_plane_residuals, rigid
-from pcdata.functional.small_motions import (
+from pcdata.functional import estimate_normals
+from pcdata.functional.rows import transform_points
+from pcdata.geometry import rigid
+from pcdata.geometry.small_motions import (
     motion_from_twist,
     plane_system,
     solve_observable,
@@ -29,7 +32,7 @@ def small_motion(millimetres: float, degrees: float, seed: int) -> torch.Tensor:
 
 
 def moved(points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
-    return rigid.transform_points(points, torch.tensor([0, len(points)]), matrix[None])
+    return transform_points(points, torch.tensor([0, len(points)]), matrix[None])
 
 
 def apart(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:

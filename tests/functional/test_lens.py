@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError, ShapeError
-from pcdata.functional import lens as lens_module
-from pcdata.functional.lens import distort_normalized, fold_radius, undistort_normalized
+from pcdata.geometry import lens as lens_module
+from pcdata.geometry.lens import distort_normalized, fold_radius, undistort_normalized
 
 # One realistic lens per length: a webcam, the same with k3, a rational wide-angle (Azure Kinect), and with thin prism.
 WEBCAM = [0.12, -0.25, 0.0011, -0.0007]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from pcdata.errors import DTypeError
-from pcdata.functional import largest_missing_block, largest_missing_region
+from pcdata.validation.measures import largest_missing_block, largest_missing_region
 
 
 @pytest.mark.parametrize("size", [(480, 640), (720, 1280), (100, 90), (7, 5)])

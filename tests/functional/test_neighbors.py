@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.neighbors import ball_query, knn
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.normals import _smallest_eigenvector, estimate_normals, orient_normals
-from pcdata.functional.rigid import angle_between
+from pcdata.geometry.rigid import angle_between
 
 
 def test_normals_of_a_tilted_plane_are_its_normal():

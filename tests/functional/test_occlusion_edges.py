@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import DTypeError, ShapeError
-from pcdata.functional import occlusion_edges
+from pcdata.validation.measures import occlusion_edges
 
 HEIGHT, WIDTH = 240, 320
 CENTER, RADIUS = (160.0, 120.0), 60.0

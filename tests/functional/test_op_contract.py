@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 import pcdata.functional  # noqa: F401 - registers the operations
-from pcdata.checks import parse_spec
-from pcdata.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailable
+from pcdata.contracts.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailable
+from pcdata.contracts.tensors import parse_spec
 from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, PcdataError, ShapeError
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import seeded
 from tests.warm import run_python
 

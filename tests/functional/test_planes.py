@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional import planes as planes_module
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.plane_fit import fit_plane, plane_distance, planes_through
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.planes import ransac_plane
+from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.functional import ragged
+from pcdata.functional import rows as ragged
 
 ragged_counts = st.lists(st.integers(0, 6), min_size=1, max_size=6)
 few = settings(max_examples=30, deadline=None)

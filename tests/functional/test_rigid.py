@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import PoseError, ShapeError
-from pcdata.functional import rigid
+from pcdata.functional.rows import transform_directions, transform_points
+from pcdata.geometry import rigid
 
 angles = st.floats(-math.pi, math.pi)
 
@@ -49,9 +50,9 @@ def test_a_batch_of_clouds_moves_as_each_cloud_alone():
     points = torch.randn(1000, 3)
     matrices = torch.stack([random_pose(seed) for seed in range(3)])
     ptr = torch.tensor([0, 400, 400, 1000])
-    moved = rigid.transform_points(points, ptr, matrices)
+    moved = transform_points(points, ptr, matrices)
     alone = [
-        rigid.transform_points(points[a:b], torch.tensor([0, b - a]), matrices[i : i + 1])
+        transform_points(points[a:b], torch.tensor([0, b - a]), matrices[i : i + 1])
         for i, (a, b) in enumerate([(0, 400), (400, 400), (400, 1000)])
     ]
     assert torch.equal(moved, torch.cat(alone))
@@ -61,7 +62,7 @@ def test_points_far_away_keep_float32_precision():
     point = torch.tensor([[1e6, -1e6, 1.0]])
     there = random_pose(1)
     back = rigid.invert_rigid(there)
-    round_trip = rigid.transform_points(point.double(), torch.tensor([0, 1]), (back @ there)[None])
+    round_trip = transform_points(point.double(), torch.tensor([0, 1]), (back @ there)[None])
     torch.testing.assert_close(round_trip.float(), point, rtol=2e-7, atol=1e-6)
 
 
@@ -72,14 +73,14 @@ def test_normals_stay_perpendicular_to_a_sheared_surface():
     normal = torch.nn.functional.normalize(torch.randn(1, 3, dtype=torch.float64))
     along = torch.linalg.cross(normal, torch.randn(1, 3, dtype=torch.float64))
     ptr = torch.tensor([0, 1])
-    moved_normal = rigid.transform_directions(normal, ptr, shear[None])
-    moved_along = rigid.transform_points(along, ptr, shear[None])
+    moved_normal = transform_directions(normal, ptr, shear[None])
+    moved_along = transform_points(along, ptr, shear[None])
     assert abs(float((moved_normal * moved_along).sum())) < 1e-12
     assert float(moved_normal.norm()) == pytest.approx(1.0)
 
 
 def test_a_zero_normal_stays_zero():
-    moved = rigid.transform_directions(torch.zeros(1, 3), torch.tensor([0, 1]), random_pose(0)[None])
+    moved = transform_directions(torch.zeros(1, 3), torch.tensor([0, 1]), random_pose(0)[None])
     assert torch.equal(moved, torch.zeros(1, 3))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pcdata.functional.roughness import depth_roughness
+from pcdata.functional.depth.roughness import depth_roughness
 from pcdata.rng import seeded
 
 

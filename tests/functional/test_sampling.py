@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
-from pcdata.functional.depth import deproject_depth
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.depth.deproject import deproject_depth
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pcdata.functional.sensor_noise import err_in_disparity, facing_depth, quantized, surface_slope
+from pcdata.functional.depth.sensor_noise import err_in_disparity, facing_depth, quantized, surface_slope
 
 FOCAL = torch.full((1, 1, 1), 500.0, dtype=torch.float64)
 

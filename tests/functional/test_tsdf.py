@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import BackendError, ConfigError, UnitError
 from pcdata.functional import tsdf
-from pcdata.functional.depth import deproject_depth
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.tsdf.blocks import COLOR_SCALE, MAX_WEIGHT, TSDF_SCALE
 from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, pack_keys, unpack_keys
 from pcdata.rng import seeded

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import VolumeTooLargeError
 from pcdata.functional.tsdf.grid import unpack_keys
 from pcdata.rng import seeded

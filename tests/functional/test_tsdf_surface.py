@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 from pcdata.functional import tsdf
 from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE
 from pcdata.functional.tsdf.grid import pack_keys, unpack_keys, voxel_offsets

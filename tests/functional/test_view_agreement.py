@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid, view_agreement
+from pcdata.alignment import view_agreement
+from pcdata.geometry import rigid
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
 

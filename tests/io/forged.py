@@ -14,10 +14,10 @@ import torch
 
 from pcdata import PointCloud
 from pcdata.errors import CacheError, PcdataError
-from pcdata.io.manifest import Manifest, Sample
-from pcdata.io.record import record_from_cloud
-from pcdata.io.stored_arrays import stored_arrays
-from pcdata.io.stores import STORES
+from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.store.manifest import Manifest, Sample
+from pcdata.io.store.record import record_from_cloud
+from pcdata.io.store.stores import STORES
 from pcdata.transforms.pipeline import Pipeline
 from tests.io.memory import memory_limit
 

@@ -10,7 +10,7 @@ import struct
 import pytest
 
 from pcdata.errors import CaptureError
-from pcdata.io.bag_index import MAGIC, MAX_CHUNK, PackedChunk, checked_chunks
+from pcdata.io.sources.bag_index import MAGIC, MAX_CHUNK, PackedChunk, checked_chunks
 
 
 def record(data: bytes, **fields: bytes) -> bytes:

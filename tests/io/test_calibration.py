@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError, PoseError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.io import Calibration, Evidence, open_source, write_depth
 from pcdata.structures import Camera
 

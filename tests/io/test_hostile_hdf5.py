@@ -16,9 +16,9 @@ import pytest
 
 from pcdata import CachedCloudDataset
 from pcdata.errors import CacheError
-from pcdata.io.hdf5_arrays import fletcher32
-from pcdata.io.stored_arrays import stored_arrays
-from pcdata.io.stores import STORES
+from pcdata.io.arrays.hdf5_arrays import fletcher32
+from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.store.stores import STORES
 from tests.io.forged import dataset, foreign, foreign_refused, refused, stored
 from tests.warm import run_python
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pcdata.io.record import record_from_cloud
-from pcdata.io.stores import STORES
+from pcdata.io.store.record import record_from_cloud
+from pcdata.io.store.stores import STORES
 from tests.io.forged import cloud, refused, stored, zip_of
 
 # -- .pt -----------------------------------------------------------------------------------------------------------

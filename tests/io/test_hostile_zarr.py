@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from pcdata.errors import CacheError, PcdataError
-from pcdata.io.stored_arrays import stored_arrays
-from pcdata.io.zarr_codecs import COMPRESSORS, FILTERS, decoder_of
+from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.arrays.zarr_codecs import COMPRESSORS, FILTERS, decoder_of
 from tests.io.memory import memory_limit
 
 ARRAY = np.arange(48, dtype="<f4").reshape(4, 4, 3)

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
-from pcdata.array_files.npz import write_npz
-from pcdata.array_files.zip_archive import ZipArchive
 from pcdata.errors import CacheError
+from pcdata.files.npz import write_npz
+from pcdata.files.zip_archive import ZipArchive
 from tests.io.forged import foreign, foreign_refused, npy, raw_deflate, refused, zip_of
 
 # -- zip archives --------------------------------------------------------------------------------------------------

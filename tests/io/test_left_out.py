@@ -14,9 +14,9 @@ from pcdata.build import build_dataset
 from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
-from pcdata.io.averaged import AveragedSource
-from pcdata.io.manifest import Manifest
-from pcdata.io.selection import open_selected, read_skip_file
+from pcdata.io.sources.averaged import AveragedSource
+from pcdata.io.sources.selection import open_selected, read_skip_file
+from pcdata.io.store.manifest import Manifest
 from pcdata.report.inspection import skipped_text
 
 SIZE = (24, 32)

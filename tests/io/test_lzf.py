@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError
-from pcdata.io import lzf
+from pcdata.io.clouds import lzf
 
 
 def decode_by_the_book(stream: bytes) -> bytes:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pcdata.errors import CacheError, PcdataWarning
-from pcdata.io.manifest import FILE_NAME, SCHEMA, Manifest, Sample, checksum_of, key_of
+from pcdata.io.store.manifest import FILE_NAME, SCHEMA, Manifest, Sample, checksum_of, key_of
 
 GOOD = {
     "format": "npz",

@@ -11,7 +11,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from pcdata.errors import CaptureError
-from pcdata.io.matlab import numeric_arrays
+from pcdata.io.arrays.matlab import numeric_arrays
 
 KINDS = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
 LIMIT = 1 << 20

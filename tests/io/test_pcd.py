@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError, NonFiniteError, PcdataError, ShapeError, UnitError
-from pcdata.io import lzf, read_pcd, write_pcd
+from pcdata.io import read_pcd, write_pcd
+from pcdata.io.clouds import lzf
 from pcdata.structures import Kind, PointCloud
 from tests.messages import told
 

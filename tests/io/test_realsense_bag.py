@@ -12,7 +12,7 @@ import torch
 
 from pcdata import DepthFrame, open_source
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PoseError, UnitError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 typesys = pytest.importorskip("rosbags.typesys")

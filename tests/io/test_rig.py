@@ -13,9 +13,9 @@ import torch
 
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError, UnitError
 from pcdata.io import Calibration, open_source, write_capture_camera, write_color, write_depth, write_pcd
-from pcdata.io.capture_camera import CaptureCamera, read_capture_camera
-from pcdata.io.raw import write_capture
-from pcdata.io.rig import RigSource
+from pcdata.io.calibration.capture_camera import CaptureCamera, read_capture_camera
+from pcdata.io.sources.rig import RigSource
+from pcdata.io.writers.capture import write_capture
 from pcdata.structures import Camera, Confidence, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame

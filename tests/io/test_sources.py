@@ -16,8 +16,8 @@ from scipy.io import savemat
 
 from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, UnitError
 from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
-from pcdata.io.sample_names import in_order
-from pcdata.io.source import Source
+from pcdata.io.sources.sample_names import in_order
+from pcdata.io.sources.source import Source
 from pcdata.structures import DepthFrame, PointCloud
 from tests.messages import told
 

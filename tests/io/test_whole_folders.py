@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pcdata.io.whole_folders import complete_or_nothing, scratch_beside
+from pcdata.files.whole_folders import complete_or_nothing, scratch_beside
 
 pytest.importorskip("fcntl")
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import INNER, why_unavailable
-from pcdata.functional import rigid
-from pcdata.functional.depth import Deprojected
+from pcdata.contracts.dispatch import INNER, why_unavailable
+from pcdata.functional.depth.deproject import Deprojected
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")
@@ -175,7 +175,7 @@ def test_a_depth_that_cannot_be_gets_the_reference_s_error(bad):
 
 
 def test_gradients_reach_the_depth():
-    from pcdata.functional.depth import deproject_images
+    from pcdata.functional.depth.deproject import deproject_images
 
     depth = depth_image().requires_grad_()
     deproject_images(depth, K.repeat(3, 1, 1), None, None, {}).points.sum().backward()

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pcdata import functional as F
-from pcdata.dispatch import OPERATIONS, why_unavailable
+from pcdata.contracts.dispatch import OPERATIONS, why_unavailable
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import ptr_from_counts
-from pcdata.kernels import native
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.kernels.cpu import native
 from tests.warm import run_python
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
@@ -369,7 +369,7 @@ def test_working_space_is_at_most_a_hundred_bytes_per_point(organised: bool):
     code = f"""
         import resource, torch
         from pcdata import functional as F
-        from pcdata.kernels import native
+        from pcdata.kernels.cpu import native
         native.library()
         torch.set_num_threads(2)
         v, u = torch.meshgrid(torch.arange({side}), torch.arange({side}), indexing="ij")

@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import OPERATIONS, why_unavailable
+from pcdata.contracts.dispatch import OPERATIONS, why_unavailable
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.clusters import dbscan
-from pcdata.functional.grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.outliers import radius_outlier_mask
-from pcdata.functional.ragged import ptr_from_counts
-from pcdata.kernels import native
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.kernels.cpu import native
 from tests.warm import run_python
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))

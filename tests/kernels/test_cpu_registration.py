@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import OPERATIONS, why_unavailable
+from pcdata.contracts.dispatch import OPERATIONS, why_unavailable
 from pcdata.errors import CaptureError
-from pcdata.functional import rigid
-from pcdata.functional.depth_registration import RegisteredDepth
+from pcdata.functional.depth.depth_to_color import RegisteredDepth
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import INNER, why_unavailable
-from pcdata.functional import rigid
-from pcdata.functional.ragged import pick_rows, ptr_after_mask, ptr_from_counts
+from pcdata.contracts.dispatch import INNER, why_unavailable
+from pcdata.functional.rows import pick_rows, ptr_after_mask, ptr_from_counts, transform_points
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")
@@ -156,7 +156,7 @@ def test_float64_points_and_foreign_shapes_go_to_the_reference():
     assert ours.dtype == theirs.dtype == torch.float64
     assert torch.equal(ours, theirs)
     with pytest.raises((RuntimeError, IndexError)):
-        rigid.transform_points(torch.rand(4, 3), torch.tensor([0, 2, 4]), motions(1))
+        transform_points(torch.rand(4, 3), torch.tensor([0, 2, 4]), motions(1))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])

@@ -19,13 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pcdata.dispatch import why_unavailable
-from pcdata.functional.depth import deproject_depth
+from pcdata.contracts.dispatch import why_unavailable
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample
-from pcdata.kernels import native
+from pcdata.kernels.cpu import native
 
 REASON = why_unavailable("cpu")
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
@@ -262,7 +262,7 @@ def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses,
 
 def test_inlier_counts_equal_the_reference():
     from pcdata.functional import planes
-    from pcdata.kernels import cpu_sampling
+    from pcdata.kernels.cpu import sampling as cpu_sampling
 
     points, ptr = organised(100, 101), torch.tensor([0, 4000, 4003, 10100])
     triples, which = planes._draw_triples([4000, 3, 6097], 77, [0, 1, 2])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 

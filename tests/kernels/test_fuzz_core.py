@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from pcdata import functional as F
-from pcdata.dispatch import INNER, OPERATIONS, why_unavailable
+from pcdata.contracts.dispatch import INNER, OPERATIONS, why_unavailable
 from pcdata.errors import PcdataError, add_note
-from pcdata.functional.grid import ImageGrid
-from pcdata.functional.ragged import ptr_from_counts
-from pcdata.kernels import native
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.kernels.cpu import native
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import BackendError, TooFewPointsError
 from pcdata.functional.neighbors import ball_query
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.kernels import torch_cluster as backend
 

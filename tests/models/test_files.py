@@ -19,8 +19,8 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import CacheError, ConfigError, MissingExtraError
 from pcdata.exports.zarr_v2 import RowWriter
-from pcdata.io import zarr_codecs
-from pcdata.io.zarr_arrays import zarr_array, zarr_names
+from pcdata.io.arrays import zarr_codecs
+from pcdata.io.arrays.zarr_arrays import zarr_array, zarr_names
 from pcdata.models import CONTRACTS, check_files, preset
 from pcdata.models.pages import contract_page, index_page
 from pcdata.synthetic import SyntheticSource

@@ -10,7 +10,7 @@ import torch
 
 from pcdata.datasets import collate_fixed, collate_padded
 from pcdata.errors import DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.models import preset, to_frame, to_source
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud

@@ -14,7 +14,7 @@ from pcdata import Camera, DepthFrame, PointCloud
 from pcdata.build import BuildReport, BuiltSample
 from pcdata.errors import MissingExtraError
 from pcdata.io import open_source, write_ply
-from pcdata.io.source import Source
+from pcdata.io.sources.source import Source
 from pcdata.report import save_pipeline_figure, text_table
 from pcdata.report.inspection import build_text, capture_text
 from pcdata.synthetic import tabletop

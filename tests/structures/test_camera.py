@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError, DeviceError, DTypeError, NonFiniteError, ShapeError
-from pcdata.functional.depth import deproject_depth
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.structures import Camera
 
 SIZE = (48, 64)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
-from pcdata.functional import rigid
-from pcdata.functional.ragged import ptr_from_counts
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.geometry import rigid
 from pcdata.structures import METRE, NORMALIZED, Kind, PointCloud
 from tests.factories import assert_same, base_from_camera, cloud_in_base, cloud_in_camera, differences, tree
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from pcdata.errors import ShapeError
-from pcdata.functional import rigid
+from pcdata.functional.rows import transform_points
+from pcdata.geometry import rigid
 from pcdata.structures import Camera, DepthFrame, register_to_color
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Deproject
@@ -42,7 +43,7 @@ def registered(scene, color) -> DepthFrame:
 def test_points_keep_their_place_in_the_world_and_lie_on_the_surfaces(scene, color, registered):
     torch.testing.assert_close(registered.world_from_camera, color.world_from_camera)
     cloud = Deproject()(registered)
-    in_base = rigid.transform_points(cloud.points, cloud.ptr, registered.world_from_camera)
+    in_base = transform_points(cloud.points, cloud.ptr, registered.world_from_camera)
     distance = scene.surface_distance(in_base)
     assert float(distance.median()) < 0.003
     assert float((distance > 0.01).float().mean()) < 0.01

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from pcdata.errors import CacheError, CaptureError, ConfigError, FrameError, VolumeTooLargeError
-from pcdata.functional import rigid
-from pcdata.functional.depth import deproject_depth
+from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.neighbors import knn
+from pcdata.functional.rows import transform_points
 from pcdata.io import open_source, write_ply
 from pcdata.structures import TSDFVolume
 from pcdata.synthetic import tabletop
@@ -141,7 +141,7 @@ def test_what_was_seen_is_covered(exact):
     truth = SCENE.truth
     every = 97  # pixels: a sample of the visible surface
     points, ptr, _ = deproject_depth(truth.depth.float(), truth.camera.intrinsics)
-    seen = rigid.transform_points(points, ptr, truth.world_from_camera)[::every]
+    seen = transform_points(points, ptr, truth.world_from_camera)[::every]
     _, distance = knn(exact.points, queries=seen, k=1)
     assert float((distance[:, 0] < 0.004).float().mean()) > 0.99
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.synthetic import Miscalibration, look_at, tabletop
 
 SMALL = (60, 80)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError
-from pcdata.functional.sensor_noise import facing_depth
+from pcdata.functional.depth.sensor_noise import facing_depth
 from pcdata.rng import seeded
 from pcdata.structures import Camera
 from pcdata.synthetic import SensorNoise, Tabletop, look_at, tabletop

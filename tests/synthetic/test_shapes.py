@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.synthetic import Box, Cylinder, Shape, Sphere
 

@@ -172,7 +172,7 @@ def test_a_standing_cylinder_seen_from_above_covers_its_cap() -> None:
 
 
 def test_a_distorted_camera_sees_the_same_surfaces() -> None:
-    from pcdata.functional.lens import undistort_normalized
+    from pcdata.geometry.lens import undistort_normalized
 
     lens = (0.05, -0.08, 0.001, -0.0005, 0.01)
     camera = Camera.pinhole(fx=150.0, fy=152.0, cx=80.0, cy=58.0, size=SMALL, distortion=lens)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pcdata.errors import ConfigError, PoseError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms import RandomFlip, RandomRotation, RandomScale, RandomTranslation

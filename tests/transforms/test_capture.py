@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from pcdata.dispatch import why_unavailable
+from pcdata.contracts.dispatch import why_unavailable
 from pcdata.structures import Camera, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Compose, CropWorkspace, Deproject, MaskDepth, RandomJitter, ToFrame
@@ -64,7 +64,7 @@ def step_by_step(chain: Compose, frame: DepthFrame) -> PointCloud:
 def bodies(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Once with the compiled kernels and once without."""
     if request.param == "references":
-        monkeypatch.setattr("pcdata.dispatch.AUTO_ORDER", {})
+        monkeypatch.setattr("pcdata.contracts.dispatch.AUTO_ORDER", {})
     elif why_unavailable("cpu") is not None:
         pytest.skip(str(why_unavailable("cpu")))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.errors import CaptureError, ConfigError, TooFewPointsError
-from pcdata.functional import rigid
+from pcdata.functional.rows import transform_points
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Deproject, MaskDepth, ToFrame
@@ -126,7 +126,7 @@ def test_the_history_of_the_capture_goes_on_in_every_cloud():
 def test_depth_is_z_and_not_the_length_of_the_ray():
     scene = tabletop(0, num_objects=0, num_views=1, size=(40, 60), floor=False)
     cloud = Deproject()(scene.frame)
-    in_base = rigid.transform_points(cloud.points, cloud.ptr, scene.truth.world_from_camera)
+    in_base = transform_points(cloud.points, cloud.ptr, scene.truth.world_from_camera)
     on_top = scene.truth.normals.reshape(-1, 3)[cloud.source_index, 2] > 0.99
     assert int(on_top.sum()) > 100
     assert float(in_base[on_top, 2].abs().max()) < 1e-5

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional import rigid
+from pcdata.functional.rows import transform_points
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
 from pcdata.transforms import CropCenter, DecimateDepth, Deproject, ResizeDepth
@@ -33,7 +33,7 @@ def scene():
 
 def in_base(frame: DepthFrame) -> torch.Tensor:
     cloud = Deproject()(frame)
-    return rigid.transform_points(cloud.points, cloud.ptr, frame.world_from_camera)
+    return transform_points(cloud.points, cloud.ptr, frame.world_from_camera)
 
 
 @each_step

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from pcdata.errors import ConfigError, FrameError
-from pcdata.functional import rigid
+from pcdata.functional.rows import transform_points
 from pcdata.functional.voxels import voxel_downsample
+from pcdata.geometry import rigid
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import (
@@ -114,7 +115,7 @@ def test_every_point_keeps_the_viewpoint_it_was_seen_from():
     assert torch.equal(merged.viewpoint_per_point(), views.viewpoint[merged.extra["view"]])
     matrix = MATRIX[None]
     moved = merged.transformed(matrix)
-    expected = rigid.transform_points(merged.viewpoint_per_point(), merged.ptr, matrix)
+    expected = transform_points(merged.viewpoint_per_point(), merged.ptr, matrix)
     assert torch.equal(moved.viewpoint_per_point(), expected)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.errors import FrameError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.structures import PointCloud
 from pcdata.transforms import EstimateNormals
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.errors import ConfigError, FrameError, NoPlaneError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop

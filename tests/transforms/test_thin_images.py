@@ -7,8 +7,8 @@ import torch
 
 import pcdata
 from pcdata import transforms as T
+from pcdata.alignment.patches import fit_depth_patches
 from pcdata.errors import PcdataError
-from pcdata.functional.depth_patches import fit_depth_patches
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame, register_to_color
 from tests.transforms.examples import ALL, NAMES

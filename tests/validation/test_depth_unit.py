@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata.functional.depth_unit import DepthUnit, encoded, unit_fits
+from pcdata.functional.depth.unit_fit import DepthUnit, encoded, unit_fits
 from pcdata.io import open_source
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import look_at, tabletop
 from pcdata.validation import Check, Limits, Verdict
-from pcdata.validation.depth_unit import depth_unit_check
+from pcdata.validation.checks.depth_unit import depth_unit_check
 
 UNITS = [
     DepthUnit(0.001),

@@ -11,7 +11,7 @@ from torch import Tensor
 import pcdata
 from pcdata import validate_frame
 from pcdata.errors import ConfigError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, tabletop
 from pcdata.validation import Check, Limits, Verdict

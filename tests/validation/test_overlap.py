@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.errors import ConfigError, FrameError, ShapeError, UnitError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.io import open_source
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import Miscalibration, tabletop

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata import validate_frame, validate_source
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import look_at, tabletop
 from pcdata.validation import WHOLE, Check, SampleReport, Verdict

@@ -17,7 +17,7 @@ from PIL import Image
 
 from pcdata import open_source, validate_frame, validate_source
 from pcdata.errors import CaptureError, DTypeError
-from pcdata.functional import rigid
+from pcdata.geometry import rigid
 from pcdata.io import read_depth, write_pcd
 from pcdata.report.validation import validation_text
 from pcdata.structures import DepthFrame, PointCloud

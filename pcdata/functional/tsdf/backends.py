@@ -1,6 +1,7 @@
 """Which body computes a step of fusion: the plain torch reference on any device, or the compiled core on the CPU.
 
-These steps change a volume in place, which an operation of :mod:`pcdata.dispatch` must not; the choice is the same.
+These steps change a volume in place, which an operation of :mod:`pcdata.contracts.dispatch` must not; the choice is
+the same.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.dispatch import BACKEND_MODULES, REFERENCE, backends, first_live, why_unavailable
+from pcdata.contracts.dispatch import BACKEND_MODULES, REFERENCE, backends, first_live, why_unavailable
 from pcdata.errors import BackendError, near_matches
 from pcdata.functional.tsdf import integrate, marching, surface, views
 from pcdata.functional.tsdf.blocks import VoxelBlocks

@@ -11,9 +11,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
+from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
 
 _TOGETHER = 512  # blocks
 Edge = tuple[int, int]  # the corners it joins; corner c lies at (c & 1, c >> 1 & 1, c >> 2)

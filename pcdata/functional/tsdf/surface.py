@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.functional.ragged import pick_rows
-from pcdata.functional.tsdf.apron import SIDE, Neighbourhood, own_places
+from pcdata.functional.rows import pick_rows
 from pcdata.functional.tsdf.blocks import COLOR_SCALE, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS, VoxelGrid
+from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
 
 _TOGETHER = 512  # blocks read in one go: 0.7 million voxels with their margins
 # Ends of one edge that differ by more lie on two surfaces: the front of one seen past the edge of another. A surface

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.functional import rigid
-from pcdata.functional.lens import fold_radius
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
+from pcdata.geometry import rigid
+from pcdata.geometry.lens import fold_radius
 
 Weighting = Literal["constant", "inverse_square", "angle"]
 Carving = Literal["never", "near", "everywhere"]  # see structures.TSDFVolume
@@ -52,7 +52,7 @@ def pack_colors(colors: Tensor) -> Tensor:
 
 def fit_labels(labels: Tensor) -> bool:
     """Say whether int64 labels fit the 32 bits of a voxel."""
-    found = labels.numpy() if labels.device.type == "cpu" else labels  # see pcdata.checks on NumPy
+    found = labels.numpy() if labels.device.type == "cpu" else labels  # see pcdata.contracts.tensors on NumPy
     return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
 
 

@@ -1,0 +1,73 @@
+"""The one loop of point-to-plane alignment: match, step, match again, over search distances from coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pcdata.geometry.robust import TUKEY_CUT
+from pcdata.geometry.small_motions import motion_from_twist
+
+
+class Step(NamedTuple):
+    """What one round of matching says about V views."""
+
+    twist: Tensor  # (V, 6) float64 about the pivot: where least squares would move them
+    settled: bool  # the step is too small to matter
+    spread: float  # of the residuals: a search distance within it would keep what fits by chance
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where the rounds ended."""
+
+    motions: Tensor  # (V, 4, 4) float64
+    reach: float  # the last search distance that was used
+    iterations: int  # over all distances
+    settled: bool  # the last distance ended because the step was small
+    lost: bool  # the surfaces ceased to overlap on the way
+
+
+def descend(
+    measure: Callable[[Tensor, float], Step | None],
+    motions: Tensor,  # (V, 4, 4) float64
+    pivot: Tensor,  # (3,)
+    distances: Sequence[float],
+    *,
+    max_iterations: int,
+) -> Descent:
+    """Take Gauss-Newton steps at each search distance, from coarse to fine, until they are small.
+
+    Along a weak direction a step may go too far, by as much as it came; a part of it ends the swinging. The distances
+    end before they fall within the spread of the residuals: such a cut would keep the partners that fit by chance and
+    throw out what could correct them.
+
+    Args:
+        measure: matches the surfaces under the motions within a distance; None = they do not overlap.
+        motions: where to start.
+        pivot: about which the twists act.
+        distances: between partners, descending.
+        max_iterations: per distance.
+    """
+    iterations, settled, reach = 0, False, distances[0]
+    step: Step | None = None
+    for distance in distances:
+        if step is not None and distance < TUKEY_CUT * step.spread:
+            break
+        reach, settled = distance, False
+        share, last = 1.0, torch.zeros(len(motions), 6, dtype=torch.float64, device=motions.device)
+        for _ in range(max_iterations):
+            step = measure(motions, distance)
+            if step is None:
+                return Descent(motions, reach, iterations, settled=False, lost=True)
+            share, last = 0.5 * share if float((step.twist * last).sum()) < 0 else share, step.twist
+            motions = motion_from_twist(share * step.twist, pivot) @ motions
+            iterations += 1
+            if step.settled:
+                settled = True
+                break
+    return Descent(motions, reach, iterations, settled, lost=False)

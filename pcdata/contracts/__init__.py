@@ -1,0 +1,1 @@
+"""What an operation may assume: tensors, numbers and units are checked once, whichever body computes."""

@@ -1,0 +1,244 @@
+"""One public function per operation; several bodies may compute it.
+
+``@op`` marks the public function: its own body is the reference, plain torch on any device. ``@kernel`` registers a
+faster body beside it under a backend name; it receives arguments that already passed the contract, and must give the
+same result. ``backend="auto"`` takes the fastest live backend for the device, and the reference where a gradient is
+wanted and the operation gives one; naming an absent backend raises with the reason. Where the body that ``auto`` would
+take is absent, and a slow one serves, a :class:`~pcdata.errors.SlowBackendWarning` says so once.
+
+``@inner`` marks what only pcdata itself calls, with tensors that it has checked already (picking rows, moving points):
+kernels register beside it in the same way, but there is no contract to check and no ``backend`` to choose.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.tensors import check_tensors, parse_spec
+from pcdata.errors import BackendError, DTypeError, SlowBackendWarning, near_matches
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+REFERENCE = "torch"
+
+# Backend name -> module that registers its kernels when imported and defines `unavailable() -> str | None`.
+BACKEND_MODULES = {"cpu": "pcdata.kernels.cpu", "torch_cluster": "pcdata.kernels.torch_cluster"}
+
+# What `auto` tries, best first. torch_cluster is chosen only by name: it covers few calls.
+AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": ("cpu", REFERENCE), "cuda": (REFERENCE,)}
+
+
+@dataclass
+class Operation:
+    """A registered operation: its contract, its reference and its kernels."""
+
+    name: str
+    specs: dict[str, str]
+    reference: Callable[..., Any]
+    public: Callable[..., Any]
+    gradient: bool = True  # whether results carry one to the inputs
+    kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
+
+
+OPERATIONS: dict[str, Operation] = {}
+INNER: dict[str, Operation] = {}
+
+
+def op(*, gradient: bool = True, **specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Register the decorated reference as a public operation with a tensor contract per argument.
+
+    Row pointers given as None mean "one cloud" and reach the body as ``[0, N]``; float inputs must be finite. Kernels
+    get contiguous tensors without a gradient, whatever the caller's look like.
+
+    Args:
+        gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
+        specs: argument name -> contract, see :mod:`pcdata.contracts.tensors`.
+    """
+
+    def decorate(reference: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(reference)
+        name = reference.__name__
+        # Row pointers come last, when the number of rows is known.
+        ordered = dict(sorted(specs.items(), key=lambda item: parse_spec(item[1]).is_ptr))
+        # Row pointers may be None wherever they stand: that means one cloud.
+        required = [
+            key
+            for key, text in ordered.items()
+            if signature.parameters[key].default is inspect.Parameter.empty and not parse_spec(text).is_ptr
+        ]
+
+        @functools.wraps(reference)
+        def public(*args: P.args, **kwargs: P.kwargs) -> R:
+            bound = signature.bind(*args, **kwargs)
+            bound.apply_defaults()
+            arguments = bound.arguments
+            for key in required:
+                if arguments[key] is None:
+                    raise DTypeError(f"{name}: {key} must be a torch.Tensor, not None")
+            _fill_row_pointers(arguments, ordered)
+            check_tensors(name, arguments, ordered)
+            backend = arguments.pop("backend", "auto")
+            device = next(arguments[key].device for key in ordered if isinstance(arguments.get(key), Tensor))
+            wants_gradient = gradient and _wants_gradient(arguments.values())
+            if backend == "auto" and wants_gradient:
+                backend = REFERENCE  # kernels know no derivative
+            body: Callable[..., R] = _choose(operation, backend, device)
+            is_kernel = body is not operation.reference
+            if gradient and not is_kernel:
+                return body(**arguments)
+            tidy = _plain if is_kernel else _detached
+            with torch.no_grad():
+                return body(**{key: tidy(value) for key, value in arguments.items()})
+
+        operation = OPERATIONS[name] = Operation(name, ordered, reference, public, gradient)
+        return public
+
+    return decorate
+
+
+def inner(reference: Callable[P, R]) -> Callable[P, R]:
+    """Register the decorated reference as a function without a contract: its callers pass what they have checked.
+
+    The first tensor among its arguments, or inside mappings and sequences among them, says the device.
+    """
+    name = reference.__name__
+
+    @functools.wraps(reference)
+    def function(*args: P.args, **kwargs: P.kwargs) -> R:
+        tensors = list(_tensors_in((*args, *kwargs.values())))
+        if not tensors or _wants_gradient(tensors):
+            return reference(*args, **kwargs)
+        body: Callable[P, R] = _choose(operation, "auto", tensors[0].device)
+        return body(*args, **kwargs)
+
+    operation = INNER[name] = Operation(name, {}, reference, function)
+    return function
+
+
+def kernel(name: str, backend: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Register a faster body of operation ``name``; it is called with keyword arguments and no ``backend``.
+
+    The body of an inner function is called as the function was.
+    """
+
+    def decorate(body: Callable[P, R]) -> Callable[P, R]:
+        registry = OPERATIONS if name in OPERATIONS else INNER
+        registry[name].kernels[backend] = body
+        return body
+
+    return decorate
+
+
+@functools.cache
+def why_unavailable(backend: str) -> str | None:
+    """Load a backend; return None when it is live, else the reason and what to do."""
+    if backend == REFERENCE:
+        return None
+    module = importlib.import_module(BACKEND_MODULES[backend])
+    reason: str | None = module.unavailable()
+    return reason
+
+
+def backends() -> list[str]:
+    """Every backend name that ``backend=`` accepts besides ``"auto"``."""
+    return [REFERENCE, *BACKEND_MODULES]
+
+
+def _fill_row_pointers(arguments: dict[str, Any], specs: dict[str, str]) -> None:
+    rows_of = {
+        spec.dims[0]: arguments[key]
+        for key, text in specs.items()
+        if not (spec := parse_spec(text)).is_ptr and isinstance(arguments.get(key), Tensor) and arguments[key].ndim
+    }
+    for key, text in specs.items():
+        spec = parse_spec(text)
+        if spec.is_ptr and arguments.get(key) is None and spec.dims[0] in rows_of:
+            rows = rows_of[spec.dims[0]]
+            arguments[key] = torch.tensor([0, rows.shape[0]], dtype=torch.int64, device=rows.device)
+
+
+def _wants_gradient(arguments: Iterable[Any]) -> bool:
+    return torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in arguments)
+
+
+def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
+    for one in arguments:
+        if isinstance(one, Tensor):
+            yield one
+        elif isinstance(one, Mapping):
+            yield from _tensors_in(one.values())
+        elif isinstance(one, (list, tuple)):
+            yield from _tensors_in(one)
+
+
+def _detached(value: Any) -> Any:
+    return value.detach() if isinstance(value, Tensor) and value.requires_grad else value
+
+
+def _plain(value: Any) -> Any:
+    """Return a tensor as kernels read memory: row after row, without gaps, and no part of a graph."""
+    return _detached(value).contiguous() if isinstance(value, Tensor) else value
+
+
+def first_live(device: torch.device, has_kernel: Callable[[str], bool]) -> str:
+    """Return the backend that ``auto`` takes: the first for the device that is live and has a kernel.
+
+    Warns:
+        SlowBackendWarning: once, if a faster one has a kernel but is absent.
+    """
+    for name in AUTO_ORDER.get(device.type, (REFERENCE,)):
+        if name == REFERENCE:
+            break
+        reason = why_unavailable(name)  # loads the kernels, if any
+        if not has_kernel(name):
+            continue
+        if reason is None:
+            return name
+        _warn_of_slow_bodies(reason)
+    return REFERENCE
+
+
+@functools.cache
+def _warn_of_slow_bodies(reason: str) -> None:
+    # A process that another one started (a loader's worker, a build's) leaves the word to that one.
+    if multiprocessing.parent_process() is None:
+        warnings.warn(
+            f"operations on the CPU run in plain torch, many times slower than compiled: {reason}",
+            SlowBackendWarning,
+            stacklevel=2,
+        )
+
+
+def warn_if_slow() -> None:
+    """Give the warning of :func:`first_live` now, where worker processes that stay silent are about to be started."""
+    if (reason := why_unavailable("cpu")) is not None:
+        _warn_of_slow_bodies(reason)
+
+
+def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:
+    if backend == "auto":
+        backend = first_live(device, operation.kernels.__contains__)
+    if backend == REFERENCE:
+        return operation.reference
+    if backend not in BACKEND_MODULES:
+        raise BackendError(
+            f"{operation.name}: unknown backend {backend!r}; known: 'auto', {', '.join(map(repr, backends()))}"
+            f"{near_matches(str(backend), ['auto', *backends()])}"
+        )
+    reason = why_unavailable(backend)
+    if reason is not None:
+        raise BackendError(f"{operation.name}: backend {backend!r} is not available: {reason}")
+    if backend not in operation.kernels:
+        raise BackendError(f"{operation.name}: backend {backend!r} has no kernel for it; use backend='auto'")
+    return operation.kernels[backend]

@@ -1,0 +1,53 @@
+"""Fast answers about tensors in host memory: finite, negative, rising, how many.
+
+On the CPU these work through NumPy, on one thread: the OpenMP threads that torch would wake spin for ten milliseconds
+after every operation, and would take the cores from the kernel that is about to start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def all_finite(values: Tensor) -> bool:
+    """Say whether no value is NaN or infinite."""
+    if values.device.type == "cpu":
+        return bool(np.isfinite(values.detach().numpy()).all())
+    return bool(torch.isfinite(values).all())
+
+
+def any_negative(values: Tensor) -> bool:
+    """Say whether a value is below 0; NaN is not."""
+    if values.device.type == "cpu":
+        return bool((values.detach().numpy() < 0).any())
+    return bool((values < 0).any())
+
+
+def count_true(mask: Tensor) -> int:
+    """Count the true values of a mask."""
+    return int(np.count_nonzero(mask.numpy())) if mask.device.type == "cpu" else int(mask.sum())
+
+
+def negated(mask: Tensor) -> Tensor:
+    """Return the mask that is true where this one is false."""
+    return torch.from_numpy(~mask.numpy()) if mask.device.type == "cpu" else ~mask
+
+
+def equal_values(a: Tensor, b: Tensor) -> bool:
+    """Say whether two tensors of one shape hold the same values."""
+    return bool(np.array_equal(a.numpy(), b.numpy())) if a.device.type == "cpu" else torch.equal(a, b)
+
+
+def rising(values: Tensor, ptr: Tensor) -> bool:
+    """Say whether the (N,) values of every segment rise strictly."""
+    starts = ptr[1:-1]
+    starts = starts[(starts > 0) & (starts < len(values))]
+    if values.device.type == "cpu":
+        array = values.numpy()
+        rises = torch.from_numpy(array[1:] > array[:-1])
+    else:
+        rises = values[1:] > values[:-1]
+    rises[starts - 1] = True
+    return count_true(rises) == len(rises)

@@ -1,0 +1,173 @@
+"""Hidden folders to write in beside the place where the result goes, and what killed processes left of theirs.
+
+A scratch folder carries the machine and process that made it in its name, and a lock that ends with that process
+however it ends. So a folder whose owner lives is never touched, and one whose owner is dead is removed by the next
+writer.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import platform
+import shutil
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Literal
+
+from pcdata.errors import CacheError, write_fault
+from pcdata.files.interrupts import shielded
+from pcdata.files.locks import try_lock
+
+Note = Callable[[str], None]  # tell the user what is no error
+
+PARTIAL = "partial"  # what is being written
+RETIRED = "retired"  # what was under the name, until the new folder is: to be put back
+REPLACED = "replaced"  # what was under the name before the new folder: to be deleted
+
+_FRESH = 60.0  # seconds: a folder so new may not be locked yet
+_LOCKING = 0.2  # seconds from making a folder to locking it, at most
+_LONGEST = 150  # bytes of a name that hidden names can carry, of the 255 that a file name may have
+
+
+def silent(text: str) -> None:
+    """Tell nobody."""
+
+
+@contextmanager
+def scratch_beside(folder: Path, *, alone: bool = False, note: Note = silent) -> Iterator[Path]:
+    """Give an empty hidden folder on the file system of ``folder``; it is removed at the end, with what is still in it.
+
+    Args:
+        folder: the name to write beside; parents that are missing are made, and removed again on failure.
+        alone: refuse where another process has such a folder now.
+        note: told what was found of killed processes.
+
+    Raises:
+        CacheError: nothing can be written there, or another process writes there.
+    """
+    partial = folder.with_name(hidden_name(folder, PARTIAL))
+    created = [parent for parent in folder.parents if not parent.exists()]
+    lock: int | None = None
+    try:
+        try:
+            partial.mkdir(parents=True)
+        except OSError as error:
+            raise CacheError(f"{folder}: cannot write there: {write_fault(error)}") from error
+        lock, _ = try_lock(partial)
+        _settle_others(folder, partial, alone, note)
+        yield partial
+    except BaseException:
+        with shielded():
+            shutil.rmtree(partial, ignore_errors=True)
+            with suppress(OSError):  # not empty: somebody else uses it
+                for parent in created:
+                    parent.rmdir()
+        raise
+    finally:
+        with shielded():
+            shutil.rmtree(partial, ignore_errors=True)
+            if lock is not None:
+                os.close(lock)
+
+
+def hidden_name(folder: Path, what: str) -> str:
+    """Return a new name for a hidden neighbour of a folder; it says who made it, and when."""
+    return f"{_prefix(folder, what)}{platform.node()}-{os.getpid()}-{time.time_ns():x}{uuid.uuid4().hex[:4]}"
+
+
+def retired_of(folder: Path) -> list[Path]:
+    """Return what killed overwrites of a folder had set aside, the newest first."""
+    with suppress(OSError):
+        return sorted(hidden_neighbours(folder, RETIRED), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+    return []
+
+
+def hidden_neighbours(folder: Path, what: str) -> list[Path]:
+    """Return the hidden neighbours of one kind that a folder has."""
+    return sorted(folder.parent.glob(glob.escape(_prefix(folder, what)) + "*"))
+
+
+def _prefix(folder: Path, what: str) -> str:
+    name = os.fsencode(folder.name)
+    return f".{folder.name if len(name) <= _LONGEST else hashlib.sha256(name).hexdigest()[:32]}.{what}-"
+
+
+def _settle_others(folder: Path, own: Path, alone: bool, note: Note) -> None:
+    """Remove what dead processes left; refuse to be the second writer where only one may be."""
+    try:
+        others = [path for path in hidden_neighbours(folder, PARTIAL) if path != own]
+    except OSError:  # a folder that may be written but not listed
+        return
+    for other in others:
+        made_by = other.name.removeprefix(_prefix(folder, PARTIAL))
+        state, lock = _owner(other, made_by)
+        if state == "dead":
+            shutil.rmtree(other, ignore_errors=True)
+            note(f"removed {other.name}, which a killed process had left")
+        elif alone and state == "alive" and _made(made_by) < _made(own.name):  # of two at once, the first goes on
+            raise CacheError(
+                f"{folder}: another process writes it now (see {other}); wait until that ends, or choose another folder"
+            )
+        elif alone and state == "unknown":
+            note(f"{other} was left by a process of which nothing is known here; remove it if that has ended")
+        if lock is not None:
+            os.close(lock)
+
+
+def _made(name: str) -> str:
+    """Return the part of a name that grows with time."""
+    return name.rsplit("-", 1)[-1]
+
+
+def _owner(scratch: Path, made_by: str) -> tuple[Literal["alive", "dead", "unknown"], int | None]:
+    """Say what became of the process that made a scratch folder; of a dead one the lock is taken over."""
+    try:
+        node, pid = made_by.rsplit("-", 2)[:2]
+        here, number = node == platform.node(), int(pid)
+    except ValueError:
+        return "unknown", None
+    if not here:
+        # Whether locks reach across machines depends on the file system: one that is held is sure, a free one is not.
+        lock, held = try_lock(scratch)
+        if lock is not None:
+            os.close(lock)
+        return ("alive" if held else "unknown"), None
+    deadline = time.monotonic() + _LOCKING
+    while True:
+        lock, held = try_lock(scratch)
+        if held:
+            return "alive", None
+        if not _runs(number):
+            return "dead", lock
+        if lock is None:  # no locks here: the process alone tells
+            return "alive", None
+        with suppress(OSError):
+            if time.time() - scratch.stat().st_mtime > _FRESH:  # another process has the number now
+                return "dead", lock
+        os.close(lock)
+        if time.monotonic() > deadline:
+            return "unknown", None
+        time.sleep(_LOCKING / 10)
+
+
+def _runs(pid: int) -> bool:
+    """Say whether a process of this machine may be running."""
+    if sys.platform == "win32":  # there, signal 0 would end it
+        return True
+    with suppress(OSError):
+        # Killed, but not yet collected by its parent: "123 (name) Z ...", where the name may hold anything.
+        if Path(f"/proc/{pid}/stat").read_bytes().rsplit(b")", 1)[1].split()[0] == b"Z":
+            return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's
+        return True
+    return True

@@ -1,0 +1,1 @@
+"""Depth images: to points and back, averaged, filled, resampled, registered to color."""

@@ -1,0 +1,62 @@
+"""Readings that hang in the air between two surfaces."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import op
+from pcdata.errors import ConfigError
+from pcdata.functional.depth.deproject import check_lengths
+
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbours is compared once
+
+
+@op(depth="V H W")
+def flying_pixel_mask(
+    depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
+    *,
+    tolerance: float = 0.02,
+    min_neighbors: int = 3,
+    backend: str = "auto",
+) -> Tensor:  # (V, H, W) bool, True = flying pixel
+    """Mark readings beside a depth edge that share a surface with too few of their eight neighbours.
+
+    Two neighbours share a surface if their depths differ by at most ``tolerance`` times the nearer one; two readings
+    that do not lie across an edge from each other. Relative to depth, the slope of a surface gives the same difference
+    at any distance: 0.02 bears one tilted by 85 degrees at 600 pixels focal length. Lines that are one pixel wide go as
+    well (their pixels have two neighbours); a reading with nothing but holes around it stays.
+
+    Args:
+        depth: the images.
+        tolerance: as a part of the depth; sensor noise of three standard deviations should fit in.
+        min_neighbors: 1..8 neighbours that a good reading has on its surface.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        ConfigError: a parameter out of range.
+        CaptureError: a negative depth.
+    """
+    where = "flying_pixel_mask"
+    if not tolerance > 0 or not 1 <= min_neighbors <= 8:
+        raise ConfigError(
+            f"{where}: needs tolerance > 0 and min_neighbors 1..8, got {tolerance}, {min_neighbors}; to keep every "
+            "pixel leave the step out"
+        )
+    check_lengths(where, "depth", depth)
+    height, width = depth.shape[1:]
+    on_surface = torch.zeros_like(depth, dtype=torch.uint8)
+    at_edge = torch.zeros_like(depth, dtype=torch.bool)
+    for down, across in _DIRECTIONS:
+        if down >= height or abs(across) >= width:
+            continue
+        here = (..., slice(0, height - down), slice(max(0, -across), width - max(0, across)))
+        there = (..., slice(down, height), slice(max(0, across), width - max(0, -across)))
+        nearer = torch.minimum(depth[here], depth[there])
+        both = nearer > 0
+        same = both & ((depth[here] - depth[there]).abs() <= tolerance * nearer)
+        edge = both & ~same
+        for side in (here, there):
+            on_surface[side] += same
+            at_edge[side] |= edge
+    return at_edge & (on_surface < min_neighbors)

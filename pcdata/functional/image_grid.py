@@ -1,0 +1,91 @@
+"""The depth image that an organized cloud still lies on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.host import rising
+from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
+from pcdata.functional.rows import counts_from_ptr
+
+# Kernels number the pixels of an image, with a margin around it, in 63 bits.
+_MOST_PIXELS = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Where each point of a packed batch sits in its view's depth image.
+
+    Operations that take a grid give the same answer without it; it lets a kernel search a window of pixels instead of
+    space. That is fast while the points are the back-projection of those pixels, up to a rigid motion that
+    ``camera_from_points`` undoes. It is never wrong: kernels prove each window from the points themselves, so a grid
+    that does not fit (points denoised, jittered or scaled since, a forgotten motion, a lens that bends the rows) only
+    loses the speed. Points that were masked out are no points: leave their pixels out too.
+    """
+
+    pixel_index: Tensor  # (N,) int64, v * width + u within the cloud's own image, increasing within a cloud
+    size: tuple[int, int]  # (height, width) of every image
+    intrinsics: Tensor  # (B, 3, 3) pixels
+    camera_from_points: Tensor | None = None  # (B, 4, 4) float, rigid; None = points are in their cameras' frames
+
+
+def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) -> None:
+    """Require that an image grid, when given, describes exactly these points: a kernel will trust it.
+
+    Raises:
+        ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
+            intrinsics or motions are not one per cloud, or the image is no image.
+        DTypeError: its pixels are not int64.
+        ConfigError: ``camera_from_points`` is not rigid.
+        DeviceError: it is on another device.
+    """
+    if grid is None:
+        return
+    pixel, (height, width) = grid.pixel_index, grid.size
+    if pixel.dtype is not torch.int64:
+        raise DTypeError(f"{where}: grid.pixel_index must be int64, not {pixel.dtype}; convert it with .long()")
+    if not (height >= 0 and width >= 0 and height * width <= _MOST_PIXELS):
+        raise ShapeError(
+            f"{where}: grid.size must be (height, width) of at most {_MOST_PIXELS} pixels in all, got {grid.size}"
+        )
+    if pixel.device != points.device:
+        raise DeviceError(f"{where}: grid is on {pixel.device} but points is on {points.device}; move one with .to()")
+    if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (len(ptr) - 1, 3, 3):
+        raise ShapeError(
+            f"{where}: grid has {tuple(pixel.shape)} pixels and {tuple(grid.intrinsics.shape)} intrinsics for "
+            f"{len(points)} points in {len(ptr) - 1} clouds; drop the grid, or select it together with the points"
+        )
+    if grid.camera_from_points is not None:
+        _check_rigid(where, grid.camera_from_points, len(ptr) - 1, points.device)
+    if len(pixel) == 0:
+        return
+    filled = counts_from_ptr(ptr) > 0
+    first, last = ptr[:-1][filled], ptr[1:][filled] - 1
+    # Where pixels rise, only the ends of a cloud can lie outside the image.
+    if not rising(pixel, ptr) or int(pixel[first].min()) < 0 or int(pixel[last].max()) >= height * width:
+        raise ShapeError(
+            f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
+            "the points were reordered or repeated since they were read, so pass grid=None"
+        )
+
+
+def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.device) -> None:
+    name = f"{where}: grid.camera_from_points"
+    if motion.shape != (num_clouds, 4, 4):
+        raise ShapeError(f"{name} must be ({num_clouds}, 4, 4), one per cloud, got {tuple(motion.shape)}")
+    if motion.device != device:
+        raise DeviceError(f"{name} is on {motion.device} but points is on {device}; move one with .to()")
+    wide = motion.double()
+    rotation, last = wide[:, :3, :3], wide[:, 3]
+    off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device=device)).abs().amax((1, 2))
+    off = torch.maximum(off, (last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1))
+    # Kernels allow for motions that stretch lengths by up to 5e-5; NaN fails too.
+    wrong = (~(off <= 2e-5) | ~torch.isfinite(wide).all(2).all(1)).nonzero().squeeze(1).tolist()
+    if wrong:
+        raise ConfigError(
+            f"{name}[{wrong[0]}] is not rigid: rotation^T rotation is off the identity by {float(off[wrong[0]]):.2g}; "
+            "a window of a scaled or sheared cloud proves nothing, so pass grid=None"
+        )

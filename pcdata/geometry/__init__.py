@@ -1,0 +1,1 @@
+"""Maths without clouds: rigid motions, lenses, planes, robust statistics."""

@@ -1,0 +1,130 @@
+"""Rigid motions and affine maps as 4x4 matrices that act on column vectors: ``p_to = to_from @ p_from``."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import PoseError, ShapeError
+
+
+def from_rotation_translation(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Assemble (..., 4, 4) float64 from (..., 3, 3) and (..., 3)."""
+    shape = rotation.shape[:-2]
+    if translation.shape[:-1] != shape:
+        shape = torch.broadcast_shapes(shape, translation.shape[:-1])
+    matrix = torch.zeros((*shape, 4, 4), dtype=torch.float64, device=rotation.device)
+    matrix[..., :3, :3] = rotation
+    matrix[..., :3, 3] = translation
+    matrix[..., 3, 3] = 1.0
+    return matrix
+
+
+def scaling(factors: Tensor) -> Tensor:
+    """Return (..., 4, 4) float64 matrices that scale by (..., 3) factors about the origin."""
+    return from_rotation_translation(torch.diag_embed(factors.double()), torch.zeros_like(factors))
+
+
+def rotation_about_axis(axis: Tensor, angle: Tensor) -> Tensor:
+    """Return (..., 3, 3) float64 rotations by ``angle`` (...,) radians about unit ``axis`` (..., 3), right-handed.
+
+    Source: Rodrigues' formula.
+    """
+    axis, angle = axis.double(), angle.double()
+    x, y, z = axis.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*axis.shape[:-1], 3, 3)
+    sine, cosine = angle.sin()[..., None, None], angle.cos()[..., None, None]
+    identity = torch.eye(3, dtype=torch.float64, device=axis.device)
+    return identity + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
+    """Return (..., 3, 3) float64 rotations from (..., 4) quaternions in (x, y, z, w) order, normalised first.
+
+    Raises:
+        PoseError: a quaternion of length 0, or not finite.
+    """
+    length = quaternion.double().norm(dim=-1, keepdim=True)
+    if not bool(((length > 0) & torch.isfinite(length)).all()):
+        raise PoseError("rotation_from_quaternion: a quaternion has length 0 or is not finite")
+    x, y, z, w = (quaternion.double() / length).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quaternion.shape[:-1], 3, 3)
+
+
+def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
+    """Require finite (..., 4, 4) matrices with an orthonormal, right-handed rotation and last row 0 0 0 1.
+
+    Raises:
+        ShapeError: the shape is not (..., 4, 4).
+        PoseError: any other fault, with what was found.
+    """
+    if pose.shape[-2:] != (4, 4):
+        raise ShapeError(f"{where}: a pose must be (..., 4, 4), got {tuple(pose.shape)}")
+    flat = pose.detach().double().reshape(-1, 4, 4)
+    for index, matrix in enumerate(flat):
+        name = f"{where}: pose {index}" if len(flat) > 1 else f"{where}: the pose"
+        if not bool(torch.isfinite(matrix).all()):
+            raise PoseError(f"{name} has NaN or infinite values (tracking lost?); drop this frame")
+        rotation = matrix[:3, :3]
+        error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=matrix.device)).abs().max())
+        if error > tolerance:
+            raise PoseError(
+                f"{name} is not rigid: R R^T differs from the identity by {error:.2g} (at most {tolerance:g}); "
+                "is there a scale in it, or is it transposed or truncated?"
+            )
+        if float(torch.linalg.det(rotation)) < 0:
+            raise PoseError(f"{name} is a mirror (determinant -1), not a rotation; check the axis convention")
+        if float((matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > 1e-6:
+            raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
+
+
+def is_rigid(matrix: Tensor, *, tolerance: float = 1e-5) -> bool:
+    """Say whether all (..., 4, 4) matrices are rotations and translations, or mirrors: they keep every distance."""
+    linear = matrix[..., :3, :3].double()
+    identity = torch.eye(3, dtype=torch.float64, device=matrix.device)
+    return bool(((linear @ linear.mT - identity).abs() <= tolerance).all())
+
+
+def invert_rigid(pose: Tensor) -> Tensor:
+    """Invert (..., 4, 4) rigid poses.
+
+    The inverse of what is there, not the transpose: recorded rotations are orthonormal to a few digits only, and 1e-4
+    off moves a point at 2 m by 0.2 mm on the way there and back.
+    """
+    rotation = torch.linalg.inv_ex(pose[..., :3, :3]).inverse  # unlike inv, it does not make a GPU wait
+    return from_rotation_translation(rotation, -(rotation @ pose[..., :3, 3:]).squeeze(-1))
+
+
+def map_poses(matrix: Tensor, poses: Tensor) -> Tensor:
+    """Move rigid (..., 4, 4) poses (grasps, objects) by a similarity (4,4): the scale moves positions, not rotations.
+
+    Raises:
+        PoseError: the matrix mirrors (a mirrored gripper is not a gripper) or scales axes differently.
+    """
+    matrix = matrix.double()
+    linear = matrix[..., :3, :3]
+    determinant = torch.linalg.det(linear)
+    if bool((determinant <= 0).any()):
+        raise PoseError("map_poses: the matrix mirrors (determinant <= 0); a mirrored pose does not exist")
+    scale = determinant ** (1.0 / 3.0)
+    rotation = linear / scale[..., None, None]
+    identity = torch.eye(3, dtype=torch.float64, device=matrix.device)
+    if float((rotation @ rotation.mT - identity).abs().max()) > 1e-6:
+        raise PoseError("map_poses: the matrix scales the axes differently, so rotations have no image under it")
+    moved = matrix @ poses.double()
+    return from_rotation_translation(rotation @ poses[..., :3, :3].double(), moved[..., :3, 3])
+
+
+def angle_between(a: Tensor, b: Tensor) -> Tensor:
+    """Return the (...,) angle in radians between vectors (..., 3), exact near 0 and pi."""
+    a, b = a.double(), b.double()
+    cross = torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-1).norm(dim=-1)
+    return torch.atan2(cross, (a * b).sum(-1)).clamp(0.0, math.pi)

@@ -1,0 +1,237 @@
+"""Intrinsics and poses from the small text files that travel with a capture."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pcdata.contracts.lengths import check_metres_per_unit
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, near_matches
+from pcdata.files.opening import map_npy, read_text, replacing
+from pcdata.files.strict_json import json_object
+from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
+from pcdata.geometry import rigid
+from pcdata.io.sources.option_checks import check_invalid_values
+from pcdata.structures import Camera
+
+_SHOWN = 8  # faults of a file in one message
+_REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
+_OPTIONAL = ("distortion", "metres_per_unit", "depth_encoding", "frame_id", "background_label", "invalid_values")
+_REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
+_DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
+_HINTS = {
+    "depth_scale": "depth_scale has three incompatible meanings; write metres_per_unit (0.001 for millimetres)",
+    "factor_depth": "write metres_per_unit = 1 / factor_depth",
+    "intrinsic_matrix": "write fx, fy, cx, cy as four numbers (Open3D stores the matrix column by column)",
+    "k": "write fx, fy, cx, cy as four numbers",
+    "coeffs": "write the lens coefficients as distortion",
+    "dist_coeffs": "write the lens coefficients as distortion",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureCamera:
+    """What a calibration file states of one camera."""
+
+    camera: Camera
+    metres_per_unit: float | None = None  # length of one stored depth unit; None = the file does not say
+    depth_encoding: DepthEncoding | None = None  # order of the stored bits; None = the file does not say
+    frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
+    background_label: int | None = None  # what means "no object" in the label images; None = the file does not say
+    invalid_values: tuple[int, ...] | None = None  # stored depth besides 0 that is no reading; None = not said
+
+
+def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
+    """Read the intrinsics of one camera from a JSON file.
+
+    Such as::
+
+        {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
+         "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
+
+    The last three are optional, as are ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
+    "swapped"), ``background_label``, the id that means "no object", and ``invalid_values``, a list of stored depths
+    besides 0 that mean "no reading"; ``notes``, ``sensor``, ``serial``, ``registered_to`` and ``date`` are free
+    remarks. Any other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
+
+    Raises:
+        CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
+        UnitError: ``metres_per_unit`` is not a number above 0 and at most 1, or ``depth_encoding`` is not known.
+    """
+    where = f"read_capture_camera: {path}"
+    data = json_object(where, read_text(where, path), error=CaptureError)
+    _check_keys(where, data)
+    width, height = (_whole(where, data, key) for key in ("width", "height"))
+    fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
+    unit = data.get("metres_per_unit")
+    encoding = data.get("depth_encoding")
+    frame_id = data.get("frame_id")
+    if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
+        raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r:.80}")
+    background = data.get("background_label")
+    if background is not None and not (type(background) is int and 0 <= background <= 65535):
+        raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r:.80}")
+    invalid = data.get("invalid_values")
+    if invalid is not None:
+        try:
+            invalid = check_invalid_values(where, invalid)
+        except ConfigError as error:
+            raise CaptureError(str(error)) from error
+    camera = _camera(
+        where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
+    )
+    return CaptureCamera(
+        camera=camera,
+        metres_per_unit=None if unit is None else check_metres_per_unit(where, unit),
+        depth_encoding=None if encoding is None else check_depth_encoding(where, encoding),
+        frame_id=frame_id,
+        background_label=background,
+        invalid_values=invalid,
+    )
+
+
+def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamera) -> None:
+    """Write the JSON file from which :func:`read_capture_camera` returns the same numbers.
+
+    Raises:
+        CaptureError: there is more than one camera, its axes are skewed, or the file cannot be written.
+    """
+    where = f"write_capture_camera: {path}"
+    camera = calibration.camera
+    k = camera.intrinsics[0].tolist()
+    if camera.num_views != 1 or k[0][1] != 0.0:
+        raise CaptureError(f"{where}: the file describes one camera without skew, got {camera!r}; write one per view")
+    data: dict[str, Any] = {"width": camera.size[1], "height": camera.size[0]}
+    data |= {"fx": k[0][0], "fy": k[1][1], "cx": k[0][2], "cy": k[1][2]}
+    if camera.distortion is not None:
+        data["distortion"] = camera.distortion[0].tolist()
+    data |= {name: value for name in _OPTIONAL[1:] if (value := getattr(calibration, name)) is not None}
+    with replacing(where, path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def read_intrinsics(
+    path: str | os.PathLike[str],
+    *,
+    size: tuple[int, int],  # (height, width) of the image they belong to
+) -> Camera:
+    """Read a 3x3 intrinsics matrix in pixels from a text file, which does not state its image size.
+
+    Raises:
+        CaptureError: the file is missing, not nine numbers, or not the intrinsics of an image of this size.
+    """
+    where = f"read_intrinsics: {path}"
+    values = _numbers(where, read_text(where, path))
+    if len(values) != 9:
+        raise CaptureError(f"{where}: must hold a 3x3 matrix, nine numbers, got {len(values)}")
+    fx, skew, cx, zero, fy, cy, *last = values
+    if skew != 0 or zero != 0 or last != [0.0, 0.0, 1.0]:
+        raise CaptureError(
+            f"{where}: must be fx 0 cx / 0 fy cy / 0 0 1, got {values}; is it transposed, or a 3x4 projection matrix?"
+        )
+    return _camera(where, fx=fx, fy=fy, cx=cx, cy=cy, size=size)
+
+
+def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
+    """Read a rigid 4x4 pose from text (16 numbers, row by row) or ``.npy``. Its direction is the caller's to know.
+
+    Raises:
+        CaptureError: the file is missing, or not a 4x4 matrix of numbers.
+        PoseError: the matrix is not rigid, or has NaN or infinite values (tracking lost).
+    """
+    where = f"read_pose: {path}"
+    if Path(path).suffix.lower() == ".npy":
+        matrix = map_npy(where, path, max_bytes=4096)
+        if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu":
+            raise CaptureError(f"{where}: a pose must be a (4, 4) array of numbers, got {matrix.dtype} {matrix.shape}")
+        pose = torch.from_numpy(matrix.astype(np.float64))
+    else:
+        values = _numbers(where, read_text(where, path))
+        if len(values) != 16:
+            short = "; the last row 0 0 0 1 is missing" if len(values) == 12 else ""
+            raise CaptureError(f"{where}: a pose must be 4x4, sixteen numbers row by row, got {len(values)}{short}")
+        pose = torch.tensor(values, dtype=torch.float64, device="cpu").reshape(4, 4)
+    rigid.check_rigid(where, pose)
+    return pose
+
+
+def write_pose(path: str | os.PathLike[str], pose: Tensor) -> None:
+    """Write a rigid (4, 4) pose as text that :func:`read_pose` reads back exactly."""
+    where = f"write_pose: {path}"
+    if tuple(pose.shape) != (4, 4):
+        raise PoseError(f"{where}: one pose is (4, 4), got {tuple(pose.shape)}")
+    rigid.check_rigid(where, pose)
+    rows = "\n".join(" ".join(map(repr, row)) for row in pose.double().tolist())
+    with replacing(where, path) as temporary:
+        temporary.write_text(rows + "\n", encoding="utf-8")
+
+
+def _camera(where: str, **values: Any) -> Camera:
+    try:
+        return Camera.pinhole(**values)
+    except PcdataError as error:
+        raise IntrinsicsError(f"{where}: {error}") from error
+
+
+def _check_keys(where: str, data: dict[str, Any]) -> None:
+    known = (*_REQUIRED, *_OPTIONAL, *_REMARKS)
+    faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
+    for key in data:
+        if key not in known:
+            hint = _HINTS.get(key.lower())
+            faults.append(f"{key[:60]!r} is not known{'; ' + hint if hint else near_matches(key, known)}")
+    if faults:
+        more = f" and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
+        raise CaptureError(f"{where}: {', '.join(faults[:_SHOWN])}{more}")
+
+
+def _number(where: str, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise CaptureError(f"{where}: {key!r} must be a number, got {value!r:.80}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise CaptureError(f"{where}: {key!r} must be a finite number")
+    return number
+
+
+def _whole(where: str, data: dict[str, Any], key: str) -> int:
+    number = _number(where, key, data[key])
+    if number != int(number) or not 1 <= number <= 1 << 16:
+        raise CaptureError(f"{where}: {key!r} must be a whole number of pixels, got {data[key]!r:.80}")
+    return int(number)
+
+
+def _distortion(where: str, value: Any) -> list[float] | None:
+    if value is None or value == []:
+        return None
+    if not isinstance(value, list) or len(value) not in _DISTORTION_LENGTHS:
+        raise CaptureError(
+            f"{where}: 'distortion' must be a list of {', '.join(map(str, _DISTORTION_LENGTHS))} numbers "
+            f"(OpenCV order k1 k2 p1 p2 k3 ...), got {value!r:.200}"
+        )
+    return [_number(where, "distortion", entry) for entry in value]
+
+
+def _numbers(where: str, text: str) -> list[float]:
+    words = text.replace(",", " ").split()
+    try:
+        return [_plain_number(word) for word in words[:100]]
+    except ValueError as error:
+        raise CaptureError(f"{where}: must hold numbers only: {str(error)[:200]}") from error
+
+
+def _plain_number(word: str) -> float:
+    if "_" in word or not word.isascii():  # float() takes 1_000 and the digits of other scripts
+        raise ValueError(f"{word[:60]!r} is no number")
+    return float(word)

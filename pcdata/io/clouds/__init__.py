@@ -1,0 +1,1 @@
+"""Clouds as files: PCD and PLY."""

@@ -1,0 +1,214 @@
+"""What a cloud file carries, as plain arrays: the step between a file format's columns and a :class:`PointCloud`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pcdata.contracts.lengths import check_metres
+from pcdata.contracts.tensors import check_tensors
+from pcdata.errors import CaptureError, DTypeError, ShapeError
+from pcdata.io.clouds.statement import CloudStatement
+from pcdata.structures import METRE, Kind, PointCloud
+from pcdata.structures.kinds import CORE_KINDS
+
+_ROUNDED = 1e-5  # that a float colour may lie above 1
+_FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
+
+# What torch can hold and compute with; unsigned integers go to the next wider signed type.
+_HOLDABLE = {"u1": "u1", "i1": "i1", "u2": "i4", "i2": "i2", "u4": "i8", "i4": "i4", "u8": "i8", "i8": "i8"}
+
+
+@dataclass(kw_only=True)
+class CloudArrays:
+    """The columns of one cloud, N rows each, before rows without a reading are dropped."""
+
+    xyz: NDArray[np.floating[Any]]  # (N, 3)
+    normals: NDArray[np.floating[Any]] | None = None  # (N, 3)
+    rgb: NDArray[Any] | None = None  # (N, 3): see _unit_colors
+    labels: NDArray[Any] | None = None  # (N,) whole numbers
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # name -> (N, ...)
+    kinds: Mapping[str, Kind] = field(default_factory=dict)  # of extra fields, where known
+
+
+@np.errstate(invalid="ignore", over="ignore")  # NaNs of every kind are judged by value
+def to_cloud(
+    where: str,
+    arrays: CloudArrays,
+    *,
+    statement: CloudStatement,
+    frame_id: str | None,
+    metres_per_unit: float | None,
+    viewpoint: Sequence[float] | None = None,
+    meta: Mapping[str, Any] | None = None,
+) -> PointCloud:
+    """Make the cloud of all rows whose x, y and z are finite; ``source_index`` keeps their row in the file.
+
+    Frame and unit are those that the file or the caller states; numbers whose unit nobody states are metres, provided
+    that they look like it. Normals get unit length, as only their direction means anything; a NaN normal becomes the
+    zero vector. Extra names that are no Python names, or are taken, are changed with underscores.
+    """
+    frame = statement.frame(where, frame_id)
+    stated = statement.metres_per_unit(where, metres_per_unit)
+    keep = np.isfinite(arrays.xyz).all(axis=1)
+    if len(keep) and not keep.any():
+        raise CaptureError(f"{where}: none of the {len(keep)} points has finite coordinates; drop this file")
+    rows = slice(None) if keep.all() else keep
+    xyz = arrays.xyz[rows]
+    unit = check_metres(where, xyz, stated, viewpoint=viewpoint or (0.0, 0.0, 0.0))
+    points = _metres(where, xyz, unit)
+    extra: dict[str, torch.Tensor] = {}
+    kinds: dict[str, Kind] = {}
+    for given, values in arrays.extra.items():
+        name = _free_name(given, extra)
+        extra[name] = _tensor(f"{where}: field {given!r}", values[rows])
+        kinds[name] = arrays.kinds.get(given) or _kind(name, extra[name])
+        if kinds[name] is Kind.POSITION:
+            extra[name] = extra[name] * unit
+    source = statement.source_from_cloud
+    return PointCloud(
+        points=torch.from_numpy(points),
+        frame_id=frame,
+        colors=None if arrays.rgb is None else torch.from_numpy(_unit_colors(where, arrays.rgb[rows])),
+        normals=None if arrays.normals is None else torch.from_numpy(_unit_normals(arrays.normals[rows])),
+        labels=None if arrays.labels is None else torch.from_numpy(_whole(where, arrays.labels[rows])),
+        source_index=torch.from_numpy(np.flatnonzero(keep)),
+        extra=extra,
+        kinds=kinds,
+        viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32, device="cpu") * unit,
+        source_from_cloud=None if source is None else source[None],  # type: ignore[arg-type]
+        source_frame=statement.source_frame or "",
+        frames={name: matrix[None] for name, matrix in statement.frames.items()},
+        unit=statement.unit or METRE,
+        meta=(dict(meta or {}),),
+    )
+
+
+def from_cloud(where: str, cloud: PointCloud) -> CloudArrays:
+    """Return the arrays of a single cloud, colours as uint8; ``source_index`` is left behind.
+
+    Raises:
+        ShapeError: the cloud is a batch.
+        DTypeError, NonFiniteError, CaptureError: a field cannot be stored.
+    """
+    if cloud.num_clouds != 1:
+        raise ShapeError(f"{where}: a file holds one cloud, got a batch of {cloud.num_clouds}; write each of unbatch()")
+    foreign = [name for name in cloud.extra if not name.isascii()]
+    if foreign:
+        raise CaptureError(f"{where}: field names must be ASCII in a file, got {', '.join(foreign)}; rename them")
+    core = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals}
+    check_tensors(where, core, dict.fromkeys(core, "N 3"))
+    rgb = None
+    if cloud.colors is not None:
+        colors = cloud.colors.detach().cpu().numpy()
+        if len(colors) and not (colors.min() >= 0 and colors.max() <= 1):
+            raise CaptureError(f"{where}: colors must lie in 0..1, got {colors.min():g} .. {colors.max():g}")
+        rgb = np.rint(colors * 255.0).astype(np.uint8)
+    return CloudArrays(
+        xyz=cloud.points.detach().cpu().numpy(),
+        normals=None if cloud.normals is None else cloud.normals.detach().cpu().numpy(),
+        rgb=rgb,
+        labels=None if cloud.labels is None else cloud.labels.cpu().numpy(),
+        extra={name: _array(f"{where}: {name}", value) for name, value in cloud.extra.items()},
+    )
+
+
+def narrowest_int(where: str, values: NDArray[np.int64], choices: Sequence[str]) -> NDArray[Any]:
+    """Return int64 values in the first of the dtypes that holds all of them."""
+    for dtype in choices:
+        limits = np.iinfo(dtype)
+        if not len(values) or (limits.min <= values.min() and values.max() <= limits.max):
+            return values.astype(dtype)
+    raise DTypeError(f"{where}: values {values.min()} .. {values.max()} do not fit any integer type of this format")
+
+
+def _metres(where: str, xyz: NDArray[Any], unit: float) -> NDArray[np.float32]:
+    wide = xyz.astype(np.float64) * unit
+    with np.errstate(over="ignore"):
+        points = wide.astype(np.float32)
+    if xyz.dtype != np.float32 and len(wide) and not float(np.abs(points - wide).max()) <= _FINEST:
+        raise CaptureError(
+            f"{where}: coordinates reach {np.abs(wide).max():.6g} m, where float32 moves points by more than "
+            f"{_FINEST:g} m; subtract a common offset (a map origin) before saving"
+        )
+    return points
+
+
+def _unit_colors(where: str, rgb: NDArray[Any]) -> NDArray[np.float32]:
+    """Return colours in 0..1: bytes, 16 bits, whole numbers up to 255 of any type, or floats that are in 0..1 already.
+
+    Whole numbers that reach beyond 1 and not beyond 255 are bytes in a wider type: no other scale has them.
+    """
+    if not len(rgb) or rgb.dtype == np.uint8:
+        return (rgb / np.float32(255)).astype(np.float32)
+    low, high = float(rgb.min()), float(rgb.max())
+    is_float = rgb.dtype.kind == "f"
+    if is_float and low >= 0 and high <= 1 + _ROUNDED:
+        return np.minimum(rgb.astype(np.float32), np.float32(1))
+    if low >= 0 and high <= 255 and (not is_float or bool((rgb == np.rint(rgb)).all())):
+        return (rgb / np.float32(255)).astype(np.float32)
+    if rgb.dtype.kind == "u" and rgb.dtype.itemsize == 2:
+        return (rgb / np.float32(65535)).astype(np.float32)
+    raise CaptureError(
+        f"{where}: colours must be whole numbers in 0..255 or unsigned 16 bits, or floats in 0..1, got {rgb.dtype} "
+        f"{low:g} .. {high:g}; rescale them when exporting"
+    )
+
+
+def _unit_normals(normals: NDArray[Any]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit = normals.astype(np.float32)
+        unit[~np.isfinite(unit).all(axis=1)] = 0.0
+        length = np.linalg.norm(unit.astype(np.float64), axis=1)
+    off = (np.abs(length - 1.0) > 1e-3) & (length > 0)
+    unit[off] = unit[off] / length[off, None]
+    return unit
+
+
+def _whole(where: str, labels: NDArray[Any]) -> NDArray[np.int64]:
+    if labels.ndim != 1:
+        raise CaptureError(f"{where}: a label must be one number per point, got {labels.shape[1]}")
+    if labels.dtype.kind == "f" and not (np.isfinite(labels).all() and (labels == np.rint(labels)).all()):
+        raise CaptureError(f"{where}: labels must be whole numbers, but some are not; rename the field if a score")
+    if labels.dtype.kind != "i" and len(labels) and not labels.max() < 2**63:
+        raise CaptureError(f"{where}: labels reach {labels.max()}, above what int64 holds")
+    return labels.astype(np.int64)
+
+
+def _tensor(where: str, values: NDArray[Any]) -> torch.Tensor:
+    native = values.dtype.newbyteorder("=")
+    if native.kind in "iu":
+        if native == np.uint64 and len(values) and values.max() >= 2**63:
+            raise CaptureError(f"{where}: values reach {values.max()}, above what int64 holds")
+        native = np.dtype(_HOLDABLE[native.str[1:]])
+    return torch.from_numpy(np.array(values, dtype=native))
+
+
+def _array(where: str, value: torch.Tensor) -> NDArray[Any]:
+    odd_type = value.dtype in (torch.bfloat16, torch.float16) or value.is_complex()
+    if odd_type or value.ndim > 2 or 0 in value.shape[1:]:
+        raise DTypeError(
+            f"{where}: a file holds (N,) or (N, C) integers or floats of 32 or 64 bits, "
+            f"got {value.dtype} {tuple(value.shape)}"
+        )
+    array: NDArray[Any] = value.detach().cpu().numpy()
+    return array.astype(np.uint8) if array.dtype == bool else array
+
+
+def _kind(name: str, value: torch.Tensor) -> Kind:
+    # Scanners write a "confidence" of their own as floats; pcdata's levels are bytes.
+    return Kind.MINIMUM if name == "confidence" and value.dtype == torch.uint8 else Kind.INVARIANT
+
+
+def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+    name = "".join(letter if ("_" + letter).isidentifier() else "_" for letter in name)
+    if not name.isidentifier():
+        name = f"_{name}"
+    while name in CORE_KINDS or name in taken:
+        name += "_"
+    return name

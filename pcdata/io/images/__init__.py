@@ -1,0 +1,1 @@
+"""Depth, color, label and confidence images as files."""

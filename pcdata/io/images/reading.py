@@ -1,0 +1,277 @@
+"""Depth, colour, label and mask images <-> tensors.
+
+Nothing is guessed: the unit of depth is an argument, and an image whose type could mean two things is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import warnings
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from pcdata.contracts.lengths import check_metres_per_unit
+from pcdata.errors import CaptureError, NoReadingError, PcdataWarning, UnitError
+from pcdata.files.opening import map_npy, read_bytes
+from pcdata.functional.depth.unit_fit import (
+    DepthEncoding,
+    DepthUnit,
+    check_depth_encoding,
+    decoded,
+    unit_fits,
+    units_in_words,
+)
+from pcdata.io.images.structure import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
+
+MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
+_MAX_BYTES = 1 << 30
+_PNG, _TIFF, _JPEG = "PNG", "TIFF", "JPEG"
+_FORMATS = {".png": _PNG, ".tif": _TIFF, ".tiff": _TIFF, ".jpg": _JPEG, ".jpeg": _JPEG}
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+_NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame lies outside
+MARKS = {65535: "the highest 16-bit number", 32767: "the highest 15-bit number", 4095: "the highest 12-bit number"}
+_FEW = 1000  # fewer readings may hold any number by chance
+_MARKED = 0.002  # of the readings: a single depth holds less of any real scene
+_NAMED = 0.001  # probability above which a unit is named: without the camera even the right one may look unlikely
+
+
+def read_depth(
+    path: str | os.PathLike[str],
+    *,
+    metres_per_unit: float,
+    invalid_values: Collection[int] = (),
+    depth_encoding: DepthEncoding = "plain",
+) -> Tensor:  # (H, W) float32 metres, 0 = no reading
+    """Read a depth image as metres along z, 0 where the sensor had no reading.
+
+    Accepted: 16-bit grey PNG or TIFF, uint16 ``.npy``; float TIFF and float ``.npy``, whose NaN and infinite pixels
+    mean "no reading" and become 0.
+
+    Args:
+        path: ``.png``, ``.tif``, ``.tiff`` or ``.npy``.
+        metres_per_unit: length of one stored unit: 0.001 for millimetres, 0.0002 for TUM, 1.0 for metres.
+        invalid_values: stored values besides 0 that mean "no reading", e.g. ``(65535,)`` for 7-Scenes.
+        depth_encoding: order of the bits of whole numbers: "plain"; "rotated", to the left by three, as SUN3D and the
+            Amazon picking sets store them; "swapped", the high byte where the low one belongs.
+
+    Raises:
+        CaptureError: the file is missing, damaged, not a depth image, holds negative depth or no valid pixel at all.
+        UnitError: the unit is not a positive number, a float image has an order of bits, or the median is implausible.
+    """
+    where = f"read_depth: {path}"
+    unit = check_metres_per_unit(where, metres_per_unit)
+    encoding = check_depth_encoding(where, depth_encoding)
+    raw = read_raw_depth(where, Path(path))
+    if raw.dtype == np.uint16:
+        if not all(0 <= value <= 65535 for value in invalid_values):
+            raise CaptureError(f"{where}: invalid_values must lie in 0 .. 65535, got {tuple(invalid_values)}")
+        table = metres_of_value(unit, encoding)
+        table[[0, *invalid_values]] = 0.0
+        depth = table[raw]
+    elif encoding == "plain":
+        depth = _clean_float_depth(where, raw, unit, invalid_values)
+    else:
+        raise UnitError(f"{where}: holds {raw.dtype} numbers, whose bits have no order; drop depth_encoding={encoding}")
+    check_plausible(where, depth, DepthUnit(unit, encoding), raw)
+    return torch.from_numpy(depth)
+
+
+def read_raw_depth(where: str, path: Path) -> NDArray[Any]:
+    """Return the numbers of a depth image as they are stored: uint16, float32 or float64, with whatever faults.
+
+    Raises:
+        CaptureError: the file is missing, damaged, or not a depth image.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        hint = "; convert EXR to a float32 .npy in metres" if suffix == ".exr" else ""
+        raise CaptureError(f"{where}: depth must be one of {', '.join(DEPTH_SUFFIXES)}, not {suffix!r}{hint}")
+    if suffix == ".npy":
+        return _read_npy(where, path)
+    mode, pixels, (bits, _) = _decode(where, path, (_FORMATS[suffix],))
+    if mode.startswith("I;16"):
+        return pixels.astype(np.uint16)
+    if mode == "F":
+        return pixels
+    if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit grey PNG as 32-bit integers
+        return pixels.astype(np.uint16)
+    words = {"L": "8-bit grey", "P": "palette", "1": "1-bit", "RGB": "colour", "RGBA": "colour with alpha"}
+    raise CaptureError(
+        f"{where}: a depth image must be 16-bit grey, but this is a {words.get(mode, mode)} image; is it a picture of "
+        "the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
+    )
+
+
+def _read_npy(where: str, path: Path) -> NDArray[Any]:
+    array = map_npy(where, path, max_bytes=_MAX_BYTES)
+    if array.ndim != 2:
+        raise CaptureError(f"{where}: depth must be one image (H, W), got shape {array.shape}; save one file per view")
+    _check_pixels(where, array.shape[1], array.shape[0])
+    if array.dtype.newbyteorder("=") not in (np.uint16, np.float32, np.float64):
+        raise CaptureError(f"{where}: depth must be uint16, float32 or float64, got {array.dtype}; convert it")
+    return np.array(array, dtype=array.dtype.newbyteorder("="))
+
+
+def metres_of_value(metres_per_unit: float, encoding: DepthEncoding = "plain") -> NDArray[np.float32]:
+    """Return the nearest float32 metres of each of the 65536 stored values."""
+    units = decoded(np.arange(1 << 16, dtype=np.uint32).astype(np.uint16), encoding)
+    return (units.astype(np.float64) * metres_per_unit).astype(np.float32)
+
+
+def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Collection[int]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, so no reading either
+        depth = (raw.astype(np.float64) * unit).astype(np.float32)
+    depth[~np.isfinite(depth) | np.isin(raw, list(invalid))] = 0.0
+    depth += 0.0  # turns -0.0 into 0.0
+    if (depth < 0).any():
+        raise CaptureError(
+            f"{where}: {int((depth < 0).sum())} pixels have negative depth, down to {depth.min():g} m; "
+            f"{_of_negative(raw)}"
+        )
+    return depth
+
+
+def _of_negative(raw: NDArray[Any]) -> str:
+    marks = np.unique(raw[raw < 0])
+    if len(marks) == 1:
+        return f"all are {marks[0]:g}: if that marks 'no reading', write 0 or NaN for it when exporting"
+    return "is z pointing backwards (OpenGL axes)? Flip the sign when exporting, and write 0 for 'no reading'"
+
+
+def check_plausible(where: str, depth: NDArray[np.float32], unit: DepthUnit, stored: NDArray[Any]) -> None:
+    """Require readings, and half of them at distances that depth cameras see; else name the units that would fit."""
+    valid = depth[depth > 0]
+    if not len(valid):
+        raise NoReadingError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
+    _warn_of_marks(stored[depth > 0], unit)
+    median = float(np.median(valid[:: max(1, len(valid) >> 16)]))  # 65,536 pixels tell as much as all
+    if not _NEAREST <= median <= _FARTHEST:
+        fits = unit_fits(np.where(depth > 0, stored, 0), declared=unit)
+        likely = [fit for fit in fits if fit.probability >= _NAMED and _NEAREST <= fit.median <= _FARTHEST]
+        named = f"the numbers fit {units_in_words(likely)}" if likely else "give the length of one unit in metres"
+        raise UnitError(
+            f"{where}: half of the valid depth is {'beyond' if median > 1 else 'within'} {median:g} m with {unit}; is "
+            f"metres_per_unit right? {named}"
+        )
+
+
+def _warn_of_marks(stored: NDArray[Any], unit: DepthUnit) -> None:
+    """Say once that a number which usually marks "no reading" becomes points; the text is the same for every file."""
+    if stored.dtype != np.uint16 or len(stored) < _FEW:
+        return
+    for mark in MARKS:
+        # At the end of the range and more than just below it: a wall that happens to be there has noise.
+        share, beside = (stored == mark).mean(), ((stored >= 0.98 * mark) & (stored < mark)).mean()
+        if share > max(_MARKED, beside) and stored.max() == mark:
+            metres = float(metres_of_value(unit.metres, unit.encoding)[mark])
+            warnings.warn(
+                f"depth images hold {mark}, {MARKS[mark]}, at more than {_MARKED:.1%} of their readings: it becomes "
+                f"points at {metres:.5g} m. If it marks 'no reading', say invalid_values=[{mark}]",
+                PcdataWarning,
+                stacklevel=2,
+            )
+
+
+def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
+    """Read an 8-bit colour PNG or JPEG as RGB; an alpha channel is dropped, orientation tags are not applied.
+
+    Raises:
+        CaptureError: the file is missing, damaged, grey, palette, CMYK or deeper than 8 bits per channel.
+    """
+    where = f"read_color: {path}"
+    check_suffix(where, path, COLOR_SUFFIXES)
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG, _JPEG))
+    if mode not in ("RGB", "RGBA") or bits == 16:
+        found = f"{bits}-bit {mode}" if bits else mode
+        raise CaptureError(
+            f"{where}: colour must be 8-bit RGB, but this image is {found}; convert it on purpose "
+            "(for one grey or infrared channel: repeat it three times, or leave the colours out)"
+        )
+    return torch.from_numpy(np.array(pixels[..., :3]))
+
+
+def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
+    """Read an 8-bit grey, 16-bit grey or palette PNG of object ids; of a palette the index is the id.
+
+    Raises:
+        CaptureError: the file is missing, damaged, colour, or grey of fewer than 8 bits (which viewers rescale).
+    """
+    where = f"read_labels: {path}"
+    check_suffix(where, path, (".png",))
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
+    if not (mode == "P" or (mode == "L" and bits == 8) or (bits == 16 and mode.startswith("I"))):
+        raise CaptureError(
+            f"{where}: labels must be an 8-bit, 16-bit or palette PNG of ids, but this image is {bits}-bit {mode}; "
+            "map its colours to ids first"
+        )
+    return torch.from_numpy(pixels.astype(np.int64))
+
+
+def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
+    """Read a 1-bit or 8-bit grey PNG as a mask; every value but 0 is inside.
+
+    Raises:
+        CaptureError: the file is missing, damaged, or of another type.
+    """
+    where = f"read_mask: {path}"
+    check_suffix(where, path, (".png",))
+    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
+    if mode not in ("1", "L"):
+        raise CaptureError(f"{where}: a mask must be a 1-bit or 8-bit grey PNG, but this image is {bits}-bit {mode}")
+    return torch.from_numpy(pixels != 0)
+
+
+def check_suffix(where: str, path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> None:
+    """Require that a file name ends as its format demands."""
+    if Path(path).suffix.lower() not in suffixes:
+        raise CaptureError(f"{where}: the file must end in {' or '.join(suffixes)}, not {Path(path).suffix!r}")
+
+
+def _check_pixels(where: str, width: int, height: int) -> None:
+    if not 0 < width * height <= MAX_PIXELS:
+        raise CaptureError(f"{where}: an image must have 1 .. {MAX_PIXELS} pixels, this one claims {width}x{height}")
+
+
+def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDArray[Any], tuple[int, int]]:
+    """Return Pillow's mode, the pixels, and (bit depth, colour type) as a PNG's own header states them, else 0, 0.
+
+    Pillow gets a file whose structure was checked first: it shows what it can of a damaged one.
+    """
+    data = read_bytes(where, path, max_bytes=_MAX_BYTES)
+    try:
+        # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
+        depth = (0, 0)
+        if _PNG in formats and (data[:8] == PNG_SIGNATURE or formats == (_PNG,)):
+            data, *depth_and_type = checked_png(data, MAX_PIXELS)
+            depth = (depth_and_type[0], depth_and_type[1])
+            formats = (_PNG,)
+        elif _TIFF in formats:
+            check_tiff(data, MAX_PIXELS)
+        else:
+            check_jpeg(data, MAX_PIXELS)
+        with Image.open(io.BytesIO(data), formats=formats) as image:
+            _check_pixels(where, *image.size)
+            if (number := getattr(image, "n_frames", 1)) != 1:
+                raise CaptureError(f"{where}: must hold one image, but holds {number}; save one file each")
+            image.load()
+            return image.mode, np.asarray(image), depth
+    except CaptureError:
+        raise
+    except (
+        OSError, ValueError, SyntaxError, EOFError, TypeError, IndexError, KeyError, OverflowError, MemoryError,
+        AttributeError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError, Warning,
+    ) as error:  # fmt: skip  # what Pillow's parsers raise on damaged files; warnings too where a user made them errors
+        raise CaptureError(
+            f"{where}: not a readable {' or '.join(formats)} image: {str(error) or type(error).__name__}"
+        ) from error

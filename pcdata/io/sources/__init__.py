@@ -1,0 +1,1 @@
+"""Captures as others recorded them: one protocol, one small file per layout."""

@@ -1,0 +1,132 @@
+"""Many captures of a still scene as one: AveragedSource."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note, near_matches
+from pcdata.functional.depth.average import DepthAverage, average_depth
+from pcdata.io.sources.source import CaptureSource, checked_ids
+from pcdata.io.sources.still_camera import check_still_camera
+from pcdata.structures import Confidence, DepthFrame, confidence_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class AveragedSource:
+    """Averages every ``num_frames`` consecutive captures of a source into one with less noise and fewer holes.
+
+    A sample bears the id, colours, labels, pose and mask of the first capture of its group. Its provenance tells what
+    was averaged and what was dropped: ``averaged: {frames, readings, jitter, jumps, too_few, noise}``, counts of
+    readings and of pixels, and the median standard deviation of a single reading in metres.
+
+    Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
+    readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras
+    are told by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
+    """
+
+    source: CaptureSource
+    num_frames: int = 10
+    mad_factor: float = 5.0
+    resolution: float = 0.001
+    max_jump: float = 0.03
+    min_count: int = 3
+    max_moving: float = 0.01  # the part of all readings that may jump before something must have moved
+
+    def __post_init__(self) -> None:
+        if self.num_frames < 2 or not 1 <= self.min_count <= self.num_frames or not 0 <= self.max_moving <= 1:
+            raise ConfigError(
+                "AveragedSource: needs num_frames >= 2, 1 <= min_count <= num_frames and 0 <= max_moving <= 1, got "
+                f"{self.num_frames}, {self.min_count}, {self.max_moving}"
+            )
+        count = len(checked_ids("AveragedSource", self.source))
+        if count % self.num_frames:
+            raise CaptureError(
+                f"AveragedSource: {count} captures are no whole number of groups of {self.num_frames}; take a subset "
+                "or another num_frames"
+            )
+
+    @property
+    def name(self) -> str:
+        """The name of the source."""
+        return str(getattr(self.source, "name", type(self.source).__name__))
+
+    @property
+    def ids(self) -> list[str]:
+        """The id of the first capture of every group, in order."""
+        return self.source.ids[:: self.num_frames]
+
+    def __len__(self) -> int:
+        return len(self.source.ids) // self.num_frames
+
+    def group(self, sample_id: str) -> list[str]:
+        """Return the ids of the captures that make a sample.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+        if sample_id not in self.ids:
+            raise CaptureError(
+                f"AveragedSource: no sample {sample_id!r}; a group is called after its first capture"
+                f"{near_matches(sample_id, self.ids)}"
+            )
+        start = self.source.ids.index(sample_id)
+        return self.source.ids[start : start + self.num_frames]
+
+    def load(self, sample_id: str) -> DepthFrame:
+        """Load and average one group.
+
+        Raises:
+            CaptureError: no sample has this id, the captures differ in camera or pose, or the scene moved.
+        """
+        names = self.group(sample_id)
+        captures = [self.source.load(name) for name in names]
+        frames = [capture for capture in captures if isinstance(capture, DepthFrame)]
+        if len(frames) < len(captures):
+            raise DTypeError("AveragedSource: averages depth frames, but the source holds point clouds")
+        try:
+            check_still_camera("AveragedSource", frames)
+            return self._average(frames, names)
+        except CaptureError as error:
+            add_note(error, f"while averaging {names[0]!r} .. {names[-1]!r}")
+            raise
+
+    def _average(self, frames: Sequence[DepthFrame], names: Sequence[str]) -> DepthFrame:
+        confidences = torch.stack([confidence_of(frame) for frame in frames])
+        depths = torch.stack([frame.depth for frame in frames])
+        depths = torch.where(confidences > int(Confidence.NO_READING), depths, 0.0)
+        average = average_depth(
+            depths,
+            mad_factor=self.mad_factor,
+            resolution=self.resolution,
+            max_jump=self.max_jump,
+            min_count=self.min_count,
+        )
+        readings = int((depths > 0).sum())
+        jumps = int(average.num_jumps.sum())
+        if jumps > self.max_moving * readings:
+            raise CaptureError(
+                f"AveragedSource: {100 * jumps / max(readings, 1):.1f} % of the readings lie on another surface than "
+                f"the others of their pixel (at most {100 * self.max_moving:g} %): the camera or the scene moved. "
+                "Average fewer captures, or only still ones; if it is the sensor's noise, raise max_jump"
+            )
+        confidence = None
+        if any(frame.confidence is not None for frame in frames):
+            worst = torch.where(depths > 0, confidences, int(Confidence.RELIABLE)).amin(0)
+            confidence = torch.where(average.depth > 0, worst, int(Confidence.NO_READING)).to(torch.uint8)
+        facts = {"frames": list(names), "readings": readings, **_facts(average)}
+        provenance = {**frames[0].provenance, "averaged": facts}
+        return replace(frames[0], depth=average.depth, confidence=confidence, provenance=provenance)
+
+
+def _facts(average: DepthAverage) -> dict[str, Any]:
+    spread = average.variance[average.num_readings > 1].sqrt()
+    return {
+        "jitter": int(average.num_jitter.sum()),
+        "jumps": int(average.num_jumps.sum()),
+        "too_few": int(((average.depth == 0) & (average.num_readings > 0)).sum()),
+        "noise": float(spread.median()) if len(spread) else 0.0,
+    }

@@ -1,0 +1,242 @@
+"""The plain layout: one folder per kind of image, one calibration file for all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+from torch import Tensor
+
+from pcdata.contracts.lengths import check_metres_per_unit
+from pcdata.errors import CaptureError, ConfigError, UnitError
+from pcdata.files.opening import check_inside
+from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
+from pcdata.io.calibration.calibration import Calibration
+from pcdata.io.calibration.capture_camera import read_capture_camera
+from pcdata.io.images.reading import read_depth
+from pcdata.io.sources.folder_roles import ROLES, role_folders
+from pcdata.io.sources.frame_files import make_frame
+from pcdata.io.sources.listing import (
+    LinkTargets,
+    absolute,
+    by_stem,
+    check_links,
+    has_file,
+    link_targets,
+    links_in,
+    unread_entries,
+)
+from pcdata.io.sources.option_checks import check_invalid_values, check_label, check_name
+from pcdata.io.sources.sample_names import positions
+from pcdata.io.sources.source import Source, check_partners
+from pcdata.io.sources.timestamps import read_timestamps
+from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
+
+_CALIBRATIONS = ("intrinsics.json", "camera.json")
+_TIMESTAMPS = "timestamps.json"
+
+
+class FolderSource(Source):
+    """``intrinsics.json``, ``depth/NAME.png``; for all names or none colour, labels, masks, confidence and poses."""
+
+    kind = "folder"
+    needs = (
+        "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
+        "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera), "
+        "timestamps.json (seconds by NAME)"
+    )
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        metres_per_unit: float | None = None,
+        depth_encoding: DepthEncoding | None = None,
+        invalid_values: Collection[int] = (),
+        background_label: int | None = None,
+        frame_id: str | None = None,
+        calibration: Calibration | str | os.PathLike[str] | None = None,
+        camera: str | None = None,
+        folders: Mapping[str, str | None] | None = None,
+        links_to: LinkTargets = (),
+    ) -> None:
+        """Read the calibration and the file names.
+
+        Args:
+            path: the folder.
+            metres_per_unit: length of one stored depth unit, where ``intrinsics.json`` does not state it.
+            depth_encoding: order of the stored bits, where ``intrinsics.json`` does not state it; None = "plain".
+            invalid_values: stored depth values besides 0 that mean "no reading", where ``intrinsics.json`` does not
+                state them.
+            background_label: the label in the files that means "no object" and becomes -1, where ``intrinsics.json``
+                does not state it; None = keep all.
+            frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
+            calibration: a :class:`Calibration` or its file, whose camera replaces that of ``intrinsics.json``. Where it
+                has transforms, the capture has no ``poses`` and a ``frame_id`` is stated, it also gives the pose.
+            camera: its name in the calibration; None = the only one.
+            folders: the names of folders that are called otherwise, by role, such as ``{"pose": "pose"}``; None leaves
+                a role out. The roles: depth, color, labels, mask, confidence, pose.
+            links_to: folders outside that links in the capture may lead to; no other ones are followed out of it.
+
+        Raises:
+            CaptureError: the calibration is missing, wrong or of another image size, a sample lacks a file that
+                others have, a link leads to nothing, or a folder looks like a part of the capture but is not read.
+            CalibrationError, FrameError: the calibration cannot be read, or lacks the camera or the frame.
+            ConfigError: a camera is named without a calibration, or folders names no role.
+            UnitError: the unit is not stated, or stated twice and differently.
+        """
+        path = absolute(path)
+        present = [path / name for name in _CALIBRATIONS if has_file(path / name)]
+        if len(present) != 1:
+            found = "both" if present else "neither"
+            raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
+        allowed = [path, *link_targets(links_to)]
+        check_inside(str(path), present[0], allowed)
+        stated = read_capture_camera(present[0])
+        self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
+        self.depth_encoding = _one_encoding(present[0], stated.depth_encoding, depth_encoding)
+        check_name(str(path), "frame_id", frame_id)
+        check_name(str(path), "camera", camera)
+        if frame_id and stated.frame_id not in (None, frame_id):
+            raise CaptureError(f"{present[0]}: says frame_id {stated.frame_id!r}, the argument {frame_id!r}; drop one")
+        roles = role_folders(path, folders)
+        if "depth" not in roles:
+            raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
+        self.frame_id = frame_id or stated.frame_id or "world"
+        self.frame_is_stated = bool(frame_id or stated.frame_id)
+        self.camera = stated.camera
+        self.world_from_camera: Tensor | None = None  # of a camera that stands still
+        self._calibrated: dict[str, str] = {}
+        if calibration is not None:
+            frame = None if "pose" in roles else frame_id or stated.frame_id
+            self.camera, self.world_from_camera, self._calibrated = _override(
+                present[0], stated.camera, calibration, camera, frame
+            )
+        elif camera is not None:
+            raise ConfigError(
+                f"folder source {path}: camera={camera!r} names one of a calibration; give calibration too"
+            )
+        self.invalid_values = check_invalid_values(str(path), invalid_values)
+        if stated.invalid_values is not None:
+            if self.invalid_values and set(self.invalid_values) != set(stated.invalid_values):
+                raise CaptureError(
+                    f"{present[0]}: says invalid_values {list(stated.invalid_values)}, the argument "
+                    f"{list(self.invalid_values)}; drop one"
+                )
+            self.invalid_values = stated.invalid_values
+        background_label = check_label(str(path), background_label)
+        if stated.background_label is not None and background_label not in (None, stated.background_label):
+            raise CaptureError(
+                f"{present[0]}: says background_label {stated.background_label}, the argument {background_label}; drop "
+                "one"
+            )
+        self.background_label = stated.background_label if background_label is None else background_label
+        check_links(link for folder in roles.values() for link in links_in(folder))  # all of them in one message
+        self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
+        self._used = {present[0], *roles.values()}
+        super().__init__(path, self._files["depth"], links_to)
+        check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
+        if "pose" in self._files and self.frame_id == CAMERA_FRAME:
+            raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
+        self._positions = positions(self._ids)
+        times = path / _TIMESTAMPS
+        self.timestamps: dict[str, float] = {}  # seconds by id
+        if has_file(times):
+            check_inside(str(path), times, allowed)
+            self.timestamps = read_timestamps(times, self._ids)
+            self._used.add(times)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A calibration file and a folder of depth."""
+        return os.path.lexists(path / "depth") and any(os.path.lexists(path / name) for name in _CALIBRATIONS)
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the files of one sample by role."""
+        return {role: found[sample_id] for role, found in self._files.items()}
+
+    def unread(self) -> list[str]:
+        """Name the folders and files beside those that are read."""
+        return unread_entries(self.path, self._used)
+
+    def load(self, sample_id: str) -> DepthFrame:
+        """Read one sample, always a depth frame.
+
+        Raises:
+            CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
+        """
+        return cast(DepthFrame, super().load(sample_id))
+
+    def _load(self, sample_id: str) -> DepthFrame:
+        files = self.files(sample_id)
+        frame = make_frame(
+            files,
+            depth=read_depth(
+                files["depth"],
+                metres_per_unit=self.metres_per_unit,
+                depth_encoding=self.depth_encoding,
+                invalid_values=self.invalid_values,
+            ),
+            camera=self.camera,
+            sample_id=sample_id,
+            frame_id=self.frame_id,
+            capture_index=self._positions[sample_id],
+            provenance={
+                **self.provenance(sample_id),
+                "metres_per_unit": self.metres_per_unit,
+                **({} if self.depth_encoding == "plain" else {"depth_encoding": self.depth_encoding}),
+                **self._calibrated,
+                **({"timestamps": [self.timestamps[sample_id]]} if self.timestamps else {}),
+            },
+            background_label=self.background_label,
+        )
+        if self.world_from_camera is None:
+            return frame
+        return replace(frame, world_from_camera=self.world_from_camera[None], frame_id=self.frame_id)
+
+
+def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
+    if stated is None and given is None:
+        raise UnitError(
+            f'{file}: the unit of depth must be stated: add "metres_per_unit": 0.001 (for millimetres) to the file, or '
+            "pass metres_per_unit"
+        )
+    if stated is not None and given is not None and stated != given:
+        raise UnitError(f"{file}: says metres_per_unit {stated:g}, the argument {given:g}; correct the wrong one")
+    return check_metres_per_unit(str(file), stated if given is None else given)  # type: ignore[arg-type]
+
+
+def _one_encoding(file: Path, stated: DepthEncoding | None, given: DepthEncoding | None) -> DepthEncoding:
+    if stated is not None and given not in (None, stated):
+        raise UnitError(f"{file}: says depth_encoding {stated!r}, the argument {given!r}; correct the wrong one")
+    return check_depth_encoding(str(file), stated or given or "plain")
+
+
+def _override(
+    file: Path,
+    stated: Camera,
+    calibration: Calibration | str | os.PathLike[str],
+    name: str | None,
+    frame: str | None,  # where the camera's pose shall lead to; None = its pose is not asked for
+) -> tuple[Camera, Tensor | None, dict[str, str]]:  # camera, its pose, provenance
+    """Take the camera from a calibration, and its pose too if that is asked for and there are transforms."""
+    known, origin = opened_calibration(calibration)
+    name = known.camera_name(name)
+    camera = known.camera(name)
+    if camera.size != stated.size:
+        raise CaptureError(
+            f"{file}: is {stated.size[1]}x{stated.size[0]} but camera {name!r} of the calibration is "
+            f"{camera.size[1]}x{camera.size[0]}; calibrate at this resolution, or rescale with Camera.resized"
+        )
+    pose = known.transform(frame, name) if frame and known.transforms else None
+    return camera, pose, {"calibration": origin, "camera": name}
+
+
+def opened_calibration(calibration: Calibration | str | os.PathLike[str]) -> tuple[Calibration, str]:
+    """Return a calibration, read where a file is given, and what provenance tells of its origin."""
+    if isinstance(calibration, Calibration):
+        return calibration, "given as an object"
+    return Calibration.load(calibration), Path(os.fspath(calibration)).name

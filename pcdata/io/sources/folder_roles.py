@@ -1,0 +1,90 @@
+"""Which folder of a plain capture holds what; one that looks like a part of it is read or refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePath
+
+from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from pcdata.io.sources.listing import check_links, entries, has_folder, is_folder
+
+ROLES = {  # role: folder, suffixes
+    "depth": ("depth", DEPTH_SUFFIXES),
+    "color": ("color", COLOR_SUFFIXES),
+    "labels": ("labels", (".png",)),
+    "mask": ("masks", (".png",)),
+    "confidence": ("confidence", (".png",)),
+    "pose": ("poses", (".txt", ".npy")),
+}
+# What other exporters call the same, without case, plural s and separators.
+_OTHER_NAMES = {
+    "depth": ("depth", "depthimage", "depthmap", "dep"),
+    "color": ("color", "colour", "rgb", "image", "img", "colorimage", "colourimage", "rgbimage"),
+    "labels": ("label", "segmentation", "seg", "semantic", "instance", "labelimage"),
+    "mask": ("mask", "workspacemask", "objectmask"),
+    "confidence": ("confidence", "conf", "confidencemap"),
+    "pose": ("pose", "camerapose", "campose", "extrinsic", "trajectory"),
+}
+
+
+def role_folders(path: Path, folders: Mapping[str, str | None] | None) -> dict[str, Path]:
+    """Return the folder of every role that a capture has.
+
+    Args:
+        path: the folder of the capture.
+        folders: role -> name of its folder in ``path``; None = that role is left out. A role that is not named is
+            looked for under its own name.
+
+    Raises:
+        ConfigError: no such role, a folder outside the capture, or no depth.
+        CaptureError: a named folder is missing, or one looks like a role that is neither read nor left out.
+    """
+    where = f"folder source {path}"
+    if not isinstance(folders, Mapping | None):
+        raise ConfigError(f"{where}: folders must map roles to names, such as {{'pose': 'pose'}}, got {folders!r:.200}")
+    named = dict(folders or {})
+    _check_named(where, named)
+    found = {}
+    for role, (usual, _) in ROLES.items():
+        name = named.get(role, usual)
+        if name is not None and has_folder(path / name):
+            found[role] = path / name
+        elif named.get(role) is not None:
+            raise CaptureError(f"{where}: has no folder {name!r} for {role}; correct folders ({role}={name})")
+    _check_lookalikes(where, path, found, named)
+    return found
+
+
+def _check_named(where: str, named: Mapping[str, str | None]) -> None:
+    for role, name in named.items():
+        if role not in ROLES:
+            raise ConfigError(
+                f"{where}: folders: no role {role!r}{near_matches(str(role), ROLES)}; known: {', '.join(ROLES)}"
+            )
+        if name is None and role != "depth":
+            continue
+        if not isinstance(name, str) or not name or PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+            raise ConfigError(f"{where}: folders: {role} must be the name of a folder in the capture, got {name!r}")
+
+
+def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: Mapping[str, str | None]) -> None:
+    for entry in entries(path):
+        role = next((role for role, names in _OTHER_NAMES.items() if _plain(entry.name) in names), None)
+        if role is None or role in found or role in named:
+            continue
+        check_links([entry])
+        if not is_folder(entry):
+            continue
+        usual = ROLES[role][0]
+        meaning = " (4x4 each, world from camera)" if role == "pose" else ""
+        out = "" if role == "depth" else f"; to leave {role} out: --folder {role}= (in Python {role!r}: None)"
+        raise CaptureError(
+            f"{where}: {entry.name}/ looks like {role}, which is read from {usual}/{meaning}; rename it, or say "
+            f"--folder {role}={entry.name} (in Python folders={{{role!r}: {entry.name!r}}}){out}"
+        )
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[-_ .]", "", name.lower()).removesuffix("s")

@@ -1,0 +1,1 @@
+"""Built data sets: records, where they live, and what the manifest says of them."""

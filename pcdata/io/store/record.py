@@ -1,0 +1,193 @@
+"""A cloud as named arrays and one JSON text: the form that every file format stores.
+
+Arrays follow the field's customs, so that other tools can read them: ``points``, ``colors`` and ``normals`` are (N, 3)
+float32, colours in [0, 1], and ``labels`` is (N, 1) int32. ``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4)
+world_from_camera repeat what the JSON says of the cameras.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote, unquote
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pcdata.errors import CacheError, PcdataError
+from pcdata.files.strict_json import json_object, parse_json
+from pcdata.structures import PointCloud
+
+SCHEMA = "pcdata.cloud/1"
+
+_POINT_FIELDS = ("points", "colors", "normals", "labels", "source_index")
+_CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
+_EXTRA, _FRAMES = "extra.", "frames."
+_DERIVED = ("intrinsics", "extrinsics")
+
+
+@dataclass(frozen=True)
+class Record:
+    """Arrays by name, and JSON-able facts."""
+
+    arrays: Mapping[str, np.ndarray]
+    info: Mapping[str, Any]
+
+    def info_text(self) -> str:
+        """The facts as canonical JSON."""
+        return json.dumps(self.info, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+    def digest(self) -> str:
+        """SHA-256 over names, dtypes, shapes and bytes of all arrays and over the facts.
+
+        Raises:
+            CacheError: the facts hold a number that JSON does not have.
+        """
+        try:
+            total = hashlib.sha256(self.info_text().encode())
+        except (ValueError, RecursionError) as error:
+            raise CacheError(f"the JSON part cannot be written again: {error}") from error
+        for name in sorted(self.arrays):
+            array = np.ascontiguousarray(self.arrays[name])
+            total.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
+            total.update(array.data if array.size else b"")
+        return total.hexdigest()
+
+
+def record_from_cloud(cloud: PointCloud) -> Record:
+    """Write a cloud, or a batch, as a record; everything it knows is kept.
+
+    Raises:
+        CacheError: a label does not fit into int32, a dtype has no NumPy counterpart, or meta or history hold what JSON
+            cannot.
+    """
+    cloud = cloud.to("cpu")
+    arrays = {name: _array(name, value) for name in _POINT_FIELDS if (value := getattr(cloud, name)) is not None}
+    if cloud.labels is not None:
+        arrays["labels"] = _labels_as_int32(arrays["labels"])
+    arrays |= {_EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
+    # Frames may be called "robot/base_link", and a slash would open a group in HDF5.
+    arrays |= {_FRAMES + quote(name, safe=""): _array(name, matrix) for name, matrix in cloud.frames.items()}
+    arrays |= {"ptr": cloud.ptr.numpy(), "source_from_cloud": _array("source_from_cloud", cloud.source_from_cloud)}
+    if cloud.viewpoint is not None:
+        arrays["viewpoint"] = _array("viewpoint", cloud.viewpoint)
+    arrays |= _camera_arrays(cloud)
+    info = {
+        "schema": SCHEMA,
+        "frame_id": cloud.frame_id,
+        "source_frame": cloud.source_frame,
+        "unit": cloud.unit,
+        "kinds": {name: kind.value for name, kind in cloud.kinds.items()},
+        "meta": list(cloud.meta),
+        "history": [list(steps) for steps in cloud.history],
+    }
+    return Record(arrays, _as_json(info))
+
+
+def cloud_from_record(record: Record) -> PointCloud:
+    """Read a record back as the cloud it was written from.
+
+    Raises:
+        CacheError: the record is not one, or its parts do not fit together.
+    """
+    info = record.info
+    if not isinstance(info, Mapping) or info.get("schema") != SCHEMA:
+        schema = info.get("schema") if isinstance(info, Mapping) else info
+        raise CacheError(f"not a cloud record: schema must be {SCHEMA!r}, got {schema!r}")
+    _check_info(info)
+    tensors = {name: _tensor(name, array) for name, array in record.arrays.items() if name not in _DERIVED}
+    extra = {name.removeprefix(_EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(_EXTRA)}
+    frames = {
+        unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
+    }
+    unknown = tensors.keys() - {*_POINT_FIELDS, *_CLOUD_FIELDS}
+    if unknown:
+        raise CacheError(f"no cloud has the arrays {sorted(unknown)}")
+    if any(matrix.dtype != torch.float64 for matrix in frames.values()):
+        raise CacheError(f"frames must be float64, got {[str(matrix.dtype) for matrix in frames.values()]}")
+    if "labels" in tensors:
+        labels = tensors["labels"]
+        if labels.dtype != torch.int32 or labels.shape[1:] != (1,):
+            raise CacheError(f"labels must be int32 (N, 1), got {labels.dtype} {tuple(labels.shape)}")
+        tensors["labels"] = labels[:, 0].long()
+    try:
+        return PointCloud(
+            **tensors,  # type: ignore[arg-type]  # names were checked above
+            extra=extra,
+            frames=frames,
+            frame_id=info["frame_id"],
+            source_frame=info["source_frame"],
+            unit=info["unit"],
+            kinds=info["kinds"],
+            meta=info["meta"],
+            history=info["history"],
+        )
+    except (PcdataError, TypeError, ValueError, KeyError) as error:
+        raise CacheError(f"the record's parts do not fit together: {error}") from error
+
+
+def parse_info(text: str | bytes) -> dict[str, Any]:
+    """Parse the facts of a record or manifest; it takes at most about 30 times the memory of the text.
+
+    Raises:
+        CacheError: not a JSON object, as :func:`pcdata.files.strict_json.parse_json` takes them.
+    """
+    return json_object("the JSON part", text, error=CacheError)
+
+
+def _as_json(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts as JSON gives them back, so that what is read has the digest of what was written."""
+    try:
+        plain: dict[str, Any] = parse_json(json.dumps(info, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CacheError(
+            f"meta and history must hold plain finite numbers, texts, lists and dicts to be stored: {error}; convert "
+            "tensors with .tolist(), and leave out NaN"
+        ) from error
+    return plain
+
+
+def _check_info(info: Mapping[str, Any]) -> None:
+    for name in ("frame_id", "source_frame", "unit"):
+        if not isinstance(info.get(name), str):
+            raise CacheError(f"{name} must be a text, got {info.get(name)!r:.100}")
+    if not isinstance(info.get("kinds"), dict):
+        raise CacheError(f"kinds must be an object, got {info.get('kinds')!r:.100}")
+    for name, kind in (("meta", dict), ("history", list)):
+        entries = info.get(name)
+        if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
+            raise CacheError(f"{name} must be a list with one {kind.__name__} per cloud, got {entries!r:.100}")
+
+
+def _camera_arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
+    cameras = [camera for entry in cloud.meta for camera in entry.get("cameras", [])]
+    if not cameras:
+        return {}
+    intrinsics = {"intrinsics": np.array([camera["intrinsics"][0] for camera in cameras], dtype=np.float64)}
+    poses = [camera["world_from_camera"] for camera in cameras]
+    return intrinsics if None in poses else {**intrinsics, "extrinsics": np.array(poses, dtype=np.float64)}
+
+
+def _labels_as_int32(labels: np.ndarray) -> np.ndarray:
+    limits = np.iinfo(np.int32)
+    if labels.size and (labels.min() < limits.min or labels.max() > limits.max):
+        raise CacheError(f"labels are stored as int32, but they reach {labels.min()}..{labels.max()}; renumber them")
+    return labels.astype(np.int32)[:, None]
+
+
+def _array(name: str, value: Tensor) -> np.ndarray:
+    try:
+        array: np.ndarray = value.detach().numpy()
+    except (TypeError, RuntimeError) as error:
+        raise CacheError(f"{name}: {value.dtype} cannot be stored: {error}; convert it, e.g. to float32") from error
+    return array
+
+
+def _tensor(name: str, array: np.ndarray) -> Tensor:
+    if array.dtype.kind not in "biuf" or not array.dtype.isnative or array.dtype.itemsize > 8:
+        raise CacheError(f"array {name!r} has dtype {array.dtype}, which no cloud field has")
+    return torch.from_numpy(np.ascontiguousarray(array))

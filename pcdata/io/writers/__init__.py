@@ -1,0 +1,1 @@
+"""Captures written for others to read."""

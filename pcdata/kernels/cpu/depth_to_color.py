@@ -1,0 +1,71 @@
+"""Depth registered to colour in the compiled core."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_registration, half_pixels
+from pcdata.geometry.lens import fold_radius
+from pcdata.kernels.cpu.native import call, room, room_for
+from pcdata.kernels.cpu.rays import rays_of_cameras
+
+# The core numbers the pixels of an image with 32 bits.
+_MOST_PIXELS = 2**32 - 1
+
+
+@kernel("register_depth", "cpu")
+def register_depth(
+    depth: Tensor,
+    intrinsics: Tensor,
+    color_intrinsics: Tensor,
+    color_from_depth: Tensor,
+    *,
+    color_size: tuple[int, int],
+    distortion: Tensor | None,
+    color_distortion: Tensor | None,
+    max_jump: float,
+) -> RegisteredDepth:
+    """Project and paint a few rows at a time; what floats cannot hold is left to the reference."""
+    check_registration(
+        depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth, color_size, max_jump
+    )
+    views, height, width = depth.shape
+    color_shape = (views, *color_size)
+    if 0 < height * width <= _MOST_PIXELS and views > 0:
+        rays = rays_of_cameras(intrinsics, (height, width), distortion)
+        results = room_for(
+            (color_shape, torch.float32),
+            (color_shape, torch.int64),
+            (color_shape, torch.bool),
+            (depth.shape, torch.bool),
+        )
+        possible = room(1, torch.int64)
+        call(
+            "pc_register_depth",
+            *(depth.contiguous(), views, height, width, *rays),
+            *(color_from_depth.contiguous(), color_intrinsics.double().contiguous()),
+            half_pixels(intrinsics, color_intrinsics, color_from_depth).contiguous(),
+            None if color_distortion is None else _lenses(color_distortion),
+            *(*color_size, float(max_jump), *results, possible),
+        )
+        if possible:
+            return RegisteredDepth(*results)
+    reference: RegisteredDepth = OPERATIONS["register_depth"].reference(
+        depth,
+        intrinsics,
+        color_intrinsics,
+        color_from_depth,
+        color_size=color_size,
+        distortion=distortion,
+        color_distortion=color_distortion,
+        max_jump=max_jump,
+    )
+    return reference
+
+
+def _lenses(distortion: Tensor) -> Tensor:
+    """Return (V, 13) float64: twelve coefficients, those not given 0, and the radius where the model folds back."""
+    coefficients = torch.nn.functional.pad(distortion.double(), (0, 12 - distortion.shape[1]))
+    return torch.cat([coefficients, fold_radius(distortion)[:, None]], dim=1)

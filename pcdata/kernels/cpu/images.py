@@ -1,0 +1,188 @@
+"""Image kernels: from depth images to points.
+
+Deprojection takes two passes over the pixels: the first decides which become points, so that the second can write them,
+and all that goes along with them, where they belong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
+from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
+from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
+from pcdata.kernels.cpu.rays import Rays, rays_of_cameras
+
+
+@kernel("mask_depth", "cpu")
+def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tensor | None) -> Tensor:
+    """Decide and write in one pass."""
+    if mask is not None and (mask.shape != depth.shape or mask.dtype is not torch.bool):
+        return INNER["mask_depth"].reference(depth, near, far, mask)
+    masked = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    limits = _limits(near, far)
+    call("pc_mask_depth", depth.contiguous(), depth.numel(), *limits, _contiguous(mask), masked)
+    return masked
+
+
+@kernel("deproject_depth", "cpu")
+def deproject_depth(depth: Tensor, intrinsics: Tensor, *, distortion: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Write the points and their pixels."""
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return OPERATIONS["deproject_depth"].reference(depth, intrinsics, distortion=distortion)
+    made = cameras.deproject(chosen, over_all_views=False)
+    return made.points, made.ptr, made.source_index
+
+
+@kernel("deproject_images", "cpu")
+def deproject_images(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+) -> Deprojected:
+    """Write the points and all that goes along with them."""
+    if not _fit(depth, intrinsics, distortion, colors, images):
+        return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
+    cameras = _Cameras.of(depth, intrinsics, distortion)
+    chosen = cameras.choose()
+    if chosen is None:
+        return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
+    return cameras.deproject(chosen, colors=colors, images=images)
+
+
+@kernel("deproject_into_box", "cpu")
+def deproject_into_box(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+    *,
+    matrix: Tensor | None,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    near: float | None,
+    far: float | None,
+    mask: Tensor | None,
+) -> tuple[Deprojected, Tensor] | None:
+    """Write only what is inside the box."""
+    chosen = None
+    if (
+        _fit(depth, intrinsics, distortion, colors, images)
+        and (mask is None or (mask.shape == depth.shape and mask.dtype is torch.bool))
+        and (matrix is None or matrix.shape == (len(depth), 4, 4))
+    ):
+        cameras = _Cameras.of(depth, intrinsics, distortion)
+        matrix = None if matrix is None else matrix.double().contiguous()
+        corners = depth.new_tensor(lower), depth.new_tensor(upper)
+        chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
+    if chosen is None:
+        region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
+        return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
+    return cameras.deproject(chosen, matrix=matrix, colors=colors, images=images), chosen.readings
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Which pixels become points."""
+
+    keep: Tensor  # (V, H, W) bool
+    readings: Tensor  # (V,) int64: those that the box decided about
+    starts: Tensor  # (V * H + 1,) int64: where the points of each image row start
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """Depth images and the directions in which their pixels look."""
+
+    depth: Tensor  # (V, H, W)
+    rays: Rays
+
+    @classmethod
+    def of(cls, depth: Tensor, intrinsics: Tensor, distortion: Tensor | None) -> _Cameras:
+        check_intrinsics("deproject_depth", intrinsics)
+        return cls(depth.contiguous(), rays_of_cameras(intrinsics, (depth.shape[1], depth.shape[2]), distortion))
+
+    def choose(
+        self,
+        limits: tuple[float, float] = (0.0, math.inf),
+        mask: Tensor | None = None,
+        matrix: Tensor | None = None,
+        lower: Tensor | None = None,
+        upper: Tensor | None = None,
+    ) -> _Chosen | None:
+        """Decide about every pixel; None where there is none, or something wrong that the reference says best."""
+        if self.depth.numel() == 0:
+            return None
+        views, height, width = self.depth.shape
+        keep = room(self.depth.shape, torch.bool)
+        readings, possible = room(views, torch.int64), room(1, torch.int64)
+        starts = room(views * height + 1, torch.int64)
+        call(
+            "pc_choose_pixels",
+            *(self.depth, views, height, width, *self.rays),
+            *(*limits, _contiguous(mask), matrix, lower, upper),
+            *(keep, readings, starts, possible),
+        )
+        return _Chosen(keep, readings, starts) if possible else None
+
+    def deproject(
+        self,
+        chosen: _Chosen,
+        *,
+        over_all_views: bool = True,
+        matrix: Tensor | None = None,
+        colors: Tensor | None = None,
+        images: Mapping[str, Tensor] | None = None,
+    ) -> Deprojected:
+        """Write the chosen points, moved by the matrix."""
+        views, height, width = self.depth.shape
+        count = int(chosen.starts[-1])
+        sources = {name: image.contiguous() for name, image in (images or {}).items()}
+        core = [
+            ((count, 3), torch.float32),
+            ((count,), torch.int64),
+            ((count if colors is not None else 0, 3), torch.float32),
+        ]
+        copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
+        points, pixel_index, rgb, *rows = room_for(*core, *copied)
+        pixel_bytes = numbers(image.nbytes // self.depth.numel() for image in sources.values())
+        call(
+            "pc_deproject",
+            *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
+            *(points, pixel_index, over_all_views, _contiguous(colors), rgb),
+            *(len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)),
+        )
+        ptr = chosen.starts[::height].clone()
+        return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+
+
+def _fit(
+    depth: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor | None,
+    colors: Tensor | None,
+    images: Mapping[str, Tensor],
+) -> bool:
+    """Whether the core may read as many cameras and pixels as there are depths: the callers are not all checked."""
+    views = len(depth)
+    cameras = intrinsics.shape == (views, 3, 3) and (distortion is None or len(distortion) == views)
+    rgb = colors is None or (colors.shape == (*depth.shape, 3) and colors.dtype is torch.uint8)
+    return cameras and rgb and all(image.shape[:3] == depth.shape for image in images.values())
+
+
+def _limits(near: float | None, far: float | None) -> tuple[float, float]:
+    return 0.0 if near is None else float(near), math.inf if far is None else float(far)
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()

@@ -1,0 +1,165 @@
+"""Neighbour kernels: kNN, ball query, chamfer distance, statistical outliers, normals.
+
+All search one box tree over Morton order, sixteen queries at a time; clouds with an image grid search pixel windows
+first. Results are those of the references: the same neighbours in the same order, the same masks.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.contracts.numbers import require_count, require_length, require_positive
+from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.functional.metrics import mean_per_cloud, require_points
+from pcdata.functional.nearest import largest_squared
+from pcdata.functional.neighbors import check_ball_query, check_neighbors
+from pcdata.kernels.cpu.image_grid import grid_arguments
+from pcdata.kernels.cpu.native import call, room
+
+# The core keeps rows, and numbers of neighbours, in 31 bits.
+_MAX_ROWS = 2**31 - 1
+
+
+@kernel("knn", "cpu")
+def knn(
+    *,
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    grid: ImageGrid | None,
+) -> tuple[Tensor, Tensor]:
+    """Run the reference's contract in the core."""
+    check_neighbors("knn", points, ptr, queries, queries_ptr, grid)
+    require_count("knn", "k", k)
+    if k > _MAX_ROWS:
+        return _reference("knn", points, ptr, k=k, queries=queries, queries_ptr=queries_ptr, grid=grid)
+    index, distance, _ = _neighbors(points, ptr, k, None, queries, queries_ptr, grid, counted=False)
+    return index, distance
+
+
+@kernel("ball_query", "cpu")
+def ball_query(
+    *,
+    points: Tensor,
+    ptr: Tensor,
+    radius: float,
+    max_neighbors: int,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    grid: ImageGrid | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Run the reference's contract in the core."""
+    check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
+    if max_neighbors > _MAX_ROWS:
+        limits = {"radius": radius, "max_neighbors": max_neighbors}
+        return _reference("ball_query", points, ptr, **limits, queries=queries, queries_ptr=queries_ptr, grid=grid)
+    index, distance, count = _neighbors(
+        points, ptr, max_neighbors, float(radius), queries, queries_ptr, grid, counted=True
+    )
+    assert count is not None
+    return index, distance, count
+
+
+@kernel("chamfer_distance", "cpu")
+def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
+    """Run the reference's contract in the core, without gradients."""
+    require_points(ptr_a, ptr_b)
+    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
+    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
+
+
+@kernel("statistical_outlier_mask", "cpu")
+def statistical_outlier_mask(
+    *, points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None
+) -> Tensor:
+    """Run the reference's contract in the core."""
+    where = "statistical_outlier_mask"
+    require_count(where, "num_neighbors", num_neighbors)
+    require_positive(where, "std_ratio", std_ratio)
+    check_grid(where, grid, points, ptr)
+    points, ptr = _rows(points, ptr)
+    mean = room(len(points), torch.float64)
+    outlier = room(len(points), torch.bool)
+    call(
+        "pc_statistical_outliers",
+        *(points, ptr, len(ptr) - 1, _reachable(num_neighbors, points), float(std_ratio)),
+        *(*grid_arguments(grid), mean, outlier),
+    )
+    return outlier
+
+
+@kernel("estimate_normals", "cpu")
+def estimate_normals(
+    *, points: Tensor, ptr: Tensor, radius: float, max_neighbors: int, grid: ImageGrid | None
+) -> Tensor:
+    """Run the reference's contract in the core."""
+    require_length("estimate_normals", "radius", radius)
+    require_count("estimate_normals", "max_neighbors", max_neighbors)
+    check_grid("estimate_normals", grid, points, ptr)
+    points, ptr = _rows(points, ptr)
+    normals = room(points.shape, points.dtype)
+    most = _reachable(max_neighbors, points)
+    call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(float(radius)), *grid_arguments(grid), normals)
+    return normals
+
+
+def _neighbors(
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    radius: float | None,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    grid: ImageGrid | None,
+    *,
+    counted: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    points, ptr = _rows(points, ptr)
+    num_queries = len(points)
+    if queries is not None:
+        assert queries_ptr is not None
+        queries, queries_ptr = _rows(queries, queries_ptr)
+        num_queries = len(queries)
+    index = room((num_queries, k), torch.int64)
+    distance = room((num_queries, k), torch.float32)
+    count = room(num_queries, torch.int64) if counted else None
+    call(
+        "pc_neighbors",
+        *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, _limit(radius)),
+        *(*grid_arguments(grid), index, distance, count),
+    )
+    return index, distance, count
+
+
+def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool) -> Tensor:
+    """Return (B,) float64: the mean (squared) distance from every query to the nearest point of its cloud."""
+    points, ptr = _rows(points, ptr)
+    queries, queries_ptr = _rows(queries, queries_ptr)
+    distance = room(len(queries), torch.float32)
+    call("pc_nearest_squared", points, ptr, len(ptr) - 1, queries, queries_ptr, distance)
+    return mean_per_cloud(distance if squared else distance.sqrt_(), queries_ptr)
+
+
+def _rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
+    if len(points) > _MAX_ROWS:
+        raise ValueError(f"the compiled core takes at most {_MAX_ROWS} points in a call, got {len(points)}")
+    return points.detach().contiguous(), ptr.contiguous()
+
+
+def _reachable(count: int, points: Tensor) -> int:
+    """Return a number of neighbours that gives the same answer and fits the 31 bits of the core."""
+    return min(count, max(1, len(points)))
+
+
+def _reference(operation: str, *args: Any, **kwargs: Any) -> Any:
+    return OPERATIONS[operation].reference(*args, **kwargs)
+
+
+def _limit(radius: float | None) -> float:
+    return float(largest_squared(radius, torch.device("cpu")))

@@ -1,0 +1,164 @@
+"""Row kernels: picking rows of many fields at once, moving points, cutting out a box.
+
+Clouds of any size come here, also tiny ones, and some of them on the way to an error that the reference words best: it
+takes over whatever a kernel does not cover.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import pcdata.functional.rows
+import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
+from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.functional.rows import padding_of
+from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
+
+_ROWS_PER_PIECE = 16384  # as in rows.cpp
+_MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
+
+
+@kernel("pick_rows", "cpu")
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """Copy the rows of all fields piece by piece."""
+    sources = list(fields.values())
+    num_rows = len(sources[0]) if sources and sources[0].ndim else 0
+    if num_rows == 0 or rows.ndim != 1 or not all(_is_plain(field) and len(field) == num_rows for field in sources):
+        return _reference("pick_rows", fields, rows)
+    if rows.dtype is torch.bool and len(rows) == num_rows:
+        return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
+    if rows.dtype is torch.int64:
+        picked = _take_rows(sources, rows.contiguous())
+        if picked is not None:
+            return dict(zip(fields, picked))
+    return _reference("pick_rows", fields, rows)
+
+
+def _keep_rows(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
+    starts = room(-(-len(mask) // _ROWS_PER_PIECE) + 1, torch.int64)
+    call("pc_count_kept", mask, len(mask), starts)
+    sources, picked, sizes = _sources_and_picked(fields, int(starts[-1]))
+    call("pc_keep_rows", mask, len(mask), starts, len(fields), addresses(sources), sizes, addresses(picked))
+    return picked
+
+
+def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
+    """Return the rows of all fields; None if an index is negative, which counts from the end, or out of range."""
+    sources, picked, sizes = _sources_and_picked(fields, len(index))
+    possible = room(1, torch.int64)
+    of_all = len(fields), addresses(sources), sizes, addresses(picked)
+    call("pc_take_rows", index, len(index), len(fields[0]), *of_all, possible)
+    return picked if possible else None
+
+
+def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
+    sources = [field.contiguous() for field in fields]
+    picked = room_for(*(((count, *field.shape[1:]), field.dtype) for field in fields))
+    return sources, picked, numbers(field.nbytes // len(field) for field in sources)
+
+
+def _is_plain(field: Tensor) -> bool:
+    """Whether a row is its bytes."""
+    plain = field.layout is torch.strided and field.device.type == "cpu" and field.ndim > 0
+    return plain and not field.is_conj() and not field.is_neg()
+
+
+@kernel("join_rows", "cpu")
+def join_rows(parts: Mapping[str, Sequence[Tensor]]) -> dict[str, Tensor]:
+    """Copy the parts of all fields, part by part; torch is as good at a few."""
+    rows = sum(len(part) for field in parts.values() for part in field)
+    counts = _counts_of_equal_parts(parts) if rows > _MANY_ROWS else None
+    if counts is None:
+        return _reference("join_rows", parts)
+    return _placed(parts, counts, [0, *itertools.accumulate(counts)])
+
+
+@kernel("pad_rows", "cpu")
+def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Tensor]:
+    """Copy and fill the parts of all fields, part by part."""
+    counts = _counts_of_equal_parts(parts)
+    if counts is None or max(counts) > width:
+        return _reference("pad_rows", parts, width)
+    placed = _placed(parts, counts, [width * part for part in range(len(counts) + 1)])
+    return {name: block.reshape(len(counts), width, *block.shape[1:]) for name, block in placed.items()}
+
+
+def _counts_of_equal_parts(parts: Mapping[str, Sequence[Tensor]]) -> list[int] | None:
+    """Return the rows of each part; None where fields differ in them, or parts in what a row is."""
+    fields = list(parts.values())
+    if not fields or not fields[0]:
+        return None
+    counts = [len(part) if part.ndim else -1 for part in fields[0]]
+    for field in fields:
+        kind = field[0].dtype, field[0].shape[1:]
+        if [len(part) if _is_plain(part) and (part.dtype, part.shape[1:]) == kind else -1 for part in field] != counts:
+            return None
+    return counts
+
+
+def _placed(parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: list[int]) -> dict[str, Tensor]:
+    """Return one block per field with every part where it starts; the rest is padding."""
+    firsts = [field[0] for field in parts.values()]
+    blocks = room_for(*(((starts[-1], *first.shape[1:]), first.dtype) for first in firsts))
+    sources = [part.contiguous() for field in parts.values() for part in field]
+    row_bytes = [math.prod(first.shape[1:]) * first.element_size() for first in firsts]
+    fillers = [padding_of(first.dtype) & 0xFF for first in firsts]  # -1 is a row of such bytes
+    call(
+        "pc_place_rows",
+        *(len(counts), numbers(counts), numbers(starts), len(firsts), addresses(sources)),
+        *(numbers(row_bytes), numbers(fillers), addresses(blocks)),
+    )
+    return dict(zip(parts, blocks))
+
+
+@kernel("transform_points", "cpu")
+def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
+    """Move every point once, through registers."""
+    if not _covers(points, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+        return _reference("transform_points", points, ptr, matrix)
+    (moved,) = room_for((points.shape, points.dtype))
+    call("pc_transform_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _wide(matrix), moved)
+    return moved
+
+
+@kernel("transform_directions", "cpu")
+def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
+    """Turn every direction once, through registers."""
+    if not _covers(directions, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+        return _reference("transform_directions", directions, ptr, matrix)
+    (turned,) = room_for((directions.shape, directions.dtype))
+    linear = torch.linalg.inv(_wide(matrix)[:, :3, :3]).mT.contiguous()
+    call("pc_transform_directions", directions.contiguous(), ptr.contiguous(), len(ptr) - 1, linear, turned)
+    return turned
+
+
+def _covers(points: Tensor, ptr: Tensor) -> bool:
+    """Whether these are float32 points that the row pointers cut completely."""
+    fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and ptr.dtype is torch.int64 and len(ptr) > 1
+    return fits and int(ptr[0]) == 0 and int(ptr[-1]) == len(points)
+
+
+def _wide(matrix: Tensor) -> Tensor:
+    return matrix.double().contiguous()
+
+
+@kernel("inside_box", "cpu")
+def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -> Tensor | None:
+    """Look at every point once."""
+    if points.dtype is not torch.float32:
+        return _reference("inside_box", points, lower, upper)
+    inside, finite = room(len(points), torch.bool), room(1, torch.int64)
+    corners = points.new_tensor(lower), points.new_tensor(upper)
+    call("pc_inside_box", points.contiguous(), len(points), *corners, inside, finite)
+    return inside if finite else None
+
+
+def _reference(function: str, *args: Any) -> Any:
+    return INNER[function].reference(*args)

@@ -1,0 +1,122 @@
+"""Sampling kernels: planes, voxels, farthest points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.contracts.numbers import require_count
+from pcdata.functional.planes import PlaneWork, search_planes
+from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
+from pcdata.functional.sampling import check_available, counts_per_cloud
+from pcdata.functional.voxels import SIZE_TOLERANCE, sizes_per_cloud
+from pcdata.geometry.plane_fit import FLAT, plane_of_moments
+from pcdata.kernels.cpu.native import call, numbers, room
+
+# The core numbers the rows of one cloud, and voxels, with 32 bits.
+_MAX_ROWS = 2**31 - 1
+
+
+@kernel("farthest_point_sample", "cpu")
+def farthest_point_sample(
+    points: Tensor, ptr: Tensor, *, num_samples: int | Sequence[int] | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Visit only the points that a pick can change."""
+    wanted = counts_per_cloud("farthest_point_sample", num_samples, ptr)
+    check_available("farthest_point_sample", wanted, ptr)
+    if _too_long(ptr):
+        return _reference("farthest_point_sample", points, ptr, num_samples=num_samples)
+    picks, counts = room(sum(wanted), torch.int64), numbers(wanted)
+    call("pc_farthest_points", points.contiguous(), ptr.contiguous(), len(wanted), counts, picks)
+    return picks.add_(torch.repeat_interleave(ptr[:-1], counts)), ptr_from_counts(counts)
+
+
+@kernel("voxel_downsample", "cpu")
+def voxel_downsample(
+    points: Tensor, ptr: Tensor, *, voxel_size: float | Sequence[float] | Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Number voxels in a hash table; sums are integers, so threads change nothing."""
+    sizes = sizes_per_cloud("voxel_downsample", voxel_size, ptr).contiguous()
+    if _too_long(ptr):
+        return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)
+    # As many rows as there could be: those not written never become memory.
+    means, inverse = room(points.shape, points.dtype), room(len(points), torch.int64)
+    counts, spans_too_many = room(len(ptr) - 1, torch.int64), room(1, torch.int64)
+    arrays = points.contiguous(), ptr.contiguous(), len(ptr) - 1, sizes, means, inverse, counts, spans_too_many
+    call("pc_voxel_downsample", *arrays)
+    if spans_too_many:
+        return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)  # knows what to say
+    means_ptr = ptr_from_counts(counts)
+    # Not clone(): see pcdata.contracts.tensors on torch's threads.
+    return torch.from_numpy(means[: int(means_ptr[-1])].numpy().copy()), means_ptr, inverse
+
+
+@kernel("find_voxel_size", "cpu")
+def find_voxel_size(points: Tensor, ptr: Tensor, *, num_points: int) -> Tensor:
+    """Bisect like the reference: small clouds side by side, large ones with all threads."""
+    require_count("find_voxel_size", "num_points", num_points)
+    sizes, possible = room(len(ptr) - 1, torch.float64), room(1, torch.int64)
+    if not _too_long(ptr) and num_points <= _MAX_ROWS:
+        call("pc_find_voxel_sizes", points, ptr, len(sizes), num_points, SIZE_TOLERANCE, sizes, possible)
+        if possible:
+            return sizes
+    return _reference("find_voxel_size", points, ptr, num_points=num_points)  # knows what to say
+
+
+@kernel("ransac_plane", "cpu")
+def ransac_plane(
+    points: Tensor,
+    ptr: Tensor,
+    *,
+    distance: float,
+    num_hypotheses: int,
+    seed: int | Sequence[int] | Tensor,
+    up: Tensor | Sequence[float] | None,
+    max_tilt: float | None,
+) -> tuple[Tensor, Tensor]:
+    """Make and score all hypotheses of all clouds in one pass over the points; decisions are the reference's."""
+    work = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)
+    return search_planes(points, ptr, work, distance, num_hypotheses, seed, up, max_tilt)
+
+
+def _draw(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
+    planes = room((len(which), triples.shape[1], 4), torch.float64)
+    call("pc_planes_of_triples", points, ptr, len(which), triples, triples.shape[1], which, FLAT, planes)
+    return planes
+
+
+def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    counts = room(planes.shape[:2], torch.int64)
+    call("pc_count_near_planes", points, ptr, len(planes), planes.float(), planes.shape[1], float(distance), counts)
+    return counts
+
+
+def _inlier_mask(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    near = room(len(points), torch.bool)
+    call("pc_near_planes", points, ptr, len(planes), planes.float(), float(distance), near)
+    return near
+
+
+def _fit(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
+    # Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
+    origin = points[first_per_cloud(chosen, ptr)].double()
+    sums = room((len(origin), 11), torch.float64)
+    call("pc_moments", points, ptr, len(origin), chosen, origin, sums)
+    count = sums[:, :1].clamp(min=1)
+    mean = sums[:, 2:5] / count
+    xx, xy, xz, yy, yz, zz = (sums[:, 5:] / count).unbind(1)
+    second = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).reshape(-1, 3, 3)
+    planes = plane_of_moments(origin + mean, second - mean[:, :, None] * mean[:, None, :], sums[:, 1])
+    return planes.masked_fill(sums[:, :1] < 3, torch.nan)
+
+
+def _too_long(ptr: Tensor) -> bool:
+    return int(counts_from_ptr(ptr).max()) > _MAX_ROWS
+
+
+def _reference(operation: str, *args: Any, **kwargs: Any) -> Any:
+    return OPERATIONS[operation].reference(*args, **kwargs)

@@ -1,0 +1,106 @@
+"""Can the intrinsics belong to this image, and the poses to any camera?"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from pcdata.contracts.lengths import FARTHEST
+from pcdata.structures import Camera, DepthFrame
+from pcdata.validation.check import Check, Verdict, graded
+from pcdata.validation.limits import Limits
+
+_MAX_SKEWED = 1e-3  # of R R^T - I; more is refused where a frame is made
+
+
+def intrinsics_checks(camera: Camera, limits: Limits) -> list[Check]:
+    """Judge each view's principal point, field of view and pixel shape; the first two only of uncropped images."""
+    checks = []
+    for view, k in enumerate(camera.intrinsics.tolist()):
+        (fx, _, cx), (_, fy, cy), _ = k
+        if not camera.is_window:
+            checks += [
+                _principal_point(cx, cy, camera.size, limits, view),
+                _field_of_view(fx, cx, camera.size[1], limits, view),
+            ]
+        checks.append(
+            graded(
+                "pixel_aspect",
+                abs(fx / fy - 1),
+                threshold=limits.pixel_aspect,
+                fails_at=None,
+                found=f"fx {fx:.1f}, fy {fy:.1f} pixels",
+                advice="right only if the image was resized unevenly and K with it; else take the K of this resolution",
+                view=view,
+            )
+        )
+    return checks
+
+
+def _principal_point(cx: float, cy: float, size: tuple[int, int], limits: Limits, view: int) -> Check:
+    height, width = size
+    off = max(abs(cx + 0.5 - width / 2) / width, abs(cy + 0.5 - height / 2) / height)
+    return graded(
+        "principal_point",
+        off,
+        threshold=limits.principal_point[0],
+        fails_at=limits.principal_point[1],
+        found=f"({cx:.1f}, {cy:.1f}) in an image of {width}x{height}",
+        advice=f"such intrinsics belong to an image of about {2 * cx + 1:.0f}x{2 * cy + 1:.0f}: if this one was "
+        f"resized, use Camera.resized(({height}, {width})); if cropped, Camera.cropped",
+        view=view,
+    )
+
+
+def _field_of_view(fx: float, cx: float, width: int, limits: Limits, view: int) -> Check:
+    """The angle across the image through the principal point, without the lens distortion."""
+    degrees = math.degrees(math.atan((cx + 0.5) / fx) + math.atan((width - 0.5 - cx) / fx))
+    least, most = limits.field_of_view
+    bound = least if degrees < math.sqrt(least * most) else most
+    ok = least <= degrees <= most
+    return Check(
+        name="field_of_view",
+        verdict=Verdict.PASS if ok else Verdict.FAIL,
+        found=f"{degrees:.0f} degrees across {width} pixels at fx {fx:.1f}",
+        value=degrees,
+        threshold=bound,
+        fails_at=bound,
+        unit="degrees",
+        advice="" if ok else "K belongs to another resolution, or fx is in other units than pixels (mm?)",
+        view=view,
+    )
+
+
+def pose_checks(frame: DepthFrame) -> list[Check]:
+    """Judge how far each pose is from rigid; poses that are not are refused before a frame exists."""
+    if frame.world_from_camera is None:
+        return []
+    rotation = frame.world_from_camera[:, :3, :3]
+    away = frame.world_from_camera[:, :3, 3].norm(dim=1).tolist()
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)).abs().amax((1, 2))
+    return [
+        _far_pose(far, frame.frame_id or "world", view)
+        if far > FARTHEST and off <= _MAX_SKEWED
+        else graded(
+            "pose",
+            float(off),
+            threshold=_MAX_SKEWED,
+            fails_at=_MAX_SKEWED,
+            found=f"R R^T differs from the identity by {float(off):.1g}",
+            advice="write rotations with more digits, or make them orthonormal again",
+            view=view,
+        )
+        for view, (off, far) in enumerate(zip(error, away))
+    ]
+
+
+def _far_pose(metres: float, frame_id: str, view: int) -> Check:
+    return Check(
+        name="pose",
+        verdict=Verdict.WARN,
+        found=f"the camera stands {metres:.4g} m from the origin of {frame_id!r}",
+        value=None,
+        advice=f"are translations in millimetres ({metres / 1000:.3g} m)? Write metres; right if it is that far",
+        view=view,
+    )

@@ -1,0 +1,73 @@
+"""Is there depth at all, and where is it missing?"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from pcdata.validation.check import Check, graded
+from pcdata.validation.limits import Limits
+from pcdata.validation.measures.missing_region import largest_missing_block, largest_missing_region
+
+
+def coverage_checks(
+    valid: Tensor,  # (H, W) bool, True = has a reading
+    limits: Limits,
+    view: int | None = None,
+    *,
+    may_be_cut: bool = False,
+) -> list[Check]:
+    """Judge the share of pixels that have a reading, and the largest region that has none.
+
+    A region without straight ends only warns: someone may have taken the background away on purpose, or something stood
+    before the lens. With ``may_be_cut`` every one only warns: straight cuts may be on purpose too.
+    """
+    height, width = valid.shape
+    count = int(valid.sum())
+    fraction = count / valid.numel()
+    region = largest_missing_region(valid)
+    where = place_in_words(region.box, (height, width))
+    # At least half of what may not be missing lies in whole lines: less is a sensor's blind border.
+    is_block = largest_missing_block(valid) > limits.missing_region[0]
+    return [
+        graded(
+            "valid_fraction",
+            fraction,
+            threshold=limits.valid_fraction[0],
+            fails_at=limits.valid_fraction[1],
+            higher_is_better=True,
+            found=f"{count:,} of {valid.numel():,} pixels have a reading",
+            advice="raise the exposure or the projector's power, turn away from windows and mirrors, keep to the "
+            "sensor's range, or drop the capture",
+            view=view,
+        ),
+        graded(
+            "missing_region",
+            region.fraction,
+            threshold=limits.missing_region[0],
+            fails_at=limits.missing_region[1] if is_block and not may_be_cut else None,
+            found=f"{100 * region.fraction:.0f} % of the image in one piece have no reading, {where}"
+            if region.fraction
+            else "no region without readings",
+            advice=f"whole lines have no reading {where}: the background was cut away, the scene is out of range, "
+            "or a part of the image was not stored; compare with the colour image before you drop it"
+            if is_block
+            else f"look at what the camera sees {where}: something before the lens, out of range, black, shiny or "
+            "transparent; right if the background was cut away on purpose",
+            view=view,
+        ),
+    ]
+
+
+def place_in_words(box: tuple[int, int, int, int], size: tuple[int, int]) -> str:
+    """Say where in an image of (height, width) a box (top, left, bottom, right) lies, e.g. ``at the top left``."""
+    vertical = _part(box[0] / size[0], box[2] / size[0], "top", "bottom")
+    horizontal = _part(box[1] / size[1], box[3] / size[1], "left", "right")
+    words = [word for word in dict.fromkeys((vertical, horizontal)) if word]
+    return f"at the {' '.join(words)}" if words else "all over the image"
+
+
+def _part(begin: float, end: float, low: str, high: str) -> str:
+    if begin < 0.1 and end > 0.9:
+        return ""
+    middle = (begin + end) / 2
+    return low if middle < 0.4 else high if middle > 0.6 else "middle"

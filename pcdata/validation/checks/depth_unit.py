@@ -1,0 +1,134 @@
+"""Is the unit of depth right? Every usual unit is tried on the numbers as they were stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, UnitFit, encoded, unit_fits, units_in_words
+from pcdata.validation.check import Check, Verdict
+from pcdata.validation.limits import Limits
+
+NAME = "depth_unit"
+_SURE = 0.94  # probability of a unit that passes; wrong ones reach 0.90 on scenes without noise to judge by
+_NAMED = 0.01  # of a unit that is worth a mention
+_REFUTED = 0.02  # of a unit that fails
+_SAME = 0.01  # of the distance: units that give equal depth are one
+# Units in which depth in memory may have been stored, the coarsest that fits first.
+_GRIDS = (0.01, 1 / 256, 0.001, 0.00025, 0.0002, 0.0001, 0.00001)
+_OFF_GRID = 0.02  # of a unit: what float32 adds to whole numbers below 65536
+
+
+class Stored(NamedTuple):
+    """Depth as numbers of some unit."""
+
+    values: NDArray[Any]
+    unit: DepthUnit
+    is_known: bool  # whether the unit is what a file or its reader said, not what the numbers look like
+
+
+def depth_unit_check(
+    depth: Tensor,  # (H, W) metres, or (1, N) where there is no image; 0 = no reading
+    limits: Limits,
+    facts: Mapping[str, Any],  # provenance: metres_per_unit, depth_encoding, unit_is_recorded
+    *,
+    focal: float | None = None,
+    view: int | None = None,
+) -> Check:
+    """Pass a unit that alone fits the numbers, warn where others fit too and name them, fail one that does not fit.
+
+    Half of the readings beyond twice the workspace warn, whatever the unit.
+    """
+    stored = stored_numbers(depth, facts)
+    readings = depth[depth > 0]
+    median = float(readings.median())
+    near, far = limits.workspace
+    beyond = max(near / median, median / far)
+    fits = unit_fits(
+        stored.values,
+        declared=stored.unit,
+        focal=focal,
+        workspace=limits.workspace,
+        workspace_is_known=limits.workspace_is_stated,
+        known_units=[stored.unit.metres] if facts.get("unit_is_recorded") and stored.is_known else limits.units,
+    )
+    probability = sum(fit.probability for fit in fits if abs(fit.median / median - 1) < _SAME)
+    others = [fit for fit in fits if fit.probability >= _NAMED and abs(fit.median / median - 1) >= _SAME]
+    own = [UnitFit(stored.unit, probability, median)] if probability >= _REFUTED else []
+    found = f"half of the readings lie within {median:.3g} m; the workspace is {near:g} to {far:g} m"
+    if probability < _REFUTED and others:
+        verdict = Verdict.FAIL
+        advice = f"{_mend(others, stored)}{_doubt(others)}"
+    elif probability < _SURE and others:
+        verdict = Verdict.WARN
+        ranked = sorted([*own, *others], key=lambda fit: -fit.probability)
+        found += f"; several units fit: {units_in_words(ranked)}"
+        advice = (
+            f"which is right? {_mend(others, stored)}, or leave it; to tell them apart measure a distance in the scene "
+            f"and give --workspace NEAR FAR around it, or --sensor NAME"
+        )
+    elif beyond > 2:
+        verdict = Verdict.WARN
+        advice = "no other usual unit fits better: if the scene is that far away, say so with workspace"
+        if median < near:
+            advice = "no other usual unit fits better: if the scene is that near, say so with workspace"
+    else:
+        verdict, advice = Verdict.PASS, ""
+    return Check(
+        name=NAME,
+        verdict=verdict,
+        found=found,
+        value=median,
+        threshold=2 * far if median > near else near / 2,
+        fails_at=None,
+        unit="m",
+        advice=advice,
+        view=view,
+    )
+
+
+def stored_numbers(depth: Tensor, facts: Mapping[str, Any]) -> Stored:
+    """Return depth as the numbers that a file had, or may have had."""
+    metres = depth.detach().cpu().numpy().astype(np.float64)
+    stated = facts.get("metres_per_unit")
+    encoding: DepthEncoding = facts.get("depth_encoding", "plain")
+    if isinstance(stated, (int, float)) and stated > 0:
+        if (whole := _whole(metres, float(stated))) is not None:
+            return Stored(encoded(whole, encoding), DepthUnit(float(stated), encoding), True)
+        return Stored(metres / float(stated), DepthUnit(float(stated)), True)
+    grids = _GRIDS if len(metres) > 1 else ()  # a cloud has no pixels: its numbers never were an image's integers
+    for unit in grids:
+        if (whole := _whole(metres, unit)) is not None:
+            return Stored(whole, DepthUnit(unit), False)
+    return Stored(metres, DepthUnit(1.0), False)
+
+
+def _whole(metres: NDArray[np.float64], unit: float) -> NDArray[np.uint16] | None:
+    numbers = metres / unit
+    whole = np.rint(numbers)
+    if whole.max() > 65535 or len(numbers) == 0 or (np.abs(numbers - whole) > _OFF_GRID).any():
+        return None
+    return whole.astype(np.uint16)
+
+
+def _mend(others: Sequence[UnitFit], stored: Stored) -> str:
+    """Say what to change; options where the unit came with the file, factors where the depth was made in memory."""
+    if stored.is_known:
+        return f"set {units_in_words(others)}"
+    factors = (
+        f"{fit.unit.metres / stored.unit.metres:.6g} (half within {fit.median:.3g} m)"
+        if fit.unit.encoding == "plain"
+        else f"decode the {fit.unit.encoding} bits with {fit.unit} (half within {fit.median:.3g} m)"
+        for fit in others
+    )
+    return "multiply depth by " + " or ".join(factors)
+
+
+def _doubt(others: Sequence[UnitFit]) -> str:
+    if len(others) < 2:
+        return "; if a measured distance says otherwise, give workspace around it"
+    return "; several fit: measure a distance in the scene to choose, and give workspace around it"

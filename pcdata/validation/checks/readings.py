@@ -1,0 +1,89 @@
+"""Are the numbers lengths in metres, of the workspace, and not clipped?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from pcdata.io.images.reading import MARKS
+from pcdata.validation.check import Check, graded
+from pcdata.validation.checks.depth_unit import depth_unit_check
+from pcdata.validation.limits import Limits
+from pcdata.validation.measures.extremes import pile_at_extreme
+
+_SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
+
+
+def reading_checks(
+    depth: Tensor,  # (H, W), or (N,) where there is no image; metres, 0 = no reading
+    limits: Limits,
+    *,
+    facts: Mapping[str, Any] | None = None,  # provenance: the unit and the order of bits of the file, where known
+    focal: float | None = None,  # pixels
+    view: int | None = None,
+) -> list[Check]:
+    """Judge the unit, the range and the ends of the range of the readings."""
+    flat = depth.flatten()
+    flat = flat[:: max(1, len(flat) // _SAMPLES)]
+    readings = flat[flat > 0]
+    if not len(readings):
+        return []  # coverage has said so
+    return [
+        depth_unit_check(depth if depth.ndim == 2 else depth[None], limits, facts or {}, focal=focal, view=view),
+        _range(readings, limits, view),
+        _saturation(readings, limits, (facts or {}).get("metres_per_unit"), view),
+    ]
+
+
+def _share_inside(readings: Tensor, limits: Limits) -> float:
+    near, far = limits.workspace
+    return float(((readings >= near) & (readings <= far)).float().mean())
+
+
+def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
+    near, far = limits.workspace
+    one_percent = len(readings) // 100
+    low = float(readings.kthvalue(1 + one_percent).values)
+    high = float(readings.kthvalue(len(readings) - one_percent).values)
+    fraction = _share_inside(readings, limits)
+    return graded(
+        "workspace_fraction",
+        fraction,
+        threshold=limits.workspace_fraction[0],
+        fails_at=limits.workspace_fraction[1],
+        higher_is_better=True,
+        found=f"98 % of the readings lie between {low:.3g} and {high:.3g} m",
+        advice=f"move the camera, or give the workspace of this task instead of {near:g} to {far:g} m",
+        view=view,
+    )
+
+
+def _saturation(readings: Tensor, limits: Limits, metres_per_unit: float | None, view: int | None) -> Check:
+    piles = [pile for end in ("far", "near") if (pile := pile_at_extreme(readings, end=end)) is not None]
+    pile = max(piles, key=lambda one: one.fraction, default=None)
+    found, advice = "no pile of readings at either end of the range", ""
+    if pile is not None:
+        stored = None if metres_per_unit is None else round(pile.value / metres_per_unit)
+        found = f"{100 * pile.fraction:.2g} % of the readings are exactly {pile.value:.5g} m"
+        advice = "clipped at the end of the sensor's range: store 0 there instead"
+        if stored is not None and metres_per_unit != 1.0:
+            found += f", stored as {stored}" + (f", {MARKS[stored]}" if stored in MARKS else "")
+            say = (
+                f'say so: --invalid-values {stored}, or "invalid_values": [{stored}] in intrinsics.json, in Python '
+                f"open_source(invalid_values=[{stored}])"
+            )
+            if stored in MARKS:
+                advice = f"{stored} marks 'no reading' in some formats: {say}"
+            else:
+                advice += f"; if {stored} marks 'no reading', {say}"
+    return graded(
+        "saturation",
+        0.0 if pile is None else pile.fraction,
+        threshold=limits.saturation[0],
+        fails_at=limits.saturation[1],
+        found=found,
+        advice=advice,
+        view=view,
+    )

@@ -1,0 +1,53 @@
+"""The depth file as it is stored, before a reader cleans or refuses it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pcdata.io.images.stored_faults import RawFaults, count_raw_faults
+from pcdata.validation.check import Check, Verdict
+
+
+def raw_value_checks(paths: Sequence[Path]) -> list[Check]:
+    """Judge the stored values of every view: NaN and infinity warn, as programs differ on them; negative depth fails.
+
+    Raises:
+        CaptureError: a file is missing, damaged, or not a depth image.
+    """
+    if len(paths) == 1:
+        return [_judged_file(paths[0])]
+    return [replace(_judged_file(path), view=view) for view, path in enumerate(paths)]
+
+
+def _judged_file(path: Path) -> Check:
+    faults = count_raw_faults(path)
+    if faults is None:
+        return Check(
+            name="raw_values",
+            verdict=Verdict.PASS,
+            found="whole numbers: none can be NaN, infinite or negative",
+            value=0.0,
+            threshold=0.0,
+        )
+    return _judged(faults)
+
+
+def _judged(faults: RawFaults) -> Check:
+    bad = faults.nan + faults.infinite + faults.negative
+    verdict = Verdict.FAIL if faults.negative else Verdict.WARN if bad else Verdict.PASS
+    advice = {
+        Verdict.PASS: "",
+        Verdict.WARN: "pcdata reads them as 0, no reading; store 0 so that every program does",
+        Verdict.FAIL: "is z pointing backwards (OpenGL axes)? Flip the sign when exporting, write 0 for 'no reading'",
+    }[verdict]
+    return Check(
+        name="raw_values",
+        verdict=verdict,
+        found=f"of {faults.num_pixels:,} values {faults.nan:,} are NaN, {faults.infinite:,} infinite, "
+        f"{faults.negative:,} negative",
+        value=bad / faults.num_pixels,
+        threshold=0.0,
+        advice=advice,
+    )

@@ -1,0 +1,109 @@
+"""What poses may be instead of world_from_camera, and how far views agree when poses are read so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pcdata.alignment.view_agreement import Agreement, view_agreement
+from pcdata.geometry import rigid
+from pcdata.structures import DepthFrame
+
+Reading = Callable[[Tensor], Tensor]  # (4, 4) pose as given -> (4, 4) world_from_camera
+
+LEAST_COMPARED = 200  # readings that views must share before they can be said to agree or not
+AGREE = 0.5  # of the readings compared: under a wrong pose few agree, and those by chance
+_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
+_LEAST_GAIN = 0.1  # by which another convention must agree better
+_LEAST_MOTION = (0.02, 0.035)  # metres, radians: closer cameras agree under every convention
+
+
+class PosedView(NamedTuple):
+    """One view with its pose."""
+
+    sample_id: str
+    depth: Tensor  # (H, W)
+    intrinsics: Tensor  # (3, 3)
+    distortion: Tensor | None
+    pose: Tensor  # (4, 4) world_from_camera as given
+
+
+def _with_translation(pose: Tensor, factor: float) -> Tensor:
+    scaled = pose.clone()
+    scaled[:3, 3] *= factor
+    return scaled
+
+
+def _transposed_rotation(pose: Tensor) -> Tensor:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3].mT
+    return turned
+
+
+def as_given(pose: Tensor) -> Tensor:
+    """Return the pose itself."""
+    return pose
+
+
+# The mistake in words, and the poses set right.
+CONVENTIONS: dict[str, Reading] = {
+    "camera_from_world, the inverse of what is needed": rigid.invert_rigid,
+    "rotations stored transposed": _transposed_rotation,
+    "poses of OpenGL cameras (y up, z backwards)": lambda pose: pose @ _OPENGL.to(pose.device),
+    "translations in millimetres": lambda pose: _with_translation(pose, 1e-3),
+    "translations in centimetres": lambda pose: _with_translation(pose, 1e-2),
+}
+
+
+def posed_views(frame: DepthFrame) -> list[PosedView]:
+    """Return the views of a frame with their poses; none where there are no poses."""
+    if frame.world_from_camera is None:
+        return []
+    camera = frame.camera
+    lenses: Sequence[Tensor | None] = [None] * frame.num_views if camera.distortion is None else list(camera.distortion)
+    return [
+        PosedView(frame.sample_id, depth, k, lens, pose)
+        for depth, k, lens, pose in zip(frame.depth, camera.intrinsics, lenses, frame.world_from_camera)
+    ]
+
+
+def agreement(a: PosedView, b: PosedView, read_a: Reading = as_given, read_b: Reading = as_given) -> Agreement:
+    """Carry each of two views into the other, with their poses read so, and add up."""
+    pose_a, pose_b = read_a(a.pose), read_b(b.pose)
+    total = Agreement(0, 0)
+    for one, other, other_from_one in (
+        (a, b, rigid.invert_rigid(pose_b) @ pose_a),
+        (b, a, rigid.invert_rigid(pose_a) @ pose_b),
+    ):
+        found = view_agreement(
+            one.depth,
+            other.depth,
+            one.intrinsics,
+            other.intrinsics,
+            other_from_one,
+            distortion_a=one.distortion,
+            distortion_b=other.distortion,
+        )
+        total = Agreement(total.agree + found.agree, total.compared + found.compared)
+    return total
+
+
+def share(found: Agreement) -> float:
+    """Return the part of the readings compared that agree; of too few, they count as too few that agree."""
+    return found.agree / max(found.compared, LEAST_COMPARED)
+
+
+def explains_more(share_read: float, share_given: float) -> bool:
+    """Whether a convention agrees at all, better by a margin, and resolves half of what contradicts as given."""
+    gain = share_read - share_given
+    return share_read >= AGREE and gain >= max(_LEAST_GAIN, 0.5 * (1.0 - share_given))
+
+
+def has_moved(a: Tensor, b: Tensor) -> bool:
+    """Whether two poses lie so far apart that conventions can be told from each other."""
+    motion = rigid.invert_rigid(a) @ b
+    turn = torch.linalg.matrix_norm(motion[:3, :3] - torch.eye(3, dtype=motion.dtype, device=motion.device)) / 2**0.5
+    return bool(motion[:3, 3].norm() > _LEAST_MOTION[0]) or bool(turn > _LEAST_MOTION[1])
