@@ -19,18 +19,18 @@ OPENS = {
 }  # fmt: skip
 # What looks like it and is none: the call, and why.
 ALLOWED = {
-    "files.py": {"os.open": "the door"},
-    "demo.py": {"(files('pcdata') / 'demo.yaml').read_text": "a file of the package"},
+    "files/opening.py": {"os.open": "the door"},
+    "cli/demo.py": {"(files('pcdata') / 'demo.yaml').read_text": "a file of the package"},
     "sensors/catalogue.py": {"files('pcdata.sensors').joinpath('profiles.yaml').read_text": "a file of the package"},
-    "io/images.py": {"Image.open": "of bytes"},
-    "io/rosbag.py": {"rosbag1.Reader": "after open_input"},
-    "io/hdf5_arrays.py": {"h5py.File": "after the door", "h5o.open": "within a file that is open"},
-    "io/stores.py": {"h5py.File": "to write"},
-    "inputs.py": {"open": "what the door has opened, once more: has it changed?"},
-    "locks.py": {"os.open": "to lock it"},
-    "part_files.py": {"os.open": "to write"},
-    "io/scratch.py": {"Path(f'/proc/{pid}/stat').read_bytes": "of the system, not of a user"},
-    "io/whole_folders.py": {"os.open": "a folder, to force it to disk"},
+    "io/images/reading.py": {"Image.open": "of bytes"},
+    "io/sources/rosbag.py": {"rosbag1.Reader": "after open_input"},
+    "io/arrays/hdf5_arrays.py": {"h5py.File": "after the door", "h5o.open": "within a file that is open"},
+    "io/store/stores.py": {"h5py.File": "to write"},
+    "files/inputs.py": {"open": "what the door has opened, once more: has it changed?"},
+    "files/locks.py": {"os.open": "to lock it"},
+    "files/part_files.py": {"os.open": "to write"},
+    "files/scratch.py": {"Path(f'/proc/{pid}/stat').read_bytes": "of the system, not of a user"},
+    "files/whole_folders.py": {"os.open": "a folder, to force it to disk"},
     "cli/datasets.py": {"config.source.open": "a capture, not a file"},
 }
 

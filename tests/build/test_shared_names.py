@@ -14,7 +14,7 @@ import pytest
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset
 from pcdata.errors import CacheError, CaptureError
-from pcdata.files.opening import scratch, whole_folders
+from pcdata.files import scratch, whole_folders
 from tests.build.test_builder import Clouds, cloud, tree
 
 

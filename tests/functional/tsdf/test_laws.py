@@ -198,7 +198,7 @@ print(json.dumps({"refused": refused, "estimate": estimate, "grown": growth.peak
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is read from /proc")
 def test_the_estimate_is_within_a_fifth_of_what_the_process_grows_by():
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     script = f"import sys; sys.path[:0] = [{str(root)!r}, {str(root / 'benchmarks')!r}]\n{MEMORY}"
     done = run_python(script)
     assert done.returncode == 0, done.stderr

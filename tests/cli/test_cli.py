@@ -30,7 +30,7 @@ from pcdata.io import write_ply
 from pcdata.io.sources.cloud_files import CloudFilesSource
 from pcdata.synthetic import SyntheticSource
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """\
 depth: [Deproject]
 cloud: [FarthestPointSample: {num_points: 16, if_short: repeat}]

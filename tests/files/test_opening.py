@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pcdata.errors import CacheError, CaptureError
-from pcdata.files.opening import opening as files
+from pcdata.files import opening as files
 
 DOORS = {
     "open_input": lambda path, **options: files.open_input("here", path, **options).close(),
