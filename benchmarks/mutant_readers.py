@@ -114,9 +114,9 @@ def _robot(pattern: str) -> tuple[str, Callable[[Path], Any]]:
 
 
 def _volume(folder: Path) -> Any:
-    from pcdata import TSDFVolume
+    from pcdata import read_volume
 
-    return TSDFVolume.load(folder / "v.npz").extract_points()
+    return read_volume(folder / "v.npz").extract_points()
 
 
 READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {

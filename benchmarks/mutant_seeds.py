@@ -226,13 +226,13 @@ def _write_texts(folder: Path) -> None:
 
 
 def _write_volume(path: Path) -> None:
-    from pcdata import TSDFVolume
+    from pcdata import TSDFVolume, write_volume
 
     volume = TSDFVolume(voxel_size=0.05, truncation=0.15)
     for name in _TwoCaptures.ids:
         pose = torch.eye(4, dtype=torch.float64)[None]
         volume.integrate(replace(_TwoCaptures().load(name), world_from_camera=pose, frame_id="base"))
-    volume.save(path)
+    write_volume(path, volume)
 
 
 def _write_bags(folder: Path, depth: np.ndarray, color: np.ndarray) -> None:

@@ -29,4 +29,4 @@ assert main([*fuse, str(folder / "volume.npz")]) == 0
 cloud = pcdata.read_ply(folder / "cloud.ply")
 assert cloud.frame_id == "table"
 assert cloud.extra["num_views"].min() >= 2
-print(cloud, pcdata.TSDFVolume.load(folder / "volume.npz"), sep="\n")
+print(cloud, pcdata.read_volume(folder / "volume.npz"), sep="\n")

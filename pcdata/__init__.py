@@ -78,10 +78,12 @@ _HOMES = {
         "open_source",
         "read_pcd",
         "read_ply",
+        "read_volume",
         "refused_captures",
         "register_layout",
         "write_pcd",
         "write_ply",
+        "write_volume",
     ],
     "pcdata.imports": ["import_file"],
     "pcdata.datasets": [

@@ -43,7 +43,7 @@ def add_to(commands: Any) -> None:
 
 def _fuse(arguments: argparse.Namespace) -> None:
     out = _checked_target(arguments)  # before the work, not after
-    from pcdata.io import write_ply
+    from pcdata.io import write_ply, write_volume
     from pcdata.structures import TSDFVolume
 
     volume = TSDFVolume(
@@ -60,7 +60,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
             progress(done, len(source), sample_id)
     least = arguments.min_weight or 0.0
     if out.suffix == ".npz":
-        volume.save(out)
+        write_volume(out, volume)
         what = f"volume of {volume.num_blocks:,} blocks, {volume.num_bytes / 2**20:.0f} MiB"
     elif arguments.mesh:
         mesh = volume.extract_mesh(min_weight=least)

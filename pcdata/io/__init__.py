@@ -19,6 +19,7 @@ from pcdata.io.sources.detect import LAYOUTS, open_source, register_layout
 from pcdata.io.sources.selection import open_selected
 from pcdata.io.sources.source import Source, refused_captures
 from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
+from pcdata.io.store.volumes import read_volume, write_volume
 
 __all__ = [
     "LAYOUTS",
@@ -41,6 +42,7 @@ __all__ = [
     "read_pcd",
     "read_ply",
     "read_pose",
+    "read_volume",
     "refused_captures",
     "register_layout",
     "write_capture_camera",
@@ -52,4 +54,5 @@ __all__ = [
     "write_pcd",
     "write_ply",
     "write_pose",
+    "write_volume",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -269,23 +268,3 @@ class TSDFVolume:
             frames={self.frame_id: torch.eye(4, dtype=torch.float64, device=found.points.device)[None]},
             history=[[step]],
         )
-
-    # -- to disk ---------------------------------------------------------------------------------------------------
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the volume as an uncompressed ``.npz`` file; it appears complete or not at all."""
-        from pcdata.structures.tsdf_file import save_volume
-
-        save_volume(self, path)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str], *, max_bytes: int = 4 << 30, device: str = "cpu") -> TSDFVolume:
-        """Read what :meth:`save` wrote; sizes are checked before anything is allocated, nothing is unpickled.
-
-        Raises:
-            CacheError: the file is damaged or holds something else.
-            VolumeTooLargeError: it holds more than ``max_bytes``.
-        """
-        from pcdata.structures.tsdf_file import load_volume
-
-        return load_volume(path, max_bytes=max_bytes, device=device)

@@ -12,7 +12,7 @@ import pcdata
 from pcdata.cli import known_names
 from pcdata.cli.main import main
 from pcdata.functional import tsdf
-from pcdata.io import CaptureCamera, open_source, write_capture_camera, write_depth, write_pose
+from pcdata.io import CaptureCamera, open_source, read_volume, write_capture_camera, write_depth, write_pose
 from pcdata.structures import TSDFVolume
 
 
@@ -55,7 +55,7 @@ def test_cloud_mesh_and_volume_are_those_of_the_volume_in_python(capsys, capture
     assert pcdata.read_ply(tmp_path / "mesh.ply").num_points == wanted.extract_mesh().vertices.num_points
     assert b"element face" in (tmp_path / "mesh.ply").read_bytes()[:2000]
     assert fuse(captures, tmp_path / "volume.npz", *words) == 0
-    again = TSDFVolume.load(tmp_path / "volume.npz")
+    again = read_volume(tmp_path / "volume.npz")
     assert torch.equal(again.extract_points().points, wanted.extract_points().points)
 
 

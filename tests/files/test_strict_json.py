@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata import Camera, DepthFrame, PointCloud, TSDFVolume, read_ply, write_ply
+from pcdata import Camera, DepthFrame, PointCloud, TSDFVolume, read_ply, read_volume, write_ply, write_volume
 from pcdata.errors import CacheError, CaptureError, PcdataError
 from pcdata.exports.record import FILE_NAME, ExportRecord
 from pcdata.files.npz import write_npz
@@ -97,13 +97,13 @@ def volume(folder: Path, edit: Callable[[str], str]) -> Any:
     frame = DepthFrame(depth=torch.ones(1, 4, 4), camera=camera, world_from_camera=pose, frame_id="base")
     volume = TSDFVolume(voxel_size=0.05, truncation=0.15)
     volume.integrate(frame)
-    volume.save(path)
+    write_volume(path, volume)
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     arrays["about"] = np.frombuffer(edit(arrays["about"].tobytes().decode()).encode(), np.uint8)
     with path.open("wb") as file:
         write_npz(file, arrays)
-    return TSDFVolume.load(path)
+    return read_volume(path)
 
 
 DOORS = {"facts": facts, "manifest": manifest, "export": export, "zarr": zarr, "volume": volume}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata.errors import CacheError, CaptureError, ConfigError, FrameError, VolumeTooLargeError
+from pcdata.errors import CaptureError, ConfigError, FrameError, VolumeTooLargeError
 from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.neighbors import knn
 from pcdata.functional.rows import transform_points
@@ -72,43 +72,6 @@ def test_views_count_from_one_to_all():
         assert kept.num_points == int((counts >= least).sum())
         assert kept.history[0][-1]["min_weight"] == least
         assert kept.history[0][-1]["dropped"] == cloud.num_points - kept.num_points
-
-
-def test_save_and_load_give_the_same_volume_back(tmp_path):
-    volume = fused(tabletop_frame(2), weighting="angle")
-    volume.save(tmp_path / "table.npz")
-    loaded = TSDFVolume.load(tmp_path / "table.npz")
-    assert loaded.num_views == 2
-    volume.integrate(tabletop_frame(2, seed=5))
-    loaded.integrate(tabletop_frame(2, seed=5))
-    expected, found = volume.extract_points(), loaded.extract_points()
-    assert all(value.equal(found.fields()[name]) for name, value in expected.fields().items())
-    assert found.frame_id == "base"
-
-
-def test_damaged_hostile_and_large_files_are_refused(tmp_path):
-    path = tmp_path / "table.npz"
-    fused(tabletop_frame(1)).save(path)
-    with pytest.raises(VolumeTooLargeError, match="max_bytes allows"):
-        TSDFVolume.load(path, max_bytes=1000)
-    arrays = dict(np.load(path))
-    wrong = {
-        "tsdf": {**arrays, "tsdf": arrays["tsdf"][:-1]},
-        "not a complete": {name: value for name, value in arrays.items() if name != "weight"},
-        "keys must be int64": {**arrays, "keys": arrays["keys"].astype(np.int32)},
-        "distinct": {**arrays, "keys": np.zeros_like(arrays["keys"])},
-        "describe": {**arrays, "about": np.array([1.0, 2.0])},
-    }
-    for words, content in wrong.items():
-        np.savez(path, **content)
-        with pytest.raises(CacheError, match=words):
-            TSDFVolume.load(path)
-    np.savez(path, about=np.array([object()]))
-    with pytest.raises(CacheError, match="not a complete"):
-        TSDFVolume.load(path)
-    path.write_bytes(b"PK nothing")
-    with pytest.raises(CacheError, match="not a complete"):
-        TSDFVolume.load(path)
 
 
 def test_a_mesh_is_written_with_its_faces(tmp_path):

@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from pcdata import CachedCloudDataset, TSDFVolume
+from pcdata import CachedCloudDataset, read_volume
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports.episodes import read_episodes
 from pcdata.io.store.manifest import FILE_NAME, Manifest, Sample
@@ -43,7 +43,7 @@ def test_a_fifo_or_device_in_place_of_a_foreign_file_is_refused_at_once(tmp_path
 def test_other_files_that_are_fifos_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "v.npz")
     with pytest.raises(CacheError, match="FIFO"):
-        TSDFVolume.load(tmp_path / "v.npz")
+        read_volume(tmp_path / "v.npz")
     with pytest.raises(ConfigError, match="FIFO"):
         list(read_episodes("dp3", tmp_path, ["v.npz"]))
     os.mkfifo(tmp_path / FILE_NAME)

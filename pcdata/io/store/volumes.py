@@ -1,4 +1,7 @@
-"""A TSDFVolume on disk: an uncompressed ``.npz`` whose sizes are checked before anything is allocated."""
+"""A TSDFVolume on disk: an uncompressed ``.npz`` whose sizes are checked before anything is allocated.
+
+Its members are ``about`` (JSON as bytes), ``keys`` (B,) and every plane (B, 512), written chunk by chunk.
+"""
 
 from __future__ import annotations
 
@@ -18,28 +21,28 @@ from pcdata.files.strict_json import json_object
 from pcdata.files.zip_archive import ZipArchive
 from pcdata.functional.tsdf.blocks import CHUNK, Chunk, Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS
-from pcdata.structures.confidence import Confidence
-from pcdata.structures.tsdf_volume import TSDFVolume
+from pcdata.structures import Confidence, TSDFVolume
 
 _FORMAT = "pcdata TSDFVolume 1"
 _LONGEST_TEXT = 1 << 16  # bytes of the description
 _FIELDS = ("voxel_size", "truncation", "weighting", "carve", "frame_id")
 
 
-def save_volume(volume: TSDFVolume, path: str | os.PathLike[str]) -> None:
-    """Write ``about`` (JSON as bytes), ``keys`` (B,) and every plane (B, 512), chunk by chunk.
+def write_volume(path: str | os.PathLike[str], volume: TSDFVolume) -> None:
+    """Write a fused volume to an ``.npz`` file, to go on with later; it appears complete or not at all.
 
     Raises:
+        ConfigError: nothing was integrated yet.
         CacheError: the file cannot be written; what was there before stays.
     """
     if volume.blocks is None:
-        raise ConfigError("TSDFVolume.save: nothing was integrated yet")
+        raise ConfigError("write_volume: nothing was integrated yet")
     blocks = volume.blocks
     about = {name: getattr(volume, name) for name in _FIELDS}
     about |= {"format": _FORMAT, "num_views": volume.num_views, "planes": vars(blocks.planes)}
     about["min_confidence"] = None if volume.min_confidence is None else int(volume.min_confidence)
     with (
-        replacing("TSDFVolume.save", path, error=CacheError) as temporary,
+        replacing("write_volume", path, error=CacheError) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
     ):
         _write(archive, "about", np.frombuffer(json.dumps(about).encode(), np.uint8))
@@ -48,18 +51,23 @@ def save_volume(volume: TSDFVolume, path: str | os.PathLike[str]) -> None:
             _write_plane(archive, name, blocks)
 
 
-def load_volume(path: str | os.PathLike[str], *, max_bytes: int, device: str) -> TSDFVolume:
-    """Read what :func:`save_volume` wrote."""
-    where = f"TSDFVolume.load: {path}"
+def read_volume(path: str | os.PathLike[str], *, max_bytes: int = 4 << 30, device: str = "cpu") -> TSDFVolume:
+    """Read what :func:`write_volume` wrote; sizes are checked before anything is allocated, nothing is unpickled.
+
+    Raises:
+        CacheError: the file is damaged or holds something else.
+        VolumeTooLargeError: it holds more than ``max_bytes``, which is also the limit of the volume that is returned.
+    """
+    where = f"read_volume: {path}"
     try:
-        with open_input("TSDFVolume.load", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
+        with open_input("read_volume", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
             return _loaded(where, ZipArchive(file, os.fstat(file.fileno()).st_size), max_bytes, device)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, PcdataError):
             raise
         raise CacheError(f"{where}: not a complete TSDFVolume file: {error}") from error
     except CacheError as error:
-        if str(error).startswith("TSDFVolume.load"):
+        if str(error).startswith("read_volume"):
             raise
         raise CacheError(f"{where}: not a complete TSDFVolume file: {error}") from error
     except MemoryError as error:
