@@ -58,4 +58,4 @@ def test_resident_memory_is_flat_after_the_first_hundred_frames(tmp_path: Path):
 
 @pytest.mark.parametrize("start_method", ["fork", "forkserver", "spawn"])
 def test_batches_of_two_workers_are_those_of_the_parent(start_method: str, tmp_path: Path):
-    run(tmp_path, start_method, 40)
+    run(tmp_path, start_method, 20)

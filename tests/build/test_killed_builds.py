@@ -84,7 +84,7 @@ def struck(tmp_path, number: int, form: str, steps: list[int]) -> list[list]:
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["npz", "hdf5", "pt"])
 def test_a_build_killed_before_any_step_leaves_the_old_or_the_new(tmp_path, form):
-    rows = struck(tmp_path, 9, form, [*range(1, 60, 1 if form == "npz" else 3), 90])
+    rows = struck(tmp_path, 9, form, [*range(1, 60, 2 if form == "npz" else 5), 90])
     assert {row[2] for row in rows} == {"old", "new"}
     assert all(row[4] == [["out"], True] for row in rows)
     assert all(row[5] for row in rows if row[3] != ["out"])  # what had been left is told
@@ -94,7 +94,7 @@ def test_a_build_killed_before_any_step_leaves_the_old_or_the_new(tmp_path, form
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 15, 1])
 def test_a_burst_of_signals_before_any_step_leaves_nothing_hidden(tmp_path, number):
-    rows = struck(tmp_path, number, "npz", [*range(1, 60, 4), 90])
+    rows = struck(tmp_path, number, "npz", [*range(1, 60, 7), 90])
     assert {row[2] for row in rows} == {"old", "new"}
     assert {row[1] for row in rows} == {128 + number, 0}
     assert all(row[3] == ["out"] and row[4] == [["out"], True] for row in rows)
