@@ -93,9 +93,9 @@ def _cloud(kind: str) -> tuple[str, Callable[[Path], Any]]:
 
 
 def _calibration(folder: Path) -> Any:
-    from pcdata import Calibration
+    from pcdata import read_calibration
 
-    return Calibration.load(folder / "c.yaml")
+    return read_calibration(folder / "c.yaml")
 
 
 def _pipeline(folder: Path) -> Any:

@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "pcdata.structures": [
+        "Calibration",
         "Camera",
         "Confidence",
         "DepthFrame",
@@ -72,15 +73,16 @@ _HOMES = {
     ],
     "pcdata.io": [
         "AveragedSource",
-        "Calibration",
         "TemporalFilterDepth",
         "TemporallyFilteredSource",
         "open_source",
+        "read_calibration",
         "read_pcd",
         "read_ply",
         "read_volume",
         "refused_captures",
         "register_layout",
+        "write_calibration",
         "write_pcd",
         "write_ply",
         "write_volume",

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from pcdata.io import (
-    Calibration,
     CaptureCamera,
     write_capture_camera,
     write_color,
@@ -18,7 +17,7 @@ from pcdata.io import (
     write_mask,
     write_pose,
 )
-from pcdata.structures import DepthFrame
+from pcdata.structures import Calibration, DepthFrame
 
 CAMERAS = ("left", "right", "top")
 UNIT = 0.001  # metres, of the stored depth

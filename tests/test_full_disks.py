@@ -11,13 +11,13 @@ import torch
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import PcdataError
-from pcdata.io import write_color, write_depth, write_labels, write_mask, write_pcd, write_ply
-from pcdata.io.calibration.calibration import Calibration
+from pcdata.io import write_calibration, write_color, write_depth, write_labels, write_mask, write_pcd, write_ply
 from pcdata.io.calibration.capture_camera import write_pose
 from pcdata.io.images.confidence import write_confidence
 from pcdata.io.writers.capture import write_capture
 from pcdata.report.figure import save_pipeline_figure
 from pcdata.structures import TSDFVolume
+from pcdata.structures.calibration import Calibration
 from tests.disk_limits import largest_file
 from tests.exports.samples import Samples, cloud, frame, tree
 
@@ -37,7 +37,9 @@ WRITERS = {
     "a.pcd": lambda path: write_pcd(path, cloud()),
     "packed.pcd": lambda path: write_pcd(path, cloud(), encoding="binary_compressed"),
     "volume.npz": lambda path: volume().save(path),
-    "cell.yaml": lambda path: Calibration(transforms={"a_from_b": torch.eye(4, dtype=torch.float64)}).save(path),
+    "cell.yaml": lambda path: write_calibration(
+        path, Calibration(transforms={"a_from_b": torch.eye(4, dtype=torch.float64)})
+    ),
     "depth.png": lambda path: write_depth(path, VIEW.depth[0], metres_per_unit=0.001),
     "color.png": lambda path: write_color(path, VIEW.colors[0]),
     "labels.png": lambda path: write_labels(path, VIEW.labels[0], background_label=9),

@@ -9,7 +9,7 @@ from pcdata.calibration.intrinsics import IntrinsicsLimits, IntrinsicsResult, ca
 from pcdata.calibration.plane_check import PlaneCheck, PlaneLimits, check_plane
 from pcdata.calibration.refine import CameraRefinement, Refinement, refine_extrinsics
 from pcdata.calibration.robot_poses import RobotPoses, read_robot_poses
-from pcdata.io.calibration.calibration import Calibration, Evidence
+from pcdata.structures import Calibration, Evidence
 
 __all__ = [
     "Board",

@@ -20,7 +20,7 @@ from pcdata.calibration.motions import Poses, check_motions, inverse, motions_be
 from pcdata.calibration.park_martin import park_martin
 from pcdata.calibration.robot_poses import RobotPoses
 from pcdata.errors import ConfigError
-from pcdata.io.calibration.calibration import Evidence
+from pcdata.structures.calibration import Evidence
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 

@@ -16,8 +16,8 @@ from pcdata.calibration.boards import Board, BoardView, GreyImage
 from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
-from pcdata.io.calibration.calibration import Evidence
 from pcdata.structures import Camera
+from pcdata.structures.calibration import Evidence
 
 COEFFICIENT_COUNTS = (0, 4, 5, 8)
 

@@ -15,8 +15,8 @@ from pcdata.alignment.view_alignment import PairFit, ViewAlignment, align_views,
 from pcdata.calibration.pairwise import pairwise_motions
 from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matches, told_apart
 from pcdata.geometry import rigid
-from pcdata.io.calibration.calibration import Calibration, Evidence, FramePair
 from pcdata.structures import DepthFrame
+from pcdata.structures.calibration import Calibration, Evidence, FramePair
 from pcdata.validation.measures.surfaces import surfaces_of
 from pcdata.validation.overlap import judge_alignment
 from pcdata.validation.overlap_result import OverlapLimits, OverlapResult

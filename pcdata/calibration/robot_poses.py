@@ -18,10 +18,10 @@ from torch import Tensor
 
 from pcdata.errors import CalibrationError, ShapeError, first_lines, near_matches
 from pcdata.files.opening import read_text
+from pcdata.files.sample_names import name_some
 from pcdata.geometry import rigid
-from pcdata.io.calibration.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
 from pcdata.io.calibration.pose_nodes import POSE_KEYS, known_entries, matrix_from_node, pose_from_entries
-from pcdata.io.sources.sample_names import name_some
+from pcdata.structures.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
 from pcdata.yaml_nodes import YamlDocument
 
 ROBOT, TARGET, IMAGE = "base_from_gripper", "camera_from_target", "image"

@@ -232,8 +232,9 @@ def _hand_eye(arguments: argparse.Namespace) -> int:
 
 def _locator(arguments: argparse.Namespace) -> Callable[[Path], Any] | None:
     """Return what finds the board in an image that takes the place of a target pose, where the options allow it."""
-    from pcdata.calibration import Calibration, Chessboard
+    from pcdata.calibration import Chessboard
     from pcdata.errors import ConfigError
+    from pcdata.io import read_calibration
 
     if arguments.board is None and arguments.calibration is None:
         return None
@@ -244,7 +245,7 @@ def _locator(arguments: argparse.Namespace) -> Callable[[Path], Any] | None:
             "calib hand-eye: a chessboard looks the same turned by half a turn, so its pose is not certain; use a "
             "ChArUco board"
         )
-    camera = Calibration.load(arguments.calibration).camera(arguments.camera)
+    camera = read_calibration(arguments.calibration).camera(arguments.camera)
     return functools.partial(_locate, board=arguments.board, camera=camera)
 
 
@@ -274,13 +275,14 @@ def _findings_table(findings: Sequence[Finding]) -> str:
 
 def _conclude(arguments: argparse.Namespace, passed: bool, add: Callable[[Calibration], Calibration]) -> int:
     """Say the verdict; write the file only when it is a pass."""
-    from pcdata.calibration import Calibration
+    from pcdata.io import read_calibration, write_calibration
+    from pcdata.structures import Calibration
 
     print(f"\nverdict  {'pass' if passed else 'FAIL: nothing is written'}")
     if not passed:
         return FAILED
     if arguments.out is not None:
-        known = Calibration.load(arguments.out) if Path(arguments.out).exists() else Calibration()
-        add(known).save(arguments.out)
+        known = read_calibration(arguments.out) if Path(arguments.out).exists() else Calibration()
+        write_calibration(arguments.out, add(known))
         print(f"written  {arguments.out}")
     return 0

@@ -19,8 +19,8 @@ from pcdata.cli.options import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from pcdata.calibration import Calibration
     from pcdata.io.sources.rig import RigSource
+    from pcdata.structures import Calibration
 
 FAILED = 1  # exit code of a step whose limits do not hold
 
@@ -76,12 +76,13 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
 
 
 def _refine(arguments: argparse.Namespace) -> None:
-    from pcdata.calibration import Calibration, refine_extrinsics
+    from pcdata.calibration import refine_extrinsics
     from pcdata.errors import ConfigError
+    from pcdata.io import read_calibration, write_calibration
 
     if Path(arguments.out).exists():
         raise ConfigError(f"calib refine: {arguments.out} exists; name a new file, a refinement replaces none")
-    calibration = Calibration.load(arguments.calibration)
+    calibration = read_calibration(arguments.calibration)
     rig = _open(arguments, calibration)
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
     refinement = refine_extrinsics(
@@ -92,7 +93,7 @@ def _refine(arguments: argparse.Namespace) -> None:
         max_shift=arguments.max_shift,
         max_rotation_degrees=arguments.max_rotation,
     )
-    refinement.applied_to(calibration).save(arguments.out)
+    write_calibration(arguments.out, refinement.applied_to(calibration))
     print(refinement.text())
     print(f"\nwritten to {arguments.out}; {arguments.calibration} is unchanged")
 

@@ -15,9 +15,9 @@ from pcdata.errors import CacheError, ConfigError, near_matches
 from pcdata.files.npz import array_names, read_array
 from pcdata.files.opening import open_input
 from pcdata.files.packing import check_packing
+from pcdata.files.sample_names import check_names, in_order
 from pcdata.files.zip_archive import ZipArchive
 from pcdata.io.sources.listing import visible_files
-from pcdata.io.sources.sample_names import check_names, in_order
 
 ARRAYS = ("samples", "state", "action")
 _MAX_BYTES = 1 << 32

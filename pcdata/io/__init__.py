@@ -1,6 +1,6 @@
 """Bytes <-> structures: depth images, calibration, cloud files, and one source per capture layout."""
 
-from pcdata.io.calibration.calibration import Calibration, Evidence
+from pcdata.io.calibration.calibration_yaml import read_calibration, write_calibration
 from pcdata.io.calibration.capture_camera import (
     CaptureCamera,
     read_capture_camera,
@@ -24,14 +24,13 @@ from pcdata.io.store.volumes import read_volume, write_volume
 __all__ = [
     "LAYOUTS",
     "AveragedSource",
-    "Calibration",
     "CaptureCamera",
-    "Evidence",
     "Source",
     "TemporalFilterDepth",
     "TemporallyFilteredSource",
     "open_selected",
     "open_source",
+    "read_calibration",
     "read_capture_camera",
     "read_color",
     "read_confidence",
@@ -45,6 +44,7 @@ __all__ = [
     "read_volume",
     "refused_captures",
     "register_layout",
+    "write_calibration",
     "write_capture_camera",
     "write_color",
     "write_confidence",

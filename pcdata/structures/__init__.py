@@ -1,5 +1,6 @@
 """The nouns: cameras, depth frames, point clouds."""
 
+from pcdata.structures.calibration import Calibration, Evidence
 from pcdata.structures.camera import Camera
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import CAMERA_FRAME, DepthFrame
@@ -16,9 +17,11 @@ __all__ = [
     "CAMERA_FRAME",
     "METRE",
     "NORMALIZED",
+    "Calibration",
     "Camera",
     "Confidence",
     "DepthFrame",
+    "Evidence",
     "ImageLayout",
     "Kind",
     "PaddedClouds",

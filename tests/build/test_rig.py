@@ -12,7 +12,7 @@ import torch
 
 from pcdata.cli import main
 from pcdata.datasets import CachedCloudDataset
-from pcdata.io import open_source
+from pcdata.io import open_source, write_calibration
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from tests.rigs import calibration_of, write_rig
 
@@ -25,9 +25,8 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tabletop:
     """Three cameras on disk as the page names them; the calibration has ``right`` 10 mm off."""
     made = tabletop(0, 12, 3, noise="stereo", size=(240, 320))
     wrong = Miscalibration(translation=[0, 0.01, 0], rotation_degrees=[0, 0, 0])
-    calibration_of(replace(made.frame, world_from_camera=wrong.apply(made.truth.world_from_camera, seed=0))).save(
-        tmp_path / "rig.yaml"
-    )
+    frame = replace(made.frame, world_from_camera=wrong.apply(made.truth.world_from_camera, seed=0))
+    write_calibration(tmp_path / "rig.yaml", calibration_of(frame))
     write_rig(tmp_path / "rig", [made.frame])
     (tmp_path / "configs").mkdir()
     shutil.copy(ROOT / CONFIG, tmp_path / CONFIG)

@@ -7,13 +7,13 @@ import re
 from pathlib import Path
 
 from pcdata.calibration import (
-    Calibration,
     HandEyeLimits,
     IntrinsicsLimits,
     PlaneLimits,
     parse_board,
     read_robot_poses,
 )
+from pcdata.io import read_calibration
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "calibration.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```yaml\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)
@@ -22,7 +22,7 @@ WORDS = " ".join(TEXT.split())
 
 def test_the_files_shown_are_read(tmp_path: Path):
     (tmp_path / "cell.yaml").write_text(BLOCKS[0])
-    cell = Calibration.load(tmp_path / "cell.yaml")
+    cell = read_calibration(tmp_path / "cell.yaml")
     assert list(cell.cameras) == ["wrist"]
     assert cell.transform("gripper", "wrist")[0, 3] == 0.05
     (tmp_path / "poses.yaml").write_text(BLOCKS[1])

@@ -12,6 +12,7 @@ from pcdata.cli import main
 from pcdata.errors import CalibrationError, ConfigError
 from pcdata.geometry import rigid
 from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
+from pcdata.io import write_calibration
 from pcdata.io.calibration.capture_camera import CaptureCamera, write_capture_camera
 from pcdata.io.images.writing import write_depth
 from pcdata.structures import DepthFrame
@@ -213,7 +214,7 @@ def test_the_commands_judge_and_refine_a_rig_on_disk(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     frame = rig(0)
     write_rig(tmp_path / "rig", frame)
-    calibration_of(frame).save(tmp_path / "old.yaml")
+    write_calibration(tmp_path / "old.yaml", calibration_of(frame))
     before = (tmp_path / "old.yaml").read_bytes()
     line = [str(tmp_path / "rig"), "--calibration", str(tmp_path / "old.yaml")]
     assert (

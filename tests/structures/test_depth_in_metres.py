@@ -7,8 +7,7 @@ import torch
 
 from pcdata.calibration import RobotPoses
 from pcdata.errors import CalibrationError, PoseError, UnitError
-from pcdata.io import Calibration
-from pcdata.structures import Camera, DepthFrame
+from pcdata.structures import Calibration, Camera, DepthFrame
 from pcdata.validation import Verdict, validate_frame
 
 CAMERA = Camera.pinhole(fx=50, fy=50, cx=19.5, cy=14.5, size=(30, 40))

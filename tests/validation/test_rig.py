@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pcdata.cli import main
-from pcdata.io import open_source
+from pcdata.io import open_source, write_calibration
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import Miscalibration, tabletop
 from pcdata.validation import Check, Verdict, validate_source
@@ -29,7 +29,7 @@ def frame() -> DepthFrame:
 
 @pytest.fixture
 def rig(tmp_path: Path, frame: DepthFrame) -> Path:
-    calibration_of(frame).save(tmp_path / "true.yaml")
+    write_calibration(tmp_path / "true.yaml", calibration_of(frame))
     return write_rig(tmp_path / "rig", [frame])
 
 
@@ -52,7 +52,7 @@ def test_a_camera_moved_by_6_mm_fails_under_its_name(
     moved = Miscalibration(translation=[0.006 * (name == "right") for name in CAMERAS], rotation_degrees=[0.0] * 3)
     assert frame.world_from_camera is not None
     wrong = replace(frame, world_from_camera=moved.apply(frame.world_from_camera, seed=0))
-    calibration_of(wrong).save(rig.parent / "wrong.yaml")
+    write_calibration(rig.parent / "wrong.yaml", calibration_of(wrong))
     checks = checks_of(rig, rig.parent / "wrong.yaml")
     failed = [check for check in checks if check.name == "view_pose" and check.verdict is Verdict.FAIL]
     assert [check.view for check in failed] == [RIGHT]

@@ -1,7 +1,8 @@
-"""The calibration file's text: to and from YAML, every fault with its place."""
+"""The calibration file: a :class:`Calibration` to and from YAML, every fault with its place."""
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from typing import Any, cast
 
@@ -9,8 +10,8 @@ import yaml
 from torch import Tensor
 
 from pcdata.errors import CalibrationError, CaptureError, PcdataError
+from pcdata.files.opening import read_text, replacing
 from pcdata.geometry.lens import COEFFICIENT_COUNTS
-from pcdata.io.calibration.calibration import Calibration, Evidence, FramePair, FrameTree, check_camera, check_transform
 from pcdata.io.calibration.pose_nodes import (
     POSE_KEYS,
     Entries,
@@ -21,6 +22,7 @@ from pcdata.io.calibration.pose_nodes import (
     whole,
 )
 from pcdata.structures import Camera
+from pcdata.structures.calibration import Calibration, Evidence, FramePair, FrameTree, check_camera, check_transform
 from pcdata.yaml_nodes import YamlDocument, yaml_text
 
 FORMAT = "pcdata-calibration"
@@ -29,6 +31,28 @@ UNIT = "metre"
 
 _LARGEST_SIDE = 1 << 16  # pixels
 _MODELS = ("pinhole", "opencv")  # without and with OpenCV's polynomial distortion
+
+
+def read_calibration(path: str | os.PathLike[str]) -> Calibration:
+    """Read a calibration file; ``docs/calibration.md`` describes every key.
+
+    Raises:
+        CaptureError: the file is missing or not text.
+        CalibrationError: every fault in it, as ``file:line:column: what``.
+    """
+    return calibration_from_yaml(read_text("read_calibration", path), name=str(path))
+
+
+def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
+    """Write the file that :func:`read_calibration` reads back exactly; equal calibrations give equal bytes.
+
+    The file appears complete or not at all; one that is there already is replaced.
+
+    Raises:
+        CaptureError: it cannot be written.
+    """
+    with replacing("write_calibration", path) as temporary:
+        temporary.write_text(calibration_to_yaml(calibration), encoding="utf-8")
 
 
 def calibration_to_yaml(calibration: Calibration) -> str:

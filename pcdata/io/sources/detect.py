@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.files.sample_names import name_some
 from pcdata.io.sources.cloud_files import CloudFilesSource
 from pcdata.io.sources.folder import FolderSource
 from pcdata.io.sources.graspnet import GraspNetSource
 from pcdata.io.sources.listing import check_links, entries, is_folder
 from pcdata.io.sources.realsense_bag import RealSenseBagSource
 from pcdata.io.sources.rig import RigSource
-from pcdata.io.sources.sample_names import name_some
 from pcdata.io.sources.seven_scenes import SevenScenesSource
 from pcdata.io.sources.source import Source
 

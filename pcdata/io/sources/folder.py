@@ -13,8 +13,9 @@ from torch import Tensor
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, UnitError
 from pcdata.files.opening import check_inside
+from pcdata.files.sample_names import positions
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
-from pcdata.io.calibration.calibration import Calibration
+from pcdata.io.calibration.calibration_yaml import read_calibration
 from pcdata.io.calibration.capture_camera import read_capture_camera
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.folder_roles import ROLES, role_folders
@@ -30,10 +31,10 @@ from pcdata.io.sources.listing import (
     unread_entries,
 )
 from pcdata.io.sources.option_checks import check_invalid_values, check_label, check_name
-from pcdata.io.sources.sample_names import positions
 from pcdata.io.sources.source import Source, check_partners
 from pcdata.io.sources.timestamps import read_timestamps
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
+from pcdata.structures.calibration import Calibration
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
 _TIMESTAMPS = "timestamps.json"
@@ -239,4 +240,4 @@ def opened_calibration(calibration: Calibration | str | os.PathLike[str]) -> tup
     """Return a calibration, read where a file is given, and what provenance tells of its origin."""
     if isinstance(calibration, Calibration):
         return calibration, "given as an object"
-    return Calibration.load(calibration), Path(os.fspath(calibration)).name
+    return read_calibration(calibration), Path(os.fspath(calibration)).name

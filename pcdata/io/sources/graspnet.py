@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError
 from pcdata.files.opening import read_bytes
+from pcdata.files.sample_names import name_some, positions
 from pcdata.geometry import rigid
 from pcdata.io.arrays.matlab import numeric_arrays
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, has_file, is_folder, unread_entries
-from pcdata.io.sources.sample_names import name_some, positions
 from pcdata.io.sources.source import Source, check_partners
 from pcdata.structures import Camera, DepthFrame
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.io.sources.sample_names import check_text, in_order, name_some
+from pcdata.files.sample_names import check_text, in_order, name_some
 
 # What desktops, servers and archivers leave behind, in lower case; hidden entries are litter too.
 _LITTER = {"thumbs.db", "ehthumbs.db", "desktop.ini", "icon\r", "__macosx", "@eadir", "lost+found", "$recycle.bin"}

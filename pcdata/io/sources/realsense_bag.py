@@ -19,6 +19,7 @@ from torch import Tensor
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
+from pcdata.files.sample_names import name_some
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.geometry import rigid
 from pcdata.io.images.reading import check_plausible, metres_of_value
@@ -26,7 +27,6 @@ from pcdata.io.sources.bag_index import MAGIC
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_seconds, check_switch
 from pcdata.io.sources.rosbag import Bag, depth_units, opened_bag, rgb_pixels
-from pcdata.io.sources.sample_names import name_some
 from pcdata.io.sources.source import Source
 from pcdata.structures import Camera, DepthFrame, register_to_color
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import cast
 
 from pcdata.errors import CaptureError, FrameError
+from pcdata.files.sample_names import check_names, in_order_of_last_number, name_some
 from pcdata.functional.depth.unit_fit import DepthEncoding
-from pcdata.io.calibration.calibration import Calibration
 from pcdata.io.sources.folder import FolderSource, opened_calibration
 from pcdata.io.sources.joined_views import join_views
 from pcdata.io.sources.listing import (
@@ -22,9 +22,9 @@ from pcdata.io.sources.listing import (
     link_targets,
     unread_entries,
 )
-from pcdata.io.sources.sample_names import check_names, in_order_of_last_number, name_some
 from pcdata.io.sources.source import Source
 from pcdata.structures import DepthFrame
+from pcdata.structures.calibration import Calibration
 
 
 class RigSource(Source):

@@ -13,12 +13,12 @@ from pathlib import Path
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError
 from pcdata.files.opening import check_inside
+from pcdata.files.sample_names import positions
 from pcdata.io.calibration.capture_camera import read_intrinsics
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.listing import LinkTargets, absolute, entries, has_file, unread_entries, visible_files
 from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole
-from pcdata.io.sources.sample_names import positions
 from pcdata.io.sources.source import Source, check_partners
 from pcdata.structures import Camera, DepthFrame
 

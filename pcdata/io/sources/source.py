@@ -23,8 +23,8 @@ from pcdata.errors import (
 )  # fmt: skip
 from pcdata.files.inputs import Inputs, recording
 from pcdata.files.opening import check_inside
+from pcdata.files.sample_names import check_names, check_text, in_order, name_some, same_but_for_writing
 from pcdata.io.sources.listing import LinkTargets, absolute, is_folder, link_targets
-from pcdata.io.sources.sample_names import check_names, check_text, in_order, name_some, same_but_for_writing
 from pcdata.structures import DepthFrame, PointCloud
 
 # What is wrong with one capture, not with what is asked of all of them.

@@ -12,11 +12,19 @@ import pytest
 import torch
 
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError, UnitError
-from pcdata.io import Calibration, open_source, write_capture_camera, write_color, write_depth, write_pcd
+from pcdata.io import (
+    open_source,
+    read_calibration,
+    write_calibration,
+    write_capture_camera,
+    write_color,
+    write_depth,
+    write_pcd,
+)
 from pcdata.io.calibration.capture_camera import CaptureCamera, read_capture_camera
 from pcdata.io.sources.rig import RigSource
 from pcdata.io.writers.capture import write_capture
-from pcdata.structures import Camera, Confidence, DepthFrame, PointCloud
+from pcdata.structures import Calibration, Camera, Confidence, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame
 from tests.rigs import CAMERAS, UNIT, calibration_of, write_rig
@@ -56,7 +64,7 @@ def rig(tmp_path: Path, frames: list[DepthFrame]) -> Path:
 @pytest.fixture
 def calibrated(tmp_path: Path, frames: list[DepthFrame]) -> tuple[Path, Path]:
     """A rig without poses, and the calibration file that has them."""
-    calibration_of(frames[0]).save(tmp_path / "rig.yaml")
+    write_calibration(tmp_path / "rig.yaml", calibration_of(frames[0]))
     return write_rig(tmp_path / "rig", frames), tmp_path / "rig.yaml"
 
 
@@ -85,10 +93,10 @@ def test_a_calibration_gives_poses_and_intrinsics(
     calibrated: tuple[Path, Path], frames: list[DepthFrame], tmp_path: Path
 ) -> None:
     rig, file = calibrated
-    known = Calibration.load(file)
+    known = read_calibration(file)
     other = Camera.pinhole(fx=20, fy=21, cx=7, cy=5, size=SIZE, distortion=(0.1, 0, 0, 0))
-    known.with_camera("right", other).save(tmp_path / "other.yaml")
-    for given in (tmp_path / "other.yaml", Calibration.load(tmp_path / "other.yaml")):
+    write_calibration(tmp_path / "other.yaml", known.with_camera("right", other))
+    for given in (tmp_path / "other.yaml", read_calibration(tmp_path / "other.yaml")):
         read = open_source(rig, calibration=given, frame_id="base").load("f0")
         assert isinstance(read, DepthFrame)
         torch.testing.assert_close(read.world_from_camera, frames[0].world_from_camera)
@@ -117,7 +125,7 @@ def test_a_camera_on_the_gripper_has_its_own_poses_beside_calibrated_ones(
     moved[2, 2, 3] += 0.1
     own = write_rig(tmp_path / "own", [frames[0], replace(frames[1], world_from_camera=moved)], poses=True)
     shutil.copytree(own / "top", rig / "top")
-    known = Calibration.load(file)
+    known = read_calibration(file)
     fixed = {name: pose for name, pose in known.transforms.items() if "top" not in name}
     source = RigSource(rig, calibration=replace(known, transforms=fixed), frame_id="base")
     first, second = (source.load(sample_id).world_from_camera for sample_id in source.ids)
@@ -276,7 +284,7 @@ def test_folders_and_cameras_of_the_calibration_must_be_the_same(
 
 def test_a_calibration_must_lead_to_a_frame_that_is_named(calibrated: tuple[Path, Path]) -> None:
     rig, file = calibrated
-    known = Calibration.load(file)
+    known = read_calibration(file)
     with pytest.raises(CaptureError, match=r"no pose is known of left, right, top.*frame_id"):
         open_source(rig, calibration=file)
     with pytest.raises(CaptureError, match="no pose is known of left, right, top"):

@@ -15,8 +15,8 @@ from PIL import Image
 from scipy.io import savemat
 
 from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, UnitError
+from pcdata.files.sample_names import in_order
 from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
-from pcdata.io.sources.sample_names import in_order
 from pcdata.io.sources.source import Source
 from pcdata.structures import DepthFrame, PointCloud
 from tests.messages import told

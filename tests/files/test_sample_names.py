@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pcdata.errors import CaptureError
-from pcdata.io.sources import sample_names
-from pcdata.io.sources.sample_names import check_names, in_order, in_order_of_last_number, name_some, positions
+from pcdata.files import sample_names
+from pcdata.files.sample_names import check_names, in_order, in_order_of_last_number, name_some, positions
 
 
 @pytest.mark.parametrize(

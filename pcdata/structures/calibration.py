@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import deque
 from collections.abc import Mapping
@@ -14,10 +13,9 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import WIDEST
 from pcdata.errors import CalibrationError, FrameError, PoseError, near_matches
-from pcdata.files.opening import read_text, replacing
+from pcdata.files.sample_names import name_some
 from pcdata.geometry import rigid
-from pcdata.io.sources.sample_names import name_some
-from pcdata.structures import Camera
+from pcdata.structures.camera import Camera
 
 # An inverse by transposition is off by as much as the rotation is from orthonormal: 0.1 mm at 1 m.
 RIGID_TOLERANCE = 1e-4
@@ -96,31 +94,6 @@ class Calibration:
             tree.join(FramePair.parse(name))
         for name in ("cameras", "transforms", "evidence"):  # the class is frozen: what the caller does later is his own
             object.__setattr__(self, name, dict(getattr(self, name)))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read a calibration file; ``docs/calibration.md`` describes every key.
-
-        Raises:
-            CaptureError: the file is missing or not text.
-            CalibrationError: every fault in it, as ``file:line:column: what``.
-        """
-        from pcdata.io.calibration.calibration_yaml import calibration_from_yaml
-
-        return calibration_from_yaml(read_text("Calibration.load", path), name=str(path))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file that :meth:`load` reads back exactly; equal calibrations give equal bytes.
-
-        The file appears complete or not at all; one that is there already is replaced.
-
-        Raises:
-            CaptureError: it cannot be written.
-        """
-        from pcdata.io.calibration.calibration_yaml import calibration_to_yaml
-
-        with replacing("Calibration.save", path) as temporary:
-            temporary.write_text(calibration_to_yaml(self), encoding="utf-8")
 
     @property
     def frames(self) -> list[str]:
