@@ -209,7 +209,7 @@ cloud:
   - CropWorkspace: {lower: [-0.5, -0.5, 0.1], upper: [0.5, 0.5, 1.5], frame: camera}
   - VoxelDownsample: {voxel_size: 0.005}
 augment:
-  - RandomApply: {transform: {RandomJitter: {sigma: 0.002}}, probability: 0.5}
+  - RandomApply: {step: {RandomJitter: {sigma: 0.002}}, probability: 0.5}
 output: {format: npz, compression: gzip}
 loader: {batch_size: 4, num_workers: 0, seed: 3}
 """

@@ -20,7 +20,7 @@ from pcdata.io import Source
 class EveryNth(Transform):
     """Keep every n-th point."""
     n: int
-    def apply(self, cloud, params):
+    def transform(self, cloud, params):
         index = torch.arange(0, cloud.num_points, self.n)
         return cloud.select(index, torch.tensor([0, len(index)]))
 

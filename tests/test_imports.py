@@ -33,7 +33,7 @@ from pcdata import Transform
 class OwnThird(Transform):
     n: int = 3
 
-    def apply(self, cloud, params):
+    def transform(self, cloud, params):
         index = torch.arange(0, cloud.num_points, self.n)
         return cloud.select(index, torch.tensor([0, len(index)]))
 """

@@ -21,6 +21,7 @@ from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.kinds import CORE_KINDS
+from pcdata.transforms.author_errors import UndeclaredStreams
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
 Data = DepthFrame | PointCloud
@@ -41,9 +42,11 @@ class Transform(nn.Module):
     takes: ClassVar[type] = PointCloud
     gives: ClassVar[type] = PointCloud
     version: ClassVar[int] = 1  # raised when the same fields give another result
+    no_streams: ClassVar[Streams]  # those of a step that is not random
 
     def __init_subclass__(cls, *, abstract: bool = False, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        cls.no_streams = UndeclaredStreams(cls.__name__)
         dataclasses.dataclass(eq=False, repr=False, kw_only=True)(cls)
         if not abstract:
             if cls.__name__ in REGISTRY and REGISTRY[cls.__name__].__module__ != cls.__module__:
@@ -66,14 +69,14 @@ class Transform(nn.Module):
     def check_fields(self) -> None:
         """Check rules that bind several fields; raise :class:`ConfigError`."""
 
-    def make_params(self, data: Any, streams: Streams | None) -> Params:
-        """Decide: all that is random or derived from the data; ``streams`` is None if not random.
+    def make_params(self, data: Any, streams: Streams) -> Params:
+        """Decide: all that is random or derived from the data; only steps that say ``is_random`` draw from ``streams``.
 
         Every value has leading dimension B, except ``index``, ``ptr`` and those named after a per-point field.
         """
         return {}
 
-    def apply(self, data: Any, params: Params) -> Any:
+    def transform(self, data: Any, params: Params) -> Any:
         """Do: pure given the params; never draws from the generator, never changes its input."""
         raise NotImplementedError
 
@@ -110,9 +113,11 @@ class Transform(nn.Module):
         """
         try:
             self.check_input(data)
-            streams = Streams.of(self._generator(generator), num_clouds(data)) if self.is_random else None
+            streams = self.no_streams
+            if self.is_random:
+                streams = Streams.of(self._generator(generator), num_clouds(data))
             params = self.make_params(data, streams)
-            result = self.apply(data, params)
+            result = self.transform(data, params)
             return self.recorded(data, result, params)
         except Exception as error:
             add_note(error, f"in {self!r} on {data!r}")
@@ -140,7 +145,7 @@ class Transform(nn.Module):
         told = {name: value for name, value in self.config_fields().items() if value != defaults.get(name)}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in told.items())})"
 
-    # -- the frame around make_params and apply --------------------------------------------------------------------
+    # -- the frame around make_params and transform --------------------------------------------------------------------
 
     def _generator(self, generator: GeneratorLike | None) -> GeneratorLike:
         if generator is None:
@@ -214,7 +219,7 @@ class Transform(nn.Module):
 class SpatialTransform(Transform, abstract=True):
     """A step that moves every cloud by one 4x4: write ``make_params`` returning ``{"matrix": (B, 4, 4)}``."""
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud; the frame and the unit follow :meth:`frame_after` and :meth:`unit_given`."""
         return data.transformed(params["matrix"], frame_id=self.frame_after(data.frame_id), unit=self.unit_given())
 
@@ -222,16 +227,16 @@ class SpatialTransform(Transform, abstract=True):
 class SelectTransform(Transform, abstract=True):
     """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,)."""
         raise NotImplementedError
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide which rows stay."""
         index, ptr = self.pick(data, streams)
         return {"index": index, "ptr": ptr}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows of every field."""
         return data.select(params["index"], params["ptr"])
 

@@ -64,8 +64,8 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     moved, moves = bare, Params()
     if isinstance(move, ToFrame):
         move.check_input(bare)
-        moves = move.make_params(bare, None)
-        moved = move.apply(bare, moves)
+        moves = move.make_params(bare, move.no_streams)
+        moved = move.transform(bare, moves)
     crop.check_input(moved)
     matrix = moves.get("matrix")
     done = deproject_into_box(

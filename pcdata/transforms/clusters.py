@@ -46,7 +46,7 @@ class ClusterObjects(Transform):
         if self.min_size > self.max_size:
             raise ConfigError(f"ClusterObjects: min_size {self.min_size} exceeds max_size {self.max_size}")
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
         raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=data.image_grid())
         parts = [self._numbered(part) for part in torch.tensor_split(raw, data.ptr[1:-1].cpu())]
@@ -79,7 +79,7 @@ class ClusterObjects(Transform):
         number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
         return number[raw + 1], size[~accepted]
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Write the labels and drop the rest unless the whole scene is kept."""
         labels = params["labels"]
         counted = {name: params[name].tolist() for name in ("noise", "too_small", "too_large")}
@@ -99,7 +99,7 @@ class SplitObjects(Transform):
 
     keeps_clouds = False
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Split each cloud by its labels."""
         if data.labels is None:
             raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")

@@ -31,7 +31,7 @@ class ShiftToOrigin(SpatialTransform):
         """Name the shifted frame."""
         return None if frame is None else f"{frame}/{self.anchor}"
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Measure the box of every cloud."""
         parts = torch.tensor_split(data.points.double(), data.ptr[1:-1].cpu())
         zero = data.points.new_zeros(3, dtype=torch.float64)
@@ -45,9 +45,9 @@ class ShiftToOrigin(SpatialTransform):
             "extent": upper - lower,
         }
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud and note its extents."""
-        moved = super().apply(data, params)
+        moved = super().transform(data, params)
         return moved.with_meta([{"extent": extent} for extent in params["extent"].tolist()])
 
 
@@ -81,7 +81,7 @@ class RandomColumn(Transform):
             "center": torch.stack(centers),
         }
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows and note the centres."""
         column = data.select(params["index"], params["ptr"])
         return column.with_meta([{"column_center": center} for center in params["center"].tolist()])

@@ -79,7 +79,7 @@ class CompleteDepth(Transform):
     def __repr__(self) -> str:
         return f"{type(self).__name__}(completion={self._name!r}, reach={self.reach})"
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Complete all views in one call."""
         known = torch.full_like(data.depth, Confidence.RELIABLE, dtype=torch.uint8)
         known = known if data.confidence is None else data.confidence

@@ -119,26 +119,26 @@ class RandomApply(Transform):
 
     is_random = True
 
-    transform: Transform
+    step: Transform
     probability: Fraction = 0.5
 
     def check_fields(self) -> None:
         """Require a transform from clouds to clouds."""
-        if not (self.transform.takes is PointCloud and self.transform.gives is PointCloud):
-            raise ConfigError(f"RandomApply: {type(self.transform).__name__} does not turn clouds into clouds")
-        self.keeps_clouds = self.transform.keeps_clouds  # type: ignore[misc]
+        if not (self.step.takes is PointCloud and self.step.gives is PointCloud):
+            raise ConfigError(f"RandomApply: {type(self.step).__name__} does not turn clouds into clouds")
+        self.keeps_clouds = self.step.keeps_clouds  # type: ignore[misc]
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
         chosen = streams.uniform(0.0, 1.0) < self.probability
         return {"chosen": chosen, "seed": streams.seeds()}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Run the inner transform on the chosen clouds and pack all again."""
         clouds = data.unbatch()
         for b, (chosen, seed) in enumerate(zip(params["chosen"].tolist(), params["seed"].tolist(), strict=True)):
             if chosen:
-                clouds[b] = self.transform(clouds[b], generator=[seeded(seed)])
+                clouds[b] = self.step(clouds[b], generator=[seeded(seed)])
         return PointCloud.cat(clouds)
 
 
@@ -172,7 +172,7 @@ def opened(steps: Sequence[Transform]) -> Iterator[Transform]:
 def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
     for step in opened(steps):
         if isinstance(step, RandomApply):
-            yield from _flatten([step.transform])
+            yield from _flatten([step.step])
         else:
             yield step
 

@@ -18,7 +18,7 @@ class KeepConfidence(SelectTransform):
 
     minimum: ConfidenceName = "reliable"
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the rows at the level or above."""
         confidence = cloud.extra.get("confidence")
         if confidence is None or confidence.dtype != torch.uint8 or confidence.ndim != 1:

@@ -44,7 +44,7 @@ class CropWorkspace(SelectTransform):
         """The frame of the box."""
         return self.frame
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the rows inside."""
         points = cloud.points
         if self.frame_from_box is not None:

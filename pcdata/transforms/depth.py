@@ -35,7 +35,7 @@ class MaskDepth(Transform):
         if self.near is not None and self.far is not None and self.near >= self.far:
             raise ConfigError(f"MaskDepth: near must be below far, got near={self.near}, far={self.far}")
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Return the frame with the dropped pixels at 0."""
         return data.masked(near=self.near, far=self.far, mask=self.mask_of(data))
 
@@ -76,11 +76,11 @@ class Deproject(Transform):
         """Deprojected points are in the camera's frame."""
         return CAMERA_FRAME
 
-    def make_params(self, data: DepthFrame, streams: Streams | None) -> Params:
+    def make_params(self, data: DepthFrame, streams: Streams) -> Params:
         """Nothing to decide."""
         return {}
 
-    def apply(self, data: DepthFrame, params: Params) -> PointCloud:
+    def transform(self, data: DepthFrame, params: Params) -> PointCloud:
         """Deproject all views in one call."""
         made = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
         return self.cloud_of(data, made)

@@ -32,7 +32,7 @@ class SpatialFilterDepth(Transform):
     hole_fill_radius: Annotated[int, Ge(0)] = 0  # pixels filled from both ends of every gap in a row
     baseline: Metres = 0.05  # between the two imagers; it scales what delta means
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Filter all views in one call."""
         focal = data.camera.intrinsics[:, 0, 0].to(data.device)
         disparity = depth_to_disparity(data.depth, focal, self.baseline)
@@ -57,7 +57,7 @@ class FillHoles(Transform):
     max_size: Count | None = None  # only where no square of this many pixels + 1 without a reading fits; None = all
     max_distance: Count = 8  # pixels
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Fill all views in one call."""
         depth, distance = fill_holes(data.depth, rule=self.rule, max_size=self.max_size)
         return with_filled_depth(data, depth, distance > 0, distance > self.max_distance)
@@ -76,7 +76,7 @@ class RemoveFlyingPixels(Transform):
     tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02
     min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3  # of the eight, on the reading's own surface
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Blank the flying pixels of all views."""
         flying = flying_pixel_mask(data.depth, tolerance=self.tolerance, min_neighbors=self.min_neighbors)
         confidence = data.confidence

@@ -35,7 +35,7 @@ class InpaintDepth(Transform):
 
     max_distance: Count = 8  # pixels
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Fill view by view."""
         hole = data.depth == 0
         if not bool(hole.any()):

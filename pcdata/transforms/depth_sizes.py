@@ -29,7 +29,7 @@ class CropCenter(Transform):
 
     size: tuple[Count, Count]  # (height, width) in pixels
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Cut every image and move the principal point."""
         (height, width), (rows, columns) = self.size, data.size
         if height > rows or width > columns:
@@ -61,7 +61,7 @@ class DecimateDepth(Transform):
     rule: Literal["median", "mean"] = "median"  # the mean mixes the surfaces that meet in a block
     max_jump: Positive = 0.02  # as a part of the depth: what differs more is another surface
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Reduce every image and rewrite the intrinsics."""
         depth, pixel_index = decimate_depth(data.depth, factor=self.factor, rule=self.rule, max_jump=self.max_jump)
         size = (depth.shape[1], depth.shape[2])
@@ -89,7 +89,7 @@ class ResizeDepth(Transform):
     size: tuple[Count, Count]  # (height, width)
     max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Resize every image and rewrite the intrinsics; images of that size stay."""
         if data.size == self.size:
             return replace(data)

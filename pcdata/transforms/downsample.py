@@ -51,14 +51,14 @@ class VoxelDownsample(Transform):
         """The unit of the voxel size."""
         return None if self.voxel_size is None else self.unit
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide the voxel size of every cloud."""
         if self.num_points is not None:
             return {"voxel_size": find_voxel_size(data.points, data.ptr, num_points=self.num_points)}
         assert self.voxel_size is not None  # check_fields
         return {"voxel_size": torch.full((data.num_clouds,), self.voxel_size, dtype=torch.float64, device=data.device)}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Reduce every field voxel by voxel."""
         means, ptr, inverse = voxel_downsample(data.points, data.ptr, voxel_size=params["voxel_size"])
         count = len(means)
@@ -78,7 +78,7 @@ class _Sample(SelectTransform, abstract=True):
     num_points: Count
     if_short: IfShort = "error"  # repeat / tile: duplicate points; zeros: zero rows; keep: give fewer
 
-    def wanted_counts(self, cloud: PointCloud, streams: Streams | None) -> list[int]:
+    def wanted_counts(self, cloud: PointCloud, streams: Streams) -> list[int]:
         """The wanted count of every cloud."""
         return [self.num_points] * cloud.num_clouds
 
@@ -86,7 +86,7 @@ class _Sample(SelectTransform, abstract=True):
         """For every cloud, ``counts[b]`` of its rows in sampling order; it has at least so many."""
         raise NotImplementedError
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Sample, then fill up short clouds as ``if_short`` says; -1 marks a zero row."""
         wanted = self.wanted_counts(cloud, streams)
         available = cloud.counts.tolist()
@@ -96,12 +96,12 @@ class _Sample(SelectTransform, abstract=True):
                     f"{type(self).__name__}: cloud {b}{sample_name(cloud, b)} has {have} points, fewer than the "
                     f"{want} asked; ask for fewer (num_points)" + ("" if have == 0 else ", or choose if_short")
                 )
-        seeds = [0] * cloud.num_clouds if streams is None else streams.seeds().tolist()
+        seeds = streams.seeds().tolist() if self.is_random else [0] * cloud.num_clouds
         sampled = self.sample(cloud, [min(pair) for pair in zip(wanted, available, strict=True)], seeds)
         filled = [self._fill_up(*case) for case in zip(sampled, wanted, seeds, strict=True)]
         return torch.cat(filled), ptr_from_counts([len(rows) for rows in filled], device=cloud.device)
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Select the rows and blank those marked -1."""
         blank = params["index"] < 0
         chosen = data.select(params["index"].clamp(min=0), params["ptr"])
@@ -148,11 +148,10 @@ class RandomSample(_Sample):
 
     with_replacement: bool = False  # draw every row anew: about a third of the points of a full cloud come twice
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw short clouds too with replacement, unless they are to get zero rows or to stay short."""
         if not self.with_replacement or self.if_short in ("zeros", "keep") or 0 in cloud.counts.tolist():
             return super().pick(cloud, streams)
-        assert streams is not None
         wanted = self.wanted_counts(cloud, streams)
         rows = self.sample(cloud, wanted, streams.seeds().tolist())
         return torch.cat(rows), ptr_from_counts(wanted, device=cloud.device)
@@ -174,9 +173,8 @@ class RandomPointCount(RandomSample):
 
     spread: Fraction = 0.2
 
-    def wanted_counts(self, cloud: PointCloud, streams: Streams | None) -> list[int]:
+    def wanted_counts(self, cloud: PointCloud, streams: Streams) -> list[int]:
         """Draw the count of every cloud."""
-        assert streams is not None
         factor = streams.uniform(1.0 - self.spread, 1.0 + self.spread)
         counts: list[int] = (factor * self.num_points).round().clamp(min=1).long().tolist()
         return counts

@@ -50,7 +50,7 @@ class ToFrame(SpatialTransform):
         """The frame to go to."""
         return self.frame
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Find the matrix from the cloud's frame to the wanted one."""
         if self.matrix is not None:
             return {
@@ -67,9 +67,9 @@ class ToFrame(SpatialTransform):
         current = data.frames[data.frame_id]
         return {"matrix": data.frames[self.frame] @ torch.linalg.inv(current)}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud and remember where the new frame lies."""
-        moved = super().apply(data, params)
+        moved = super().transform(data, params)
         # A calibration given here replaces the capture's own pose of that frame.
         if self.matrix is None or data.frame_id not in data.frames:
             return moved
@@ -95,12 +95,12 @@ class MergeViews(Transform):
     voxel_size: Metres | None = None  # edge of the voxels in which views compete; None = keep every point
     face_cameras: bool = True  # turn normals towards the camera that saw the point
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""
         starts = [b for b in range(data.num_clouds) if b == 0 or not _same_capture(data.meta[b - 1], data.meta[b])]
         return {"group_ptr": torch.tensor([*starts, data.num_clouds], dtype=torch.int64, device="cpu")}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Drop the boundaries between the views of a capture."""
         bounds = params["group_ptr"].tolist()
         views = torch.diff(params["group_ptr"])

@@ -45,7 +45,7 @@ class FuseTSDF(Transform):
         except ConfigError as error:
             raise ConfigError(f"FuseTSDF: {error}") from error
 
-    def apply(self, data: DepthFrame, params: Params) -> PointCloud:
+    def transform(self, data: DepthFrame, params: Params) -> PointCloud:
         """Integrate all views and extract the points."""
         volume = self._volume(str(data.device))
         volume.integrate(data)

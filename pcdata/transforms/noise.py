@@ -27,7 +27,7 @@ class RandomJitter(Transform):
         """Draw a seed per cloud: with it the noise can be drawn again exactly."""
         return {"seed": streams.seeds()}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Add the noise that belongs to the seeds."""
         noise = torch.empty((data.num_points, 3), dtype=torch.float32, device="cpu")
         for rows, seed in zip(noise.split(data.counts.tolist()), params["seed"].tolist(), strict=True):
@@ -51,9 +51,8 @@ class RandomPointDropout(SelectTransform):
         if self.low > self.high:
             raise ConfigError(f"RandomPointDropout: low {self.low} exceeds high {self.high}")
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw the fraction, then which points."""
-        assert streams is not None
         fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
         keep = torch.zeros(cloud.num_points, dtype=torch.bool, device="cpu")
         counts = cloud.counts.tolist()
@@ -91,7 +90,7 @@ class RandomColorJitter(Transform):
         middle = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64, device="cpu")
         return {"factors": middle + streams.uniform(-1.0, 1.0, 4) * limits}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Adjust each cloud as an image of one column."""
         if data.colors is None:
             raise DTypeError("RandomColorJitter: the cloud has no colours")

@@ -20,7 +20,7 @@ class NormalizeUnitSphere(SpatialTransform):
         """The result is normalised."""
         return NORMALIZED
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Measure the centre and the radius of every cloud."""
         center = segment_mean(data.points, data.ptr)
         offset = data.points.double() - center[cloud_of_rows(data.ptr)]
@@ -60,7 +60,7 @@ class NormalizeWorkspace(SpatialTransform):
         """The result is normalised."""
         return NORMALIZED
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """The same matrix for every cloud."""
         lower, upper = torch.tensor([self.lower, self.upper], dtype=torch.float64, device=data.device)
         shift = rigid.from_rotation_translation(
@@ -77,7 +77,7 @@ class Center(SpatialTransform):
         """Name the shifted frame."""
         return None if frame is None else f"{frame}/centered"
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Measure the mean of every cloud."""
         center = segment_mean(data.points, data.ptr)
         return {

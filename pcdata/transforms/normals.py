@@ -24,7 +24,7 @@ class EstimateNormals(Transform):
     max_neighbors: Count = 30  # the nearest within the radius, the point itself among them
     orient: Literal["viewpoint", "none"] = "viewpoint"  # "none": the sign is arbitrary but repeatable
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Estimate from the points of each cloud alone."""
         normals = estimate_normals(
             data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=data.image_grid()
@@ -39,6 +39,6 @@ class EstimateNormals(Transform):
             normals = orient_normals(data.points, normals, viewpoint)
         return {"normals": normals}
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Write the normals."""
         return data.with_fields(normals=params["normals"])

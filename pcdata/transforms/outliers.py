@@ -24,7 +24,7 @@ class RemoveStatisticalOutliers(SelectTransform):
     num_neighbors: Count = 20  # nearest neighbours, the point itself among them
     std_ratio: Positive = 2.0  # standard deviations above the cloud's mean that are still usual
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""
         outlier = statistical_outlier_mask(
             cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
@@ -41,7 +41,7 @@ class RemoveRadiusOutliers(SelectTransform):
     min_neighbors: Count = 5
     radius: Annotated[Metres, FromSensor(SensorProfile.outlier_radius)] = 0.01
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""
         outlier = radius_outlier_mask(
             cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()

@@ -58,7 +58,7 @@ class RemovePlane(SelectTransform):
         """The frame of ``up``."""
         return self.frame
 
-    def make_params(self, data: PointCloud, streams: Streams | None) -> Params:
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Find the plane of every cloud and the rows that stay."""
         planes, inlier = ransac_plane(
             data.points,
@@ -100,7 +100,7 @@ class RemovePlane(SelectTransform):
                     "give max_tilt to look for a level plane, or the up of this one"
                 )
 
-    def apply(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
         entries: list[dict[str, Any]] = []
         source_planes = _map_planes(params["planes"], torch.linalg.inv(data.source_from_cloud))
@@ -118,7 +118,7 @@ class RemovePlane(SelectTransform):
                 up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
                 found["tilt"] = float(rigid.angle_between(params["planes"][b, :3].cpu(), up))
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
-        return super().apply(data, params).with_meta(entries)
+        return super().transform(data, params).with_meta(entries)
 
 
 def planes_in_cloud(cloud: PointCloud, b: int = 0) -> Tensor:

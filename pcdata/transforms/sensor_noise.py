@@ -69,7 +69,7 @@ class RandomSensorNoise(Transform):
         """Draw a seed: with it the noise can be drawn again exactly."""
         return {"seed": streams.seeds()}
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Return the capture as the sensor would report it."""
         profile = sensor_profile(self.sensor)
         focals = data.camera.intrinsics[:, 0, 0].tolist()

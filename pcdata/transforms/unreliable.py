@@ -48,7 +48,7 @@ class MarkUnreliableDepth(Transform):
         """Require a depth camera."""
         depth_camera("MarkUnreliableDepth", self.sensor)
 
-    def apply(self, data: DepthFrame, params: Params) -> DepthFrame:
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Mark all views."""
         doubtful = data.depth <= 0
         if self.rough:

@@ -29,7 +29,7 @@ class VoxelSample(SelectTransform):
         """The unit of the voxel size."""
         return self.unit
 
-    def pick(self, cloud: PointCloud, streams: Streams | None) -> tuple[Tensor, Tensor]:
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the row with the lowest rank in each voxel; rows of the result are in their old order."""
         owner = cloud_of_rows(cloud.ptr)
         voxel = _numbered(torch.cat([owner[:, None], voxel_cells(cloud.points, self.voxel_size)], dim=1))
@@ -41,7 +41,7 @@ class VoxelSample(SelectTransform):
         counts = torch.bincount(owner[mask], minlength=cloud.num_clouds)
         return mask, ptr_from_counts(counts)
 
-    def ranks(self, cloud: PointCloud, streams: Streams | None) -> Tensor:
+    def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
         """(N,) int64: of the points in one voxel the lowest stays; distinct within a cloud."""
         return torch.arange(cloud.num_points, dtype=torch.int64, device=cloud.device)
 
@@ -51,9 +51,8 @@ class RandomVoxelSample(VoxelSample):
 
     is_random = True
 
-    def ranks(self, cloud: PointCloud, streams: Streams | None) -> Tensor:
+    def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
         """A random order of the points of each cloud."""
-        assert streams is not None
         counts = cloud.counts.tolist()
         orders = [
             torch.randperm(count, generator=seeded(seed), device="cpu")

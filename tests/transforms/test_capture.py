@@ -135,7 +135,7 @@ def test_what_is_not_the_usual_beginning_runs_step_by_step(runs):
 
 def test_a_subclass_or_a_hook_is_not_passed_over(runs):
     class Half(MaskDepth, abstract=True):
-        def apply(self, data, params):
+        def transform(self, data, params):
             return data.masked(far=0.8)
 
     own = Compose([Half(), Deproject(), IN_CAMERA])

@@ -13,6 +13,7 @@ from pcdata.rng import seeded
 from pcdata.structures import DepthFrame, PointCloud
 from tests.factories import assert_same, cloud_in_base, cloud_in_camera, differences, frame_with_counts, tree
 from tests.messages import told
+from tests.transforms.examples import ALL
 
 BOX = {"frame": "base", "lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
 
@@ -168,7 +169,7 @@ def test_an_error_tells_step_and_cloud():
 def test_random_apply_applies_as_often_as_it_says():
     counts = (1,) * 400
     cloud = cloud_in_base(counts)
-    flipped = T.RandomApply(transform=T.RandomFlip(probability=(1, 0, 0)), probability=0.3)
+    flipped = T.RandomApply(step=T.RandomFlip(probability=(1, 0, 0)), probability=0.3)
     moved = flipped(cloud, generator=seeded(0)).points[:, 0] != cloud.points[:, 0]
     assert 0.3 - 0.1 < float(moved.double().mean()) < 0.3 + 0.1  # 4 standard deviations are 0.09
 
@@ -177,7 +178,7 @@ def test_random_apply_applies_as_often_as_it_says():
 def test_random_apply_never_or_always(probability):
     cloud = cloud_in_base()
     inner = T.RandomFlip(probability=(1, 1, 1))
-    result = T.RandomApply(transform=inner, probability=probability)(cloud, generator=seeded(0))
+    result = T.RandomApply(step=inner, probability=probability)(cloud, generator=seeded(0))
     expected = inner(cloud, generator=seeded(9)) if probability else cloud
     assert torch.equal(result.points, expected.points)
     names = [[step["step"] for step in steps] for steps in result.history]
@@ -186,7 +187,7 @@ def test_random_apply_never_or_always(probability):
 
 def test_clouds_not_chosen_stay_bit_for_bit():
     cloud = cloud_in_base((20,) * 12)
-    result = T.RandomApply(transform=T.RandomRotation(axis=None))(cloud, generator=seeded(0))
+    result = T.RandomApply(step=T.RandomRotation(axis=None))(cloud, generator=seeded(0))
     for before, after in zip(cloud.unbatch(), result.unbatch()):
         chosen = after.history[0][-1]["params"]["chosen"]
         assert torch.equal(before.points, after.points) != chosen
@@ -195,7 +196,7 @@ def test_clouds_not_chosen_stay_bit_for_bit():
 def test_whether_a_cloud_is_chosen_shifts_no_later_draw():
     cloud = cloud_in_base((20,))
     results = [
-        T.Compose([T.RandomApply(transform=T.RandomFlip(), probability=p), T.RandomScale()])(cloud, generator=seeded(5))
+        T.Compose([T.RandomApply(step=T.RandomFlip(), probability=p), T.RandomScale()])(cloud, generator=seeded(5))
         for p in (0.0, 1.0)
     ]
     factors = [result.history[0][-1]["params"]["matrix"] for result in results]
@@ -205,11 +206,11 @@ def test_whether_a_cloud_is_chosen_shifts_no_later_draw():
 def test_random_apply_works_on_clouds_only():
     for step in (T.MaskDepth(), T.Deproject()):
         with pytest.raises(ConfigError, match=f"RandomApply: {type(step).__name__} does not turn clouds into clouds"):
-            T.RandomApply(transform=step)
+            T.RandomApply(step=step)
     with pytest.raises(ConfigError, match=r"RandomApply\.probability"):
-        T.RandomApply(transform=T.Center(), probability=1.5)
-    with pytest.raises(ConfigError, match=r"RandomApply\.transform: .*instance of Transform"):
-        T.RandomApply(transform="Center")
+        T.RandomApply(step=T.Center(), probability=1.5)
+    with pytest.raises(ConfigError, match=r"RandomApply\.step: .*instance of Transform"):
+        T.RandomApply(step="Center")
 
 
 # -- copies --------------------------------------------------------------------------------------------------------
@@ -233,3 +234,25 @@ def test_a_chain_of_captures_runs_to_clouds():
     )
     assert result.counts.tolist() == [20, 30]
     assert result.history[0][-1]["params"] != result.history[1][-1]["params"]
+
+
+# -- inside another module -------------------------------------------------------------------------------------------
+
+
+def test_a_policy_that_holds_transforms_is_a_module_like_any_other(tmp_path):
+    policy = torch.nn.Sequential()
+    policy.points = T.Compose([T.Center(), T.RandomApply(step=T.RandomFlip(), probability=0.5)])
+    policy.others = torch.nn.ModuleList([example.transform for example in ALL])
+    policy.head = torch.nn.Linear(3, 2)
+    seen = []
+    assert policy.apply(lambda module: seen.append(type(module).__name__)) is policy
+    assert {*T.REGISTRY, "Linear"} <= {*seen}
+    policy.to(torch.float64).train().eval().requires_grad_(False).share_memory().zero_grad()
+    torch.save(policy.state_dict(), tmp_path / "policy.pt")
+    policy.load_state_dict(torch.load(tmp_path / "policy.pt", weights_only=True))
+    cloud = cloud_in_base((20, 30))
+    for twin in (pickle.loads(pickle.dumps(policy)), copy.deepcopy(policy)):
+        assert repr(twin.points) == repr(policy.points)
+        assert torch.equal(
+            twin.points(cloud, generator=seeded(1)).points, policy.points(cloud, generator=seeded(1)).points
+        )

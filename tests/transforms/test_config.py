@@ -26,7 +26,7 @@ GOOD = """\
     upper: [0.5, 0.5, 1]
 - RandomApply:
     probability: 0.3
-    transform: {RandomFlip: {about: centroid}}
+    step: {RandomFlip: {about: centroid}}
 - Compose:
     steps:
       - Center:
@@ -40,7 +40,7 @@ def test_names_fields_and_steps_within_steps_are_read():
         "Deproject", "ToFrame", "CropWorkspace", "RandomApply", "Compose",
     ]  # fmt: skip
     assert pipeline.steps[2].lower == (-0.5, -0.5, 0.0)
-    assert pipeline.steps[3].transform.about == "centroid"
+    assert pipeline.steps[3].step.about == "centroid"
     assert len(pipeline.steps[4].steps) == 2
     assert pipeline_from_yaml(pipeline_to_yaml(pipeline)).fingerprint() == pipeline.fingerprint()
 
@@ -109,10 +109,10 @@ def test_every_name_comes_back_as_it_was(name):
             "p.yaml:1:48: NormalizeWorkspace.lower.1: Input should be a valid number (got 'x')",
         ),
         (
-            "- RandomApply: {transform: {RandomFlip: {about: me}}}",
-            "p.yaml:1:49: RandomFlip.about: Input should be 'origin' or 'centroid' (got 'me')",
+            "- RandomApply: {step: {RandomFlip: {about: me}}}",
+            "p.yaml:1:44: RandomFlip.about: Input should be 'origin' or 'centroid' (got 'me')",
         ),
-        ("- RandomApply: {transform: Flip}", "p.yaml:1:28: unknown transform 'Flip'; known: Center, Cl"),
+        ("- RandomApply: {step: Flip}", "p.yaml:1:23: unknown transform 'Flip'; known: Center, Cl"),
         ("- MaskDepth: {near: 1, near: 2}", "p.yaml:1:24: MaskDepth: 'near' is given twice"),
         ("- Center: &c\n- *c", "p.yaml:2:3: YAML aliases (*name) are not allowed; write the value out"),
         (
@@ -160,12 +160,12 @@ def test_all_faults_are_told_at_once_in_the_order_of_the_file():
         "- CropWorkspace: {frame: base, lower: [0, 0], upper: [1, 1, 1]}\n"
         "- RandomApply:\n"
         "    probability: 2\n"
-        "    transform: Flip\n"
+        "    step: Flip\n"
         "- Center: {}\n"
         "- Center\n"
     )
     assert [line.split(": ")[0] for line in told] == [
-        "p.yaml:1:3", "p.yaml:2:21", "p.yaml:2:25", "p.yaml:3:39", "p.yaml:5:18", "p.yaml:6:16",
+        "p.yaml:1:3", "p.yaml:2:21", "p.yaml:2:25", "p.yaml:3:39", "p.yaml:5:18", "p.yaml:6:11",
     ]  # fmt: skip
 
 

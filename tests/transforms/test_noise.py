@@ -46,7 +46,7 @@ def test_jitter_of_one_seed_is_drawn_again_from_the_history():
     step = RandomJitter()
     moved = step(cloud, generator=seeded(3))
     seed = moved.history[0][-1]["params"]["seed"]
-    again = step.apply(cloud, {"seed": torch.tensor([seed])})
+    again = step.transform(cloud, {"seed": torch.tensor([seed])})
     assert torch.equal(again.points, moved.points)
 
 
