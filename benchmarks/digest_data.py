@@ -1,0 +1,250 @@
+"""Digests of what loaders give, of whole chains, of every model's batch, and of every export."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from digest_files import CONFIG, captures, dataset, files_of
+from digest_hash import Many
+from digest_inputs import Samples, base_cloud, pose, rendered, scratch, seeded
+from digest_names import (
+    Camera,
+    DepthFrame,
+    PointCloud,
+    SyntheticSource,
+    build,
+    contract_names,
+    export,
+    export_names,
+    model_batch,
+    open_choices,
+    pcdata,
+    pipeline,
+    run,
+    step,
+    takes_images,
+)
+from digest_real import real_folder, real_frame
+from torch.utils.data import DataLoader, RandomSampler
+
+Case = tuple[str, Callable[[], Any]]
+
+# -- loaders -----------------------------------------------------------------------------------------------------------
+
+FIXED = CONFIG.replace("augment: [", "augment: [RandomSample: {num_points: 64, if_short: repeat}, ").replace(
+    ", RandomPointDropout: {low: 0.1, high: 0.3}", ""
+)
+
+
+def _batches(data: Any, collate: str, *, epochs: int = 2, workers: int = 0, sampler: Any = None) -> Many:
+    """Every batch of some epochs."""
+    found = {}
+    for epoch in range(epochs):
+        data.set_epoch(epoch)
+        given = {"sampler": sampler} if sampler is not None else {"shuffle": True, "generator": seeded(epoch)}
+        loader = DataLoader(data, batch_size=2, num_workers=workers, collate_fn=getattr(pcdata, collate), **given)
+        found[f"epoch {epoch}"] = list(loader)
+    return Many(found)
+
+
+def _on_the_fly(text: str = CONFIG, **options: Any) -> Any:
+    return pcdata.CloudDataset(captures(), pipeline(text), **options)
+
+
+def _cached(**options: Any) -> Any:
+    return pcdata.CachedCloudDataset(dataset(), **options)
+
+
+def _counted() -> Many:
+    data = _cached(seed=3)
+    sampler = pcdata.CountedSampler(RandomSampler(data, replacement=True, num_samples=7, generator=seeded(1)))
+    return _batches(data, "collate_packed", epochs=1, sampler=sampler)
+
+
+def _loaders() -> Iterator[Case]:
+    for collate in ("collate_packed", "collate_padded"):
+        yield f"loader/fly/{collate}", lambda collate=collate: _batches(_on_the_fly(), collate)
+        yield f"loader/cached/{collate}", lambda collate=collate: _batches(_cached(), collate)
+    yield "loader/fly/collate_fixed", lambda: _batches(_on_the_fly(FIXED), "collate_fixed")
+    yield "loader/fly/seed and repeats", lambda: _batches(_on_the_fly(seed=5, repeats=2), "collate_packed")
+    yield "loader/cached/seed and repeats", lambda: _batches(_cached(seed=5, repeats=2), "collate_packed")
+    yield "loader/cached/worker", lambda: _batches(_cached(seed=5), "collate_packed", epochs=1, workers=1)
+    yield "loader/cached/counted", _counted
+    synthetic = SyntheticSource(num_scenes=2, num_objects=2, size=(24, 32), noise="stereo")
+    yield "loader/synthetic", lambda: [synthetic.load(name) for name in synthetic.ids]
+
+
+# -- chains -----------------------------------------------------------------------------------------------------------
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+def _chain(name: str, capture: Any) -> Any:
+    """A capture through the depth, cloud and augment sections of one of the examples in configs/."""
+    return run(pipeline((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")), capture, 3)
+
+
+def _chains() -> Iterator[Case]:
+    policy, glass, views = "tabletop_policy", "transparent_objects", "multiview_objects"
+    yield f"chain/{policy}/rendered", lambda: _chain(policy, rendered(1, 3, (240, 320)))
+    yield f"chain/{glass}/rendered", lambda: _chain(glass, rendered(1, 3, (240, 320)))
+    yield f"chain/{views}/rendered two", lambda: _chain(views, rendered(2, 3, (240, 320)))
+    yield "chain/small/clouds enter at cloud", lambda: run(pipeline(CONFIG), base_cloud(), 4)
+    if real_folder() is None:
+        return
+    for name in ("graspnet_frame", "seven_scenes", "osd"):
+        yield f"chain/{policy}/{name}", lambda name=name: _chain(policy, real_frame(name))
+    yield f"chain/{glass}/graspnet_frame", lambda: _chain(glass, real_frame("graspnet_frame"))
+
+
+# -- models ------------------------------------------------------------------------------------------------------------
+
+TABLE = {"frame": "base", "crop": ((-0.3, -0.3, -0.05), (0.3, 0.3, 0.6)), "category": 3}
+ROOM = {"frame": "camera", "crop": ((-2.0, -2.0, 0.1), (2.0, 2.0, 3.0)), "category": 3}
+
+
+def _choices(name: str, answers: dict[str, Any]) -> dict[str, Any]:
+    return {choice: answers[choice] for choice in open_choices(name)}
+
+
+def _table_batch(name: str) -> Any:
+    size = (480, 640) if takes_images(name) else (240, 320)
+    frames = [rendered(1, seed, size) for seed in (3, 4)]
+    return model_batch(name, _choices(name, TABLE), frames)
+
+
+def _real_batch(name: str) -> Any:
+    frame = real_frame("graspnet_frame")
+    frame = frame if takes_images(name) else run(step("DecimateDepth", factor=4), frame)
+    return model_batch(name, _choices(name, ROOM), [frame])
+
+
+def _models() -> Iterator[Case]:
+    for name in contract_names():
+        yield f"model/{name}/synthetic two", lambda name=name: _table_batch(name)
+        if real_folder() is not None:
+            yield f"model/{name}/graspnet", lambda name=name: _real_batch(name)
+
+
+# -- exports -----------------------------------------------------------------------------------------------------------
+
+
+def _cloud(count: int, seed: int, **changes: Any) -> Any:
+    """Points in the unit sphere with colours of 8 bits, normals and labels."""
+    generator = seeded(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    fields: dict[str, Any] = {
+        "points": direction * torch.rand(count, 1, generator=generator),
+        "frame_id": "base",
+        "colors": torch.randint(256, (count, 3), generator=generator).float() / 255,
+        "normals": direction,
+        "labels": torch.arange(count) % 4,
+    }
+    return PointCloud(**(fields | changes))
+
+
+def _view(size: tuple[int, int], seed: int) -> Any:
+    """A view in whole millimetres with one hole, colour, a mask, labels -1, 1 and 2, and a pose."""
+    generator, (height, width) = seeded(seed), size
+    units = torch.randint(400, 900, (1, height, width), generator=generator)
+    units[0, 1, 2] = 0
+    labels = torch.full((1, height, width), -1)
+    labels[0, : height // 2, : width // 2] = 1
+    labels[0, height // 2 :, width // 2 :] = 2
+    return DepthFrame(
+        depth=(units.double() * 0.001).float(),
+        camera=Camera.pinhole(fx=20.5, fy=21.25, cx=width / 2 - 0.75, cy=height / 2 + 0.5, size=size),
+        colors=torch.randint(256, (1, height, width, 3), generator=generator, dtype=torch.uint8),
+        mask=torch.rand(1, height, width, generator=generator) > 0.3,
+        labels=labels,
+        world_from_camera=pose(seed)[None],
+        frame_id="table",
+        provenance={"metres_per_unit": 0.001},
+    )
+
+
+NAMES = ("a", "b", "c")
+SPLITS = {
+    name: {"class": "mug" if name < "c" else "bowl", "split": "train" if name < "c" else "test"} for name in NAMES
+}
+GRASPS = {name: {"positive": [[[5.0, 6.0], [9.0, 6.0], [9.0, 10.0], [5.0, 10.0]]]} for name in NAMES}
+
+
+def _shapes(count: int) -> Samples:
+    return Samples({name: run(step("NormalizeUnitSphere"), _cloud(count, n)) for n, name in enumerate(NAMES)})
+
+
+def _robot() -> dict[str, Any]:
+    number = np.random.default_rng(1)
+    lengths = {"one": NAMES[:2], "two": NAMES[2:]}
+    return {
+        name: {"samples": np.array(ids), "state": number.random((len(ids), 7)), "action": number.random((len(ids), 4))}
+        for name, ids in lengths.items()
+    }
+
+
+def _exported(target: str) -> Many:
+    clouds = Samples({name: _cloud(512, n) for n, name in enumerate(NAMES)})
+    views = Samples({name: _view((24, 32), n) for n, name in enumerate(NAMES)})
+    plans: dict[str, tuple[Any, dict[str, Any]]] = {
+        "dp3": (clouds, {"episodes": _robot()}),
+        "pointnet": (_shapes(2048), {"table": SPLITS}),
+        "pointnet_part": (_shapes(2048), {"table": {**SPLITS, "c": {"class": "mug", "split": "val"}}}),
+        "modelnet": (_shapes(1100), {"table": SPLITS}),
+        "pointcept": (clouds, {"table": SPLITS, "segment": "labels"}),
+        "contact_graspnet": (views, {}),
+        "graspnet": (views, {"any_size": True}),
+        "graspnet_scene": (views, {"any_size": True, "frames_per_scene": 3}),
+        "ggcnn": (views, {"any_size": True}),
+    }
+    source, options = plans[target]
+    folder = scratch("exports") / target
+    export(source, target, folder, **options)
+    files = files_of(folder, leave_out=("pcdata_export.json",))
+    return Many({name: _content(name, data) for name, data in sorted(files.items())})
+
+
+def _content(name: str, data: bytes) -> Any:
+    """The arrays of a container that may hold the time it was written; of another file, its bytes."""
+    suffix = Path(name).suffix
+    if suffix == ".npz":
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files if stored[key].dtype.kind in "biuf"}
+    if suffix == ".h5":
+        import h5py
+
+        with h5py.File(io.BytesIO(data), "r") as stored:
+            return {key: stored[key][()] for key in stored}
+    if suffix == ".mat":
+        from scipy.io import loadmat
+
+        return {key: value for key, value in loadmat(io.BytesIO(data)).items() if not key.startswith("__")}
+    return data
+
+
+def _built_export() -> Many:
+    """An export of what a build stored."""
+    built, folder = scratch("datasets/merged") / "dataset", scratch("exports") / "built"
+    build(CONFIG.replace("- EstimateNormals", "- MergeViews\n  - EstimateNormals"), captures(), built)
+    export(str(built), "pointcept", folder)
+    files = files_of(folder, leave_out=("pcdata_export.json",))
+    return Many({name: _content(name, data) for name, data in sorted(files.items())})
+
+
+def _exports() -> Iterator[Case]:
+    for target in export_names():
+        yield f"export/{target}", lambda target=target: _exported(target)
+    yield "export/pointcept of a build", _built_export
+
+
+def cases() -> Iterator[Case]:
+    """Yield ``loader/...``, ``chain/CONFIG/input``, ``model/NAME/input`` and ``export/TARGET``."""
+    yield from _loaders()
+    yield from _chains()
+    yield from _models()
+    yield from _exports()
