@@ -25,6 +25,10 @@ class DTypeError(PcdataError, TypeError):
     """A tensor has the wrong dtype, or a value the wrong type."""
 
 
+class OutOfRangeError(PcdataError, IndexError):
+    """There is no cloud of that number in the batch."""
+
+
 class DeviceError(PcdataError, RuntimeError):
     """Tensors that must be on one device are not."""
 

@@ -69,20 +69,15 @@ def join_rows(parts: Mapping[str, Sequence[Tensor]]) -> dict[str, Tensor]:
 
 
 @inner
-def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Tensor]:
-    """Put B parts of at most ``width`` rows of every field into (B, width, ...); the rest is 0, or -1 for integers."""
+def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int, fillers: Mapping[str, int]) -> dict[str, Tensor]:
+    """Put B parts of up to ``width`` rows of each field into (B, width, ...); the fillers are 0, or -1 for integers."""
     padded = {}
     for name, values in parts.items():
         shape = (len(values), width, *values[0].shape[1:])
-        padded[name] = values[0].new_full(shape, padding_of(values[0].dtype))
+        padded[name] = values[0].new_full(shape, fillers[name])
         for row, value in zip(padded[name], values):
             row[: len(value)] = value
     return padded
-
-
-def padding_of(dtype: torch.dtype) -> int:
-    """What stands for no value: -1 where that is a signed integer, else 0."""
-    return -1 if dtype in (torch.int16, torch.int32, torch.int64) else 0
 
 
 def first_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:

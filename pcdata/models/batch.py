@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
-from dataclasses import dataclass, field, replace
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
+from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
+
+from pcdata.structures.structure import Structure
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ModelBatch:
+class ModelBatch(Structure):
     """The tensors that a model takes, by the names of its own code, and what a check or a prediction needs to know.
 
     Empty texts and None mean "not known": tensors from a foreign file come without them.
@@ -52,23 +53,6 @@ class ModelBatch:
 
     def __len__(self) -> int:
         return len(self.tensors)
-
-    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> ModelBatch:
-        """Move all tensors to a device."""
-        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self) -> ModelBatch:
-        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
-        return self._map(lambda tensor: tensor.pin_memory())
-
-    def _map(self, move: Callable[[Tensor], Tensor]) -> ModelBatch:
-        source = self.source_from_cloud
-        return replace(
-            self,
-            tensors={key: move(value) for key, value in self.tensors.items()},
-            source_from_cloud=None if source is None else move(source),
-            frames={name: move(matrix) for name, matrix in self.frames.items()},
-        )
 
     def __repr__(self) -> str:
         shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in self.tensors.items())

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError, FrameError, ShapeError
+from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, pad_rows, transform_points
 from pcdata.functional.voxels import voxel_mean
 from pcdata.models.contract import InputTensor, ModelContract
-from pcdata.structures import METRE, PointCloud
+from pcdata.structures import PointCloud
 from pcdata.transforms.voxel_sample import voxel_cells
 
 # torchvision's: the colours that ImageNet backbones were trained with.
@@ -46,7 +46,7 @@ def _columns_in_layout(clouds: PointCloud, contract: ModelContract, tensor: Inpu
     if min(counts) == max(counts):  # packed rows are the batch already
         padded = rows.reshape(len(counts), counts[0], tensor.width)
     else:
-        padded = pad_rows({"rows": rows.split(counts)}, max(counts))["rows"]
+        padded = pad_rows({"rows": rows.split(counts)}, max(counts), {"rows": 0})["rows"]
     return padded.transpose(1, 2).contiguous() if tensor.layout == "B C N" else padded
 
 
@@ -124,23 +124,7 @@ def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor)
 
 def _xyz_in_frame(clouds: PointCloud, contract: ModelContract) -> Tensor:
     """The points before centring, in the contract's frame."""
-    return transform_points(clouds.points, clouds.ptr, frame_from_cloud(clouds, contract.frame))
-
-
-def frame_from_cloud(clouds: PointCloud, frame: str) -> Tensor:
-    """Return (B, 4, 4) float64 from the clouds' present coordinates to a frame that they know.
-
-    Raises:
-        FrameError: the clouds do not know the frame.
-    """
-    if frame == clouds.frame_id and clouds.unit == METRE:
-        return torch.eye(4, dtype=torch.float64, device=clouds.device).repeat(clouds.num_clouds, 1, 1)
-    if frame == clouds.source_frame:
-        return clouds.source_from_cloud
-    if frame not in clouds.frames:
-        known = sorted({clouds.source_frame, *clouds.frames})
-        raise FrameError(f"the clouds know the frames {known}, not {frame!r}; give the captures their poses")
-    return clouds.frames[frame] @ clouds.source_from_cloud
+    return transform_points(clouds.points, clouds.ptr, clouds.frame_from_cloud(contract.frame))
 
 
 def _colors(clouds: PointCloud, contract: ModelContract) -> Tensor:

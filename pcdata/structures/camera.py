@@ -12,10 +12,11 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
+from pcdata.structures.structure import Structure
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Camera:
+class Camera(Structure):
     """V >= 1 pinhole cameras of one image size.
 
     Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) with integer coordinates is the centre of that pixel,
@@ -101,11 +102,6 @@ class Camera:
         intrinsics[:, 0, 2] -= left
         intrinsics[:, 1, 2] -= top
         return replace(self, intrinsics=intrinsics, size=size, is_window=True)
-
-    def to(self, device: torch.device | str) -> Camera:
-        """Move the tensors to a device."""
-        distortion = None if self.distortion is None else self.distortion.to(device)
-        return replace(self, intrinsics=self.intrinsics.to(device), distortion=distortion)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; :meth:`from_dict` reads them back exactly."""

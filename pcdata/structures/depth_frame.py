@@ -17,7 +17,7 @@ from pcdata.functional.depth.deproject import mask_depth
 from pcdata.geometry import rigid
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.confidence import Confidence
-from pcdata.structures.derive import derived
+from pcdata.structures.structure import Structure, derived
 
 CAMERA_FRAME = "camera"
 _SAMPLE = 1 << 12  # readings
@@ -25,7 +25,7 @@ _MASKED = {"depth": "V H W", "mask": "V H W : bool"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DepthFrame:
+class DepthFrame(Structure):
     """V >= 1 views of one image size, taken at one moment.
 
     Depth is the z coordinate in metres; 0 means "no reading". NaN, infinite and negative depth is refused here: the
@@ -126,11 +126,6 @@ class DepthFrame:
     def with_provenance(self, entries: Mapping[str, Any]) -> DepthFrame:
         """Merge JSON-able facts into the provenance."""
         return derived(self, provenance={**self.provenance, **entries})
-
-    def to(self, device: torch.device | str) -> DepthFrame:
-        """Move all tensors to a device."""
-        images = {name: None if image is None else image.to(device) for name, image in self._tensors().items()}
-        return replace(self, camera=self.camera.to(device), **images)  # type: ignore[arg-type]
 
     def _tensors(self) -> dict[str, Tensor | None]:
         names = ("depth", "colors", "labels", "confidence", "mask", "world_from_camera")

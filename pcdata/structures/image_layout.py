@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.structures.structure import Structure
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ImageLayout:
+class ImageLayout(Structure):
     """The depth images that the clouds of a batch still lie on, row after row in pixel order."""
 
     size: tuple[int, int]  # (height, width) of every image

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
-import torch
 from torch import Tensor
 
 from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
-
-if TYPE_CHECKING:
-    from pcdata.structures.point_cloud import PointCloud
+from pcdata.structures.cloud_batch import CloudBatch
 
 
-def joinable_parts(clouds: Sequence[PointCloud]) -> dict[str, list[Tensor]]:
+def joinable_parts(clouds: Sequence[CloudBatch], fields: Sequence[Mapping[str, Tensor]]) -> dict[str, list[Tensor]]:
     """Return every field as a list with the rows of each cloud."""
     if not clouds:
         raise ShapeError("PointCloud.cat: needs at least one cloud")
-    fields = [cloud.fields() for cloud in clouds]
     for position, (cloud, own) in enumerate(zip(clouds, fields)):
         _check_joinable(clouds[0], cloud, position)
         if own.keys() != fields[0].keys() or cloud.kinds != clouds[0].kinds:
@@ -33,12 +28,6 @@ def joinable_parts(clouds: Sequence[PointCloud]) -> dict[str, list[Tensor]]:
     return {name: [own[name] for own in fields] for name in fields[0]}
 
 
-def joined_frames(clouds: Sequence[PointCloud]) -> dict[str, Tensor]:
-    """Return the poses (B, 4, 4) of the frames that every cloud knows."""
-    known = [name for name in clouds[0].frames if all(name in cloud.frames for cloud in clouds)]
-    return {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in known}
-
-
 def rows_per_cloud(values: Sequence[Tensor], counts: Sequence[Sequence[int]]) -> list[Tensor]:
     """Return the rows of every single cloud."""
     if all(len(own) == 1 for own in counts):
@@ -46,7 +35,7 @@ def rows_per_cloud(values: Sequence[Tensor], counts: Sequence[Sequence[int]]) ->
     return [part for value, own in zip(values, counts) for part in value.split(list(own))]
 
 
-def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None:
+def _check_joinable(first: CloudBatch, other: CloudBatch, position: int) -> None:
     for name in ("frame_id", "source_frame"):
         if getattr(first, name) != getattr(other, name):
             raise FrameError(
@@ -58,10 +47,10 @@ def _check_joinable(first: PointCloud, other: PointCloud, position: int) -> None
             f"PointCloud.cat: cloud {position} has unit {other.unit!r} but cloud 0 has {first.unit!r}; "
             "normalise both or neither"
         )
-    if first.device != other.device:
+    here, there = first.source_from_cloud.device, other.source_from_cloud.device
+    if here != there:
         raise DeviceError(
-            f"PointCloud.cat: cloud {position} is on {other.device} but cloud 0 is on {first.device}; "
-            "move one with .to()"
+            f"PointCloud.cat: cloud {position} is on {there} but cloud 0 is on {here}; move one with .to()"
         )
     if (first.viewpoint is None) != (other.viewpoint is None):
         raise ShapeError(f"PointCloud.cat: only one of cloud 0 and cloud {position} has a viewpoint")

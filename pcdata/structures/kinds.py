@@ -1,28 +1,169 @@
-"""What the numbers of a cloud mean: the kinds of its per-point fields, and its units."""
+"""What the numbers of a cloud mean: one row per kind of field, one row per field, and the units of length.
+
+A new kind is a name and its row in :data:`KINDS`: then clouds move it, average it, pad it and keep it on disk, and the
+laws of the test suite hold it to that. Fields of every kind are joined one after another.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from enum import Enum
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.rows import group_first, transform_directions, transform_points
+from pcdata.functional.voxels import voxel_majority, voxel_mean, voxel_mean_direction, voxel_minimum
 
 METRE = "m"
 NORMALIZED = "normalized"
 
+Move = Callable[[Tensor, Tensor, Tensor], Tensor]  # rows, ptr, matrix (B, 4, 4) float64 -> rows
+Average = Callable[[Tensor, Tensor, int], Tensor]  # rows (N, ...), group (N,) int64, their number G -> (G, ...)
+Padding = Callable[[torch.dtype], int]  # what stands for "no row": 0 or -1
+
+
+def _stays(rows: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
+    return rows
+
+
+def _mean_or_vote(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    """Average floats; of integers the most frequent one counts, the lowest of equals."""
+    if rows.is_floating_point():
+        columns = rows.reshape(len(rows), math.prod(rows.shape[1:]))
+        return voxel_mean(columns, group, num_groups).reshape(num_groups, *rows.shape[1:])
+    return _column_by_column(voxel_majority, rows, group, num_groups)
+
+
+def _minimum(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    return _column_by_column(voxel_minimum, rows, group, num_groups)
+
+
+def _column_by_column(decide: Average, rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    columns = rows.reshape(len(rows), math.prod(rows.shape[1:])).long()
+    decided = [decide(column, group, num_groups) for column in columns.unbind(1)]
+    return torch.stack(decided, dim=1).to(rows.dtype).reshape(num_groups, *rows.shape[1:])
+
+
+def _first(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    return rows[group_first(group, num_groups)]
+
+
+def _zero(dtype: torch.dtype) -> int:
+    return 0
+
+
+def _no_number(dtype: torch.dtype) -> int:
+    """Return -1 where the dtype has it, as no label and no row is called so; else 0."""
+    return -1 if dtype in (torch.int16, torch.int32, torch.int64) else 0
+
+
+def _any(dtype: torch.dtype) -> bool:
+    return True
+
+
+def _floats(dtype: torch.dtype) -> bool:
+    return dtype.is_floating_point
+
+
+def _whole(dtype: torch.dtype) -> bool:
+    return not (dtype.is_floating_point or dtype.is_complex)
+
 
 class Kind(str, Enum):
-    """How a per-point field behaves when the cloud is moved or averaged."""
+    """How the values of a field behave when its cloud is moved, averaged, padded or stored: see :data:`KINDS`."""
 
-    POSITION = "position"  # (N, 3) float: moved by the 4x4; averaged
-    DIRECTION = "direction"  # (N, 3) float: moved by the inverse transpose, renormalised; averaged and renormalised
-    INVARIANT = "invariant"  # anything: not moved; floats averaged, integers voted, never averaged
-    MINIMUM = (
-        "minimum"  # integers: not moved; of several the lowest counts, as a chain is as strong as its weakest link
-    )
+    POSITION = "position"
+    DIRECTION = "direction"
+    INVARIANT = "invariant"
+    MINIMUM = "minimum"  # as a chain is as strong as its weakest link
 
 
-CORE_KINDS = {
-    "points": Kind.POSITION,
-    "colors": Kind.INVARIANT,
-    "normals": Kind.DIRECTION,
-    "labels": Kind.INVARIANT,
-    "source_index": Kind.INVARIANT,
+@dataclass(frozen=True, kw_only=True)
+class KindRow:
+    """All that clouds know about one kind of field; a file keeps the kind's name."""
+
+    holds: str  # what its values must be, in words
+    fits: Callable[[torch.dtype], bool]  # whether they are of such a dtype
+    row: tuple[int, ...] | None = None  # the shape that a row must have; None = any
+    move: Move
+    average: Average
+    padding: Padding
+    is_length: bool = False  # in the unit of the points, so scaled where a file's unit is another one
+
+
+KINDS = {
+    # Moved by the 4x4; averaged.
+    Kind.POSITION: KindRow(
+        holds="float (N, 3)",
+        fits=_floats,
+        row=(3,),
+        move=transform_points,
+        average=_mean_or_vote,
+        padding=_zero,
+        is_length=True,
+    ),
+    # Moved by the inverse transpose and brought back to unit length; averaged, and to unit length again.
+    Kind.DIRECTION: KindRow(
+        holds="float (N, 3)",
+        fits=_floats,
+        row=(3,),
+        move=transform_directions,
+        average=voxel_mean_direction,
+        padding=_zero,
+    ),
+    # Not moved; floats are averaged, integers voted: an integer is never averaged.
+    Kind.INVARIANT: KindRow(
+        holds="numbers (N, ...)", fits=_any, move=_stays, average=_mean_or_vote, padding=_no_number
+    ),
+    # Not moved; of several the lowest counts.
+    Kind.MINIMUM: KindRow(holds="integers (N, ...)", fits=_whole, move=_stays, average=_minimum, padding=_no_number),
 }
+
+
+@dataclass(frozen=True)
+class PointField:
+    """A field that every cloud may have: its kind, its contract, and how it is averaged where not as its kind."""
+
+    kind: Kind
+    spec: str  # see pcdata.contracts.tensors
+    average: Average | None = None
+
+
+FIELDS = {
+    "points": PointField(Kind.POSITION, "N 3"),
+    "colors": PointField(Kind.INVARIANT, "N 3"),
+    "normals": PointField(Kind.DIRECTION, "N 3"),
+    "labels": PointField(Kind.INVARIANT, "N : int64"),
+    "source_index": PointField(Kind.INVARIANT, "N : int64", average=_first),  # a place, of which there is no majority
+}
+
+
+def kind_of(name: str, kinds: Mapping[str, Kind]) -> Kind:
+    """Return the kind of a field: of an extra one as declared."""
+    return FIELDS[name].kind if name in FIELDS else kinds[name]
+
+
+def averaged(name: str, rows: Tensor, kind: Kind, group: Tensor, num_groups: int) -> Tensor:
+    """Reduce the rows of one field group by group, as the field or else its kind says."""
+    own = FIELDS[name].average if name in FIELDS else None
+    return (own or KINDS[kind].average)(rows, group, num_groups)
+
+
+def fillers(fields: Mapping[str, Tensor], kinds: Mapping[str, Kind]) -> dict[str, int]:
+    """Return what stands for "no row" in each field."""
+    return {name: KINDS[kind_of(name, kinds)].padding(value.dtype) for name, value in fields.items()}
+
+
+def moved(fields: Mapping[str, Tensor], kinds: Mapping[str, Kind], ptr: Tensor, matrix: Tensor) -> dict[str, Tensor]:
+    """Move the rows of all fields by one affine (B, 4, 4) float64 matrix per cloud, each as its kind says."""
+    return {name: KINDS[kind_of(name, kinds)].move(rows, ptr, matrix) for name, rows in fields.items()}
+
+
+def attributes(rows: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return fields by name as a cloud holds them: those of :data:`FIELDS` as attributes, the others in ``extra``."""
+    own = {name: value for name, value in rows.items() if name in FIELDS}
+    return {**own, "extra": {name: value for name, value in rows.items() if name not in FIELDS}}

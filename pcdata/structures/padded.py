@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from pcdata.structures.joining import joined_frames
-from pcdata.structures.kinds import CORE_KINDS
-
-if TYPE_CHECKING:
-    from pcdata.structures.point_cloud import PointCloud
+from pcdata.structures.cloud_batch import CloudBatch, joined_facts
+from pcdata.structures.kinds import FIELDS, METRE, attributes, moved
+from pcdata.structures.structure import derived
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PaddedClouds:
-    """B clouds padded to one length M; ``mask`` says which rows are real. Made by :meth:`PointCloud.padded`."""
+class PaddedClouds(CloudBatch):
+    """B clouds padded to one length M; ``mask`` says which rows are real. Made by :meth:`PointCloud.padded`.
+
+    They know all that the packed clouds did: :meth:`PointCloud.from_padded` gives those back.
+    """
 
     points: Tensor  # (B, M, 3) float32, 0 where padded
     mask: Tensor  # (B, M) bool, True = a real point
@@ -27,44 +27,63 @@ class PaddedClouds:
     labels: Tensor | None = None  # (B, M) int64, -1 where padded
     source_index: Tensor | None = None  # (B, M) int64, -1 where padded
     extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (B, M, ...)
-    frame_id: str
-    unit: str
-    source_frame: str = ""  # the frame that source_from_cloud leads to
-    source_from_cloud: Tensor  # (B, 4, 4) float64
-    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) frame_from_source
-    meta: Sequence[Mapping[str, Any]] = ()
 
-    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PaddedClouds:
-        """Move all tensors to a device."""
-        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+    @property
+    def counts(self) -> Tensor:
+        """(B,) int64 real points per cloud."""
+        return self.mask.sum(dim=1)
 
-    def pin_memory(self) -> PaddedClouds:
-        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
-        return self._map(lambda tensor: tensor.pin_memory())
+    @property
+    def device(self) -> torch.device:
+        """Where the points lie."""
+        return self.points.device
 
-    def _map(self, move: Callable[[Tensor], Tensor]) -> PaddedClouds:
-        names = ("points", "mask", "colors", "normals", "labels", "source_index", "source_from_cloud")
-        moved = {name: move(value) for name in names if (value := getattr(self, name)) is not None}
-        extra, frames = ({name: move(one) for name, one in held.items()} for held in (self.extra, self.frames))
-        return replace(self, **moved, extra=extra, frames=frames)  # type: ignore[arg-type]
+    def fields(self) -> dict[str, Tensor]:
+        """Return every per-point field that is present, (B, M, ...), by name; extra fields included."""
+        core = {name: getattr(self, name) for name in FIELDS}
+        return {name: value for name, value in core.items() if value is not None} | dict(self.extra)
+
+    def to_frame(self, frame: str) -> PaddedClouds:
+        """Return the clouds in another frame that they know, in metres; padding stays as it is.
+
+        Raises:
+            FrameError: the clouds do not know the frame.
+        """
+        matrix = self.frame_from_cloud(frame)
+        batch, width = self.mask.shape
+        flat = {name: value.flatten(0, 1) for name, value in self.fields().items()}
+        ptr = torch.arange(batch + 1, dtype=torch.int64, device=self.device) * width
+        rows = moved(flat, self.kinds, ptr, matrix)
+        for name, value in rows.items():
+            real = self.mask.reshape(-1, *[1] * (value.ndim - 1))
+            rows[name] = torch.where(real, value, flat[name]).unflatten(0, (batch, width))
+        return derived(self, **attributes(rows), **self._facts_moved(matrix, frame, METRE))
+
+    def __getitem__(self, which: int | slice) -> PaddedClouds:
+        """Return one cloud, or a slice of the batch, at the same length; the memory is shared."""
+        clouds = self._which(which)
+        rows = {name: value[clouds] for name, value in self.fields().items()}
+        return derived(self, **attributes(rows), mask=self.mask[clouds], **self._facts_of(clouds))
+
+    def __iter__(self) -> Iterator[PaddedClouds]:
+        return (self[b] for b in range(self.num_clouds))
 
     def __repr__(self) -> str:
         batch, width = self.mask.shape
         return f"PaddedClouds({batch} x {width} in {self.frame_id!r} [{self.unit}])"
 
 
-def padded_clouds(clouds: Sequence[PointCloud], rows: Mapping[str, Tensor], counts: Sequence[int]) -> PaddedClouds:
+def padded_clouds(clouds: Sequence[CloudBatch], rows: Mapping[str, Tensor], counts: Sequence[int]) -> PaddedClouds:
     """Put together fields (B, M, ...) and what the clouds know about themselves."""
     device, width = rows["points"].device, rows["points"].shape[1]
+    first = clouds[0]
     return PaddedClouds(
         mask=torch.arange(width, dtype=torch.int64, device=device)
         < torch.tensor(counts, dtype=torch.int64, device=device)[:, None],
-        frame_id=clouds[0].frame_id,
-        unit=clouds[0].unit,
-        source_frame=clouds[0].source_frame,
-        source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
-        frames=joined_frames(clouds),
-        meta=tuple(entry for cloud in clouds for entry in cloud.meta),
-        **{name: rows[name] for name in CORE_KINDS if name in rows},
-        extra={name: value for name, value in rows.items() if name not in CORE_KINDS},
+        frame_id=first.frame_id,
+        unit=first.unit,
+        source_frame=first.source_frame,
+        kinds=first.kinds,
+        **attributes(rows),
+        **joined_facts(clouds),
     )

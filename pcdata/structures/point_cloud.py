@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,31 +13,20 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.rows import (
-    cloud_of_rows,
-    counts_from_ptr,
-    join_rows,
-    pad_rows,
-    pick_rows,
-    ptr_from_counts,
-    transform_directions,
-    transform_points,
-)
-from pcdata.geometry import rigid
-from pcdata.structures.cloud_checks import check_cloud, check_names
-from pcdata.structures.derive import derived
-from pcdata.structures.image_layout import ImageLayout, joined_layout, within_image
-from pcdata.structures.joining import joinable_parts, joined_frames, rows_per_cloud
-from pcdata.structures.kinds import CORE_KINDS, METRE, Kind
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.structures.cloud_batch import CloudBatch, Step, joined_facts
+from pcdata.structures.cloud_checks import check_cloud
+from pcdata.structures.image_layout import within_image
+from pcdata.structures.joining import joinable_parts, rows_per_cloud
+from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved
 from pcdata.structures.padded import PaddedClouds, padded_clouds
-
-Step = dict[str, Any]
+from pcdata.structures.structure import derived
 
 _SELECTED = {"points": "N 3", "ptr": "ptr N B"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PointCloud:
+class PointCloud(CloudBatch):
     """B >= 1 point clouds in one coordinate frame, packed: cloud b is rows ``ptr[b]:ptr[b+1]`` and may be empty.
 
     Frozen: every method returns a new cloud and shares what did not change. Coordinates are multiplied by a matrix only
@@ -45,26 +34,16 @@ class PointCloud:
     """
 
     points: Tensor  # (N, 3) float32, metres in frame_id unless unit says "normalized"
-    frame_id: str  # the coordinate frame, e.g. "camera", "base"
     ptr: Tensor = None  # type: ignore[assignment]  # (B+1,) int64; None = one cloud
     colors: Tensor | None = None  # (N, 3) float32 RGB in [0, 1]
     normals: Tensor | None = None  # (N, 3) float32, unit length
     labels: Tensor | None = None  # (N,) int64 object / segment id, -1 = none
     source_index: Tensor | None = None  # (N,) int64: flat pixel v*H*W + row*W + column, or row of the source file
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (N, ...)
-    kinds: Mapping[str, Kind] = field(default_factory=dict)  # the kind of every extra field
-    viewpoint: Tensor | None = None  # (B, 3) float32 where the sensor stood; per point: extra["viewpoint"]
-    source_from_cloud: Tensor = None  # type: ignore[assignment]  # (B, 4, 4) float64, back to source_frame in metres
-    source_frame: str = ""  # the frame that source_from_cloud leads to; "" = frame_id at construction
-    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) float64 frame_from_source
-    unit: str = METRE  # "m", or "normalized" after a normalisation
-    layout: ImageLayout | None = None  # set by Deproject, kept while rows are only dropped and moved rigidly
-    meta: Sequence[Mapping[str, Any]] = ()  # per cloud, JSON-able: what was found (planes, counts, sample id)
-    history: Sequence[Sequence[Step]] = ()  # per cloud, JSON-able: what was done, in order
+    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (N, ...), each of a kind that ``kinds`` names
 
     def __post_init__(self) -> None:
         self._fill_defaults()
-        check_cloud(self)
+        check_cloud(self, {name: getattr(self, name) for name in FIELDS}, self.extra, self.ptr)
 
     # -- construction ----------------------------------------------------------------------------------------------
 
@@ -91,11 +70,6 @@ class PointCloud:
     # -- reading ---------------------------------------------------------------------------------------------------
 
     @property
-    def num_clouds(self) -> int:
-        """The number of clouds B."""
-        return len(self.ptr) - 1
-
-    @property
     def num_points(self) -> int:
         """The number of points N of all clouds together."""
         return len(self.points)
@@ -112,12 +86,8 @@ class PointCloud:
 
     def fields(self) -> dict[str, Tensor]:
         """Return every per-point field that is present, by name; extra fields included."""
-        core = {name: getattr(self, name) for name in CORE_KINDS}
+        core = {name: getattr(self, name) for name in FIELDS}
         return {name: value for name, value in core.items() if value is not None} | dict(self.extra)
-
-    def kind(self, name: str) -> Kind:
-        """Return the kind of a per-point field."""
-        return CORE_KINDS[name] if name in CORE_KINDS else self.kinds[name]
 
     def image_grid(self) -> ImageGrid | None:
         """Where the points sit in their depth images, for the operations' ``grid=``; None once they left them."""
@@ -141,7 +111,7 @@ class PointCloud:
 
     def with_fields(self, **values: Tensor | None) -> PointCloud:
         """Replace, add or (None) drop per-point fields of unchanged rows; new extra fields need :meth:`with_extra`."""
-        core = {name: value for name, value in values.items() if name in CORE_KINDS}
+        core = {name: value for name, value in values.items() if name in FIELDS}
         extra = dict(self.extra)
         for name in values.keys() - core.keys():
             value = values[name]
@@ -183,9 +153,21 @@ class PointCloud:
 
     def _with_rows(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
         """Replace all per-point fields at once, and any other attributes, by ones that are known to fit."""
-        core = {name: value for name, value in rows.items() if name in CORE_KINDS}
-        extra = {name: value for name, value in rows.items() if name not in CORE_KINDS}
-        return derived(self, **core, extra=extra, **others)
+        return derived(self, **attributes(rows), **others)
+
+    def averaged(self, group: Tensor, ptr: Tensor, *, points: Tensor) -> PointCloud:
+        """Replace the rows of every group by one row: each field's average, as its kind says.
+
+        Args:
+            group: (N,) int64, the group of each row; groups lie within a cloud and none is empty.
+            ptr: (B+1,) int64, which groups are whose.
+            points: (G, 3) float32, the points that stand for the groups.
+        """
+        fields = self.fields()
+        del fields["points"]
+        count = len(points)
+        rows = {name: averaged(name, value, self.kind(name), group, count) for name, value in fields.items()}
+        return self._with_rows({"points": points, **rows}, ptr=ptr, layout=None)
 
     def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:
         """Move every positional and directional field by one affine (B, 4, 4) matrix per cloud.
@@ -200,53 +182,39 @@ class PointCloud:
         matrix = matrix.to(dtype=torch.float64, device=self.device)
         if tuple(matrix.shape) != (self.num_clouds, 4, 4):
             raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
-        moved: dict[str, Tensor] = {}
-        for name, value in self.fields().items():
-            kind = self.kind(name)
-            if kind is Kind.POSITION:
-                value = transform_points(value, self.ptr, matrix)
-            elif kind is Kind.DIRECTION:
-                value = transform_directions(value, self.ptr, matrix)
-            moved[name] = value
-        viewpoint = self.viewpoint
-        if viewpoint is not None:
-            per_cloud = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=self.device)
-            viewpoint = transform_points(viewpoint, per_cloud, matrix)
-        source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
-        result = self._with_rows(
-            moved,
-            layout=self.layout if self.layout is not None and rigid.is_rigid(source_from_cloud) else None,
-            viewpoint=viewpoint,
-            source_from_cloud=source_from_cloud,
-            frame_id=self.frame_id if frame_id is None else frame_id,
-            unit=self.unit if unit is None else unit,
-        )
-        check_names(result)
-        return result
+        rows = moved(self.fields(), self.kinds, self.ptr, matrix)
+        return self._with_rows(rows, **self._facts_moved(matrix, frame_id, unit))
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""
         return self.transformed(self.source_from_cloud, frame_id=self.source_frame, unit=METRE)
 
+    def to_frame(self, frame: str) -> PointCloud:
+        """Return the same rows in another frame that the clouds know, in metres; the transform ToFrame records it too.
+
+        Raises:
+            FrameError: the clouds do not know the frame.
+        """
+        return self.transformed(self.frame_from_cloud(frame), frame_id=frame, unit=METRE)
+
     # -- batching --------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, which: int | slice) -> PointCloud:
+        """Return one cloud of the batch, or a slice of it; the memory is shared."""
+        return self._slice(self._which(which), self.ptr.tolist())
+
+    def __iter__(self) -> Iterator[PointCloud]:
+        bounds = self.ptr.tolist()
+        return (self._slice(slice(b, b + 1), bounds) for b in range(self.num_clouds))
 
     def unbatch(self) -> list[PointCloud]:
         """Split into B single clouds (views of the same memory)."""
-        bounds = self.ptr.tolist()
-        return [self._slice(b, bounds[b], bounds[b + 1]) for b in range(self.num_clouds)]
+        return list(self)
 
-    def _slice(self, b: int, start: int, stop: int) -> PointCloud:
+    def _slice(self, clouds: slice, bounds: Sequence[int]) -> PointCloud:
+        start, stop = bounds[clouds.start], bounds[clouds.stop]
         rows = {name: value[start:stop] for name, value in self.fields().items()}
-        return self._with_rows(
-            rows,
-            layout=joined_layout([self.layout], slice(b, b + 1)),
-            ptr=torch.tensor([0, stop - start], dtype=torch.int64, device=self.device),
-            viewpoint=None if self.viewpoint is None else self.viewpoint[b : b + 1],
-            source_from_cloud=self.source_from_cloud[b : b + 1],
-            frames={name: matrix[b : b + 1] for name, matrix in self.frames.items()},
-            meta=self.meta[b : b + 1],
-            history=self.history[b : b + 1],
-        )
+        return self._with_rows(rows, ptr=self.ptr[clouds.start : clouds.stop + 1] - start, **self._facts_of(clouds))
 
     @staticmethod
     def cat(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -257,18 +225,21 @@ class PointCloud:
             ShapeError: the clouds carry different fields, or there are none.
             DeviceError: the clouds lie on different devices.
         """
-        parts = joinable_parts(clouds)
-        viewpoints = [cloud.viewpoint for cloud in clouds]
-        first = clouds[0]
-        return first._with_rows(
-            join_rows(parts),
-            layout=joined_layout([cloud.layout for cloud in clouds]),
-            ptr=ptr_from_counts(torch.cat([cloud.counts for cloud in clouds])),
-            viewpoint=torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
-            source_from_cloud=torch.cat([cloud.source_from_cloud for cloud in clouds]),
-            frames=joined_frames(clouds),
-            meta=tuple(entry for cloud in clouds for entry in cloud.meta),
-            history=tuple(steps for cloud in clouds for steps in cloud.history),
+        parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
+        ptr = ptr_from_counts(torch.cat([cloud.counts for cloud in clouds]))
+        return clouds[0]._with_rows(join_rows(parts), ptr=ptr, **joined_facts(clouds))
+
+    @staticmethod
+    def from_padded(padded: PaddedClouds) -> PointCloud:
+        """Return the packed clouds that were padded, as they were."""
+        return PointCloud(
+            ptr=ptr_from_counts(padded.counts),
+            frame_id=padded.frame_id,
+            unit=padded.unit,
+            source_frame=padded.source_frame,
+            kinds=padded.kinds,
+            **attributes({name: value[padded.mask] for name, value in padded.fields().items()}),
+            **padded._facts_of(slice(None)),
         )
 
     def padded(self, num_points: int | None = None) -> PaddedClouds:
@@ -296,38 +267,15 @@ class PointCloud:
         Raises:
             FrameError, UnitError, ShapeError, DeviceError: as :meth:`cat` and :meth:`padded`.
         """
-        parts = joinable_parts(clouds)
+        parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
         counts = [[stop - start for start, stop in itertools.pairwise(cloud.ptr.tolist())] for cloud in clouds]
         flat = list(itertools.chain.from_iterable(counts))
         width = max(flat) if num_points is None else num_points
         if max(flat) > width:
             raise ShapeError(f"PointCloud.padded: a cloud has {max(flat)} points, more than num_points={width}")
-        rows = pad_rows({name: rows_per_cloud(value, counts) for name, value in parts.items()}, width)
+        filler = fillers({name: values[0] for name, values in parts.items()}, clouds[0].kinds)
+        rows = pad_rows({name: rows_per_cloud(value, counts) for name, value in parts.items()}, width, filler)
         return padded_clouds(clouds, rows, flat)
-
-    # -- moving between devices and processes ----------------------------------------------------------------------
-
-    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PointCloud:
-        """Move all tensors to a device."""
-        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self) -> PointCloud:
-        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
-        return self._map(lambda tensor: tensor.pin_memory())
-
-    def _map(self, move: Any) -> PointCloud:
-        rows = {name: move(value) for name, value in self.fields().items()}
-        return self._with_rows(
-            rows,
-            layout=None if self.layout is None else replace(self.layout, intrinsics=move(self.layout.intrinsics)),
-            ptr=move(self.ptr),
-            viewpoint=None if self.viewpoint is None else move(self.viewpoint),
-            source_from_cloud=move(self.source_from_cloud),
-            frames={name: move(matrix) for name, matrix in self.frames.items()},
-        )
-
-    def __len__(self) -> int:
-        return self.num_clouds
 
     def __repr__(self) -> str:
         counts = self.counts.tolist()

@@ -9,10 +9,11 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ShapeError
 from pcdata.structures.point_cloud import PointCloud
+from pcdata.structures.structure import Structure
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SurfaceMesh:
+class SurfaceMesh(Structure):
     """Triangles between the points of one cloud; seen from outside, their corners run counter-clockwise."""
 
     vertices: PointCloud  # a single cloud

@@ -20,7 +20,7 @@ from typing_extensions import dataclass_transform
 from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
-from pcdata.structures.kinds import CORE_KINDS
+from pcdata.structures.kinds import FIELDS
 from pcdata.transforms.author_errors import UndeclaredStreams
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
@@ -283,7 +283,7 @@ def _small(params: Params, b: int, num: int) -> dict[str, Any]:
     kept = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in ("index", "ptr", *CORE_KINDS)
+        is_per_cloud = name not in ("index", "ptr", *FIELDS)
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16:
             kept[name] = value[b].tolist()
     return kept

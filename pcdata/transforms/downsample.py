@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated
 
 import torch
@@ -11,17 +10,11 @@ from torch import Tensor
 from pcdata.errors import ConfigError, TooFewPointsError
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
-from pcdata.functional.voxels import (
-    find_voxel_size,
-    voxel_downsample,
-    voxel_majority,
-    voxel_mean,
-    voxel_mean_direction,
-    voxel_minimum,
-)
+from pcdata.functional.voxels import find_voxel_size, voxel_downsample
 from pcdata.rng import Streams, seeded
 from pcdata.sensors import SensorProfile
-from pcdata.structures import METRE, Kind, PointCloud
+from pcdata.structures import METRE, PointCloud
+from pcdata.structures.kinds import fillers
 from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
 from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres, Unit
 
@@ -61,15 +54,7 @@ class VoxelDownsample(Transform):
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Reduce every field voxel by voxel."""
         means, ptr, inverse = voxel_downsample(data.points, data.ptr, voxel_size=params["voxel_size"])
-        count = len(means)
-        first = torch.full((count,), data.num_points, dtype=torch.int64, device=data.device)
-        first.scatter_reduce_(0, inverse, torch.arange(data.num_points, dtype=torch.int64, device=data.device), "amin")
-        rows = {name: _reduce(value, data.kind(name), inverse, count) for name, value in data.fields().items()}
-        rows["points"] = means
-        if data.source_index is not None:
-            rows["source_index"] = data.source_index[first]
-        kept = data.select(first, ptr)
-        return kept.with_fields(**rows)
+        return data.averaged(inverse, ptr, points=means)
 
 
 class _Sample(SelectTransform, abstract=True):
@@ -107,7 +92,9 @@ class _Sample(SelectTransform, abstract=True):
         chosen = data.select(params["index"].clamp(min=0), params["ptr"])
         if self.if_short != "zeros":
             return chosen
-        return chosen.with_fields(**{name: _blanked(value, blank) for name, value in chosen.fields().items()})
+        fields = chosen.fields()
+        filler = fillers(fields, chosen.kinds)
+        return chosen.with_fields(**{name: _blanked(value, blank, filler[name]) for name, value in fields.items()})
 
     def _fill_up(self, rows: Tensor, wanted: int, seed: int) -> Tensor:
         missing = wanted - len(rows)
@@ -180,20 +167,5 @@ class RandomPointCount(RandomSample):
         return counts
 
 
-def _reduce(values: Tensor, kind: Kind, inverse: Tensor, count: int) -> Tensor:
-    """Reduce one field voxel by voxel, by its kind and dtype."""
-    if kind is Kind.DIRECTION:
-        return voxel_mean_direction(values, inverse, count)
-    columns = values.reshape(len(values), math.prod(values.shape[1:]))
-    if values.is_floating_point():
-        reduced = voxel_mean(columns, inverse, count)
-    else:
-        decide = voxel_minimum if kind is Kind.MINIMUM else voxel_majority
-        votes = [decide(column.long(), inverse, count) for column in columns.unbind(1)]
-        reduced = torch.stack(votes, dim=1).to(values.dtype)
-    return reduced.reshape(count, *values.shape[1:])
-
-
-def _blanked(values: Tensor, blank: Tensor) -> Tensor:
-    filler = -1 if values.dtype in (torch.int16, torch.int32, torch.int64) else 0
+def _blanked(values: Tensor, blank: Tensor, filler: int) -> Tensor:
     return torch.where(blank.reshape(-1, *[1] * (values.ndim - 1)), torch.full_like(values, filler), values)

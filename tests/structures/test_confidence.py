@@ -95,7 +95,7 @@ def test_the_minimum_of_each_group_is_found():
 
 
 def test_a_minimum_is_of_integers():
-    with pytest.raises(DTypeError, match="must hold integers"):
+    with pytest.raises(DTypeError, match="must be integers"):
         PointCloud(points=torch.zeros(2, 3), frame_id="a", extra={"x": torch.zeros(2)}, kinds={"x": Kind.MINIMUM})
 
 

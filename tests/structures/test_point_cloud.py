@@ -78,7 +78,7 @@ GOOD = {"points": torch.zeros(N, 3), "ptr": torch.tensor([0, 1, N]), "frame_id":
         ({"extra": {"a b": torch.zeros(N)}, "kinds": {"a b": "invariant"}}, DTypeError, "cannot name"),
         ({"extra": {"axis": torch.zeros(N)}, "kinds": {"axis": "direction"}}, ShapeError, r"must be float \(N, 3\)"),
         ({"extra": {"viewpoint": torch.zeros(N, 3)}, "kinds": {"viewpoint": "invariant"}}, DTypeError, "is a position"),
-        ({"extra": {"mass": torch.zeros(N)}, "kinds": {"mass": "minimum"}}, DTypeError, "must hold integers"),
+        ({"extra": {"mass": torch.zeros(N)}, "kinds": {"mass": "minimum"}}, DTypeError, "must be integers"),
         (
             {"extra": {"mass": torch.zeros(N, device="meta")}, "kinds": {"mass": "invariant"}},
             DeviceError,

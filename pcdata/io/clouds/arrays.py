@@ -15,7 +15,7 @@ from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, DTypeError, ShapeError
 from pcdata.io.clouds.statement import CloudStatement
 from pcdata.structures import METRE, Kind, PointCloud
-from pcdata.structures.kinds import CORE_KINDS
+from pcdata.structures.kinds import FIELDS, KINDS
 
 _ROUNDED = 1e-5  # that a float colour may lie above 1
 _FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
@@ -68,7 +68,7 @@ def to_cloud(
         name = _free_name(given, extra)
         extra[name] = _tensor(f"{where}: field {given!r}", values[rows])
         kinds[name] = arrays.kinds.get(given) or _kind(name, extra[name])
-        if kinds[name] is Kind.POSITION:
+        if KINDS[kinds[name]].is_length:
             extra[name] = extra[name] * unit
     source = statement.source_from_cloud
     return PointCloud(
@@ -209,6 +209,6 @@ def _free_name(name: str, taken: Mapping[str, Any]) -> str:
     name = "".join(letter if ("_" + letter).isidentifier() else "_" for letter in name)
     if not name.isidentifier():
         name = f"_{name}"
-    while name in CORE_KINDS or name in taken:
+    while name in FIELDS or name in taken:
         name += "_"
     return name

@@ -21,10 +21,10 @@ from torch import Tensor
 from pcdata.errors import CacheError, PcdataError
 from pcdata.files.strict_json import json_object, parse_json
 from pcdata.structures import PointCloud
+from pcdata.structures.kinds import FIELDS
 
 SCHEMA = "pcdata.cloud/1"
 
-_POINT_FIELDS = ("points", "colors", "normals", "labels", "source_index")
 _CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
 _EXTRA, _FRAMES = "extra.", "frames."
 _DERIVED = ("intrinsics", "extrinsics")
@@ -66,7 +66,7 @@ def record_from_cloud(cloud: PointCloud) -> Record:
             cannot.
     """
     cloud = cloud.to("cpu")
-    arrays = {name: _array(name, value) for name in _POINT_FIELDS if (value := getattr(cloud, name)) is not None}
+    arrays = {name: _array(name, value) for name in FIELDS if (value := getattr(cloud, name)) is not None}
     if cloud.labels is not None:
         arrays["labels"] = _labels_as_int32(arrays["labels"])
     arrays |= {_EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
@@ -104,7 +104,7 @@ def cloud_from_record(record: Record) -> PointCloud:
     frames = {
         unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
     }
-    unknown = tensors.keys() - {*_POINT_FIELDS, *_CLOUD_FIELDS}
+    unknown = tensors.keys() - {*FIELDS, *_CLOUD_FIELDS}
     if unknown:
         raise CacheError(f"no cloud has the arrays {sorted(unknown)}")
     if any(matrix.dtype != torch.float64 for matrix in frames.values()):

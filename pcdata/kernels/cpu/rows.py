@@ -17,7 +17,6 @@ from torch import Tensor
 import pcdata.functional.rows
 import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.functional.rows import padding_of
 from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
 
 _ROWS_PER_PIECE = 16384  # as in rows.cpp
@@ -77,16 +76,16 @@ def join_rows(parts: Mapping[str, Sequence[Tensor]]) -> dict[str, Tensor]:
     counts = _counts_of_equal_parts(parts) if rows > _MANY_ROWS else None
     if counts is None:
         return _reference("join_rows", parts)
-    return _placed(parts, counts, [0, *itertools.accumulate(counts)])
+    return _placed(parts, counts, [0, *itertools.accumulate(counts)], dict.fromkeys(parts, 0))
 
 
 @kernel("pad_rows", "cpu")
-def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int) -> dict[str, Tensor]:
+def pad_rows(parts: Mapping[str, Sequence[Tensor]], width: int, fillers: Mapping[str, int]) -> dict[str, Tensor]:
     """Copy and fill the parts of all fields, part by part."""
     counts = _counts_of_equal_parts(parts)
     if counts is None or max(counts) > width:
-        return _reference("pad_rows", parts, width)
-    placed = _placed(parts, counts, [width * part for part in range(len(counts) + 1)])
+        return _reference("pad_rows", parts, width, fillers)
+    placed = _placed(parts, counts, [width * part for part in range(len(counts) + 1)], fillers)
     return {name: block.reshape(len(counts), width, *block.shape[1:]) for name, block in placed.items()}
 
 
@@ -103,17 +102,19 @@ def _counts_of_equal_parts(parts: Mapping[str, Sequence[Tensor]]) -> list[int] |
     return counts
 
 
-def _placed(parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: list[int]) -> dict[str, Tensor]:
+def _placed(
+    parts: Mapping[str, Sequence[Tensor]], counts: list[int], starts: list[int], fillers: Mapping[str, int]
+) -> dict[str, Tensor]:
     """Return one block per field with every part where it starts; the rest is padding."""
     firsts = [field[0] for field in parts.values()]
     blocks = room_for(*(((starts[-1], *first.shape[1:]), first.dtype) for first in firsts))
     sources = [part.contiguous() for field in parts.values() for part in field]
     row_bytes = [math.prod(first.shape[1:]) * first.element_size() for first in firsts]
-    fillers = [padding_of(first.dtype) & 0xFF for first in firsts]  # -1 is a row of such bytes
+    filling = [fillers[name] & 0xFF for name in parts]  # 0 and -1 are the numbers whose bytes are all alike
     call(
         "pc_place_rows",
         *(len(counts), numbers(counts), numbers(starts), len(firsts), addresses(sources)),
-        *(numbers(row_bytes), numbers(fillers), addresses(blocks)),
+        *(numbers(row_bytes), numbers(filling), addresses(blocks)),
     )
     return dict(zip(parts, blocks))
 

@@ -1,0 +1,142 @@
+"""What B clouds know about themselves, however their points are laid out."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.errors import DTypeError, FrameError, OutOfRangeError, UnitError
+from pcdata.geometry import rigid
+from pcdata.structures.image_layout import ImageLayout, joined_layout
+from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
+from pcdata.structures.structure import Structure
+
+Step = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CloudBatch(Structure):
+    """B >= 1 clouds that know their frame, their unit, where they came from and what was done to them."""
+
+    frame_id: str  # the coordinate frame, e.g. "camera", "base"
+    unit: str = METRE  # "m", or "normalized" after a normalisation
+    kinds: Mapping[str, Kind] = field(default_factory=dict)  # the kind of every extra field
+    viewpoint: Tensor | None = None  # (B, 3) float32 where the sensor stood; per point: extra["viewpoint"]
+    source_from_cloud: Tensor = None  # type: ignore[assignment]  # (B, 4, 4) float64, back to source_frame in metres
+    source_frame: str = ""  # the frame that source_from_cloud leads to; "" = frame_id at construction
+    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) float64 frame_from_source
+    layout: ImageLayout | None = None  # set by Deproject, kept while rows are only dropped and moved rigidly
+    meta: Sequence[Mapping[str, Any]] = ()  # per cloud, JSON-able: what was found (planes, counts, sample id)
+    history: Sequence[Sequence[Step]] = ()  # per cloud, JSON-able: what was done, in order
+
+    def kind(self, name: str) -> Kind:
+        """Return the kind of a per-point field."""
+        return kind_of(name, self.kinds)
+
+    def frame_from_cloud(self, frame: str) -> Tensor:
+        """Return (B, 4, 4) float64 from the present coordinates to a frame that the clouds know, in metres.
+
+        Raises:
+            FrameError: the clouds do not know the frame.
+        """
+        if frame == self.frame_id and self.unit == METRE:
+            return torch.eye(4, dtype=torch.float64, device=self.source_from_cloud.device).repeat(self.num_clouds, 1, 1)
+        if frame == self.source_frame:
+            return self.source_from_cloud
+        if frame not in self.frames:
+            known = sorted({self.source_frame, *self.frames})
+            raise FrameError(f"the clouds know the frames {known}, not {frame!r}; give the captures their poses")
+        return self.frames[frame] @ self.source_from_cloud
+
+    @property
+    def num_clouds(self) -> int:
+        """The number of clouds B."""
+        return len(self.source_from_cloud)
+
+    def __len__(self) -> int:
+        return self.num_clouds
+
+    def _which(self, clouds: int | slice) -> slice:
+        """Return the clouds that an index or a slice names, as a slice of at least one."""
+        name = type(self).__name__
+        if isinstance(clouds, slice):
+            start, stop, step = clouds.indices(self.num_clouds)
+            if step != 1 or stop <= start:
+                raise OutOfRangeError(
+                    f"{name}[...]: a slice must name at least one cloud of {self.num_clouds}, and neighbours, got "
+                    f"{clouds.start}:{clouds.stop}:{clouds.step}"
+                )
+            return slice(start, stop)
+        try:
+            number = operator.index(clouds)
+        except TypeError:
+            number = None
+        if number is None or isinstance(clouds, bool):
+            raise DTypeError(
+                f"{name}[...]: takes the number of a cloud or a slice of clouds, got {type(clouds).__name__}; points "
+                "are picked by PointCloud.select(index, ptr)"
+            )
+        if not -self.num_clouds <= number < self.num_clouds:
+            raise OutOfRangeError(f"{name}[{number}]: there are {self.num_clouds} clouds, numbered from 0")
+        number %= self.num_clouds
+        return slice(number, number + 1)
+
+    def __array__(self, *args: Any, **kwargs: Any) -> Any:
+        # NumPy would take it for a sequence and descend into clouds of clouds.
+        raise DTypeError(f"{type(self).__name__}: is several arrays, not one; take .points.numpy(), or another field's")
+
+    # -- what becomes of it ----------------------------------------------------------------------------------------
+
+    def _facts_of(self, clouds: slice) -> dict[str, Any]:
+        """Return what some of the clouds know."""
+        return {
+            "layout": joined_layout([self.layout], clouds),
+            "viewpoint": None if self.viewpoint is None else self.viewpoint[clouds],
+            "source_from_cloud": self.source_from_cloud[clouds],
+            "frames": {name: matrix[clouds] for name, matrix in self.frames.items()},
+            "meta": self.meta[clouds],
+            "history": self.history[clouds],
+        }
+
+    def _facts_moved(self, matrix: Tensor, frame_id: str | None, unit: str | None) -> dict[str, Any]:
+        """Return what the clouds know after a motion by (B, 4, 4): the way back to the source absorbs its inverse."""
+        viewpoint = self.viewpoint
+        if viewpoint is not None:
+            one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=viewpoint.device)
+            viewpoint = KINDS[Kind.POSITION].move(viewpoint, one_row_each, matrix)
+        source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
+        known = {"frame_id": frame_id if frame_id is not None else self.frame_id, "unit": unit or self.unit}
+        check_names(type(self).__name__, **known)
+        return {
+            **known,
+            "layout": self.layout if self.layout is not None and rigid.is_rigid(source_from_cloud) else None,
+            "viewpoint": viewpoint,
+            "source_from_cloud": source_from_cloud,
+        }
+
+
+def check_names(where: str, frame_id: str, unit: str) -> None:
+    """Raise unless the frame has a name and the unit is a known one."""
+    if not frame_id:
+        raise FrameError(f"{where}: frame_id must name the coordinate frame, it is empty")
+    if unit not in (METRE, NORMALIZED):
+        raise UnitError(f"{where}: unit must be {METRE!r} or {NORMALIZED!r}, got {unit!r}")
+
+
+def joined_facts(clouds: Sequence[CloudBatch]) -> dict[str, Any]:
+    """Return what batches know together, for clouds that may be joined."""
+    viewpoints = [cloud.viewpoint for cloud in clouds]
+    shared = [name for name in clouds[0].frames if all(name in cloud.frames for cloud in clouds)]
+    return {
+        "layout": joined_layout([cloud.layout for cloud in clouds]),
+        "viewpoint": torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
+        "source_from_cloud": torch.cat([cloud.source_from_cloud for cloud in clouds]),
+        "frames": {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in shared},
+        "meta": tuple(entry for cloud in clouds for entry in cloud.meta),
+        "history": tuple(steps for cloud in clouds for steps in cloud.history),
+    }

@@ -1,0 +1,54 @@
+"""What all frozen structures share: copies without checking again what is known to hold, and moves between devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+S = TypeVar("S")
+Movable = TypeVar("Movable", bound="Structure")
+
+
+def derived(structure: S, **changes: Any) -> S:
+    """Return a copy with other attributes; only for changes that keep everything the constructor checks."""
+    copy = object.__new__(type(structure))
+    copy.__dict__.update(structure.__dict__)
+    copy.__dict__.update(changes)
+    return copy
+
+
+class Structure:
+    """A frozen dataclass of tensors, of mappings of them, and of structures; whatever else it holds stays as it is."""
+
+    def to(self: Movable, device: torch.device | str, *, non_blocking: bool = False) -> Movable:
+        """Move all tensors to a device."""
+        return self._mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def cuda(self: Movable, device: torch.device | str | int | None = None, *, non_blocking: bool = False) -> Movable:
+        """Move all tensors to a CUDA device; None = the current one."""
+        number = torch.device("cuda", device) if isinstance(device, int) else torch.device(device or "cuda")
+        return self.to(number, non_blocking=non_blocking)
+
+    def cpu(self: Movable) -> Movable:
+        """Move all tensors to host memory."""
+        return self.to("cpu")
+
+    def pin_memory(self: Movable) -> Movable:
+        """Copy all tensors to page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
+        return self._mapped(lambda tensor: tensor.pin_memory())
+
+    def _mapped(self: Movable, move: Callable[[Tensor], Tensor]) -> Movable:
+        return derived(self, **{name: _mapped(value, move) for name, value in vars(self).items()})
+
+
+def _mapped(value: Any, move: Callable[[Tensor], Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return move(value)
+    if isinstance(value, Structure):
+        return value._mapped(move)
+    if isinstance(value, Mapping) and any(isinstance(one, Tensor) for one in value.values()):
+        return {name: _mapped(one, move) for name, one in value.items()}
+    return value
