@@ -16,19 +16,32 @@ class ModelBatch(Structure):
     """The tensors that a model takes, by the names of its own code, and what a check or a prediction needs to know.
 
     Empty texts and None mean "not known": tensors from a foreign file come without them.
+
+    Args:
+        model: the contract that it was made for.
+        choices: what was chosen where the contract leaves a choice.
+        channels: names of the channels, per tensor.
+        frame_id: the frame that the coordinates are in.
+        unit: "m" or "normalized".
+        counts: points of each cloud.
+        steps: names of the transforms that made the first cloud.
+        source_from_cloud: (B, 4, 4) float64.
+        source_frame: the frame that source_from_cloud leads to.
+        frames: frame name -> (B, 4, 4) frame_from_source.
+        meta: per cloud, JSON-able: what was found.
     """
 
     tensors: Mapping[str, Tensor]
-    model: str = ""  # the contract that it was made for
+    model: str = ""
     choices: Mapping[str, Any] = field(default_factory=dict)
-    channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names of the channels, per tensor
+    channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     frame_id: str = ""
     unit: str = ""
-    counts: tuple[int, ...] | None = None  # points of each cloud
-    steps: tuple[str, ...] | None = None  # names of the transforms that made the first cloud
-    source_from_cloud: Tensor | None = None  # (B, 4, 4) float64
+    counts: tuple[int, ...] | None = None
+    steps: tuple[str, ...] | None = None
+    source_from_cloud: Tensor | None = None
     source_frame: str = ""
-    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) frame_from_source
+    frames: Mapping[str, Tensor] = field(default_factory=dict)
     meta: Sequence[Mapping[str, Any]] = ()
 
     # Not a collections Mapping: a DataLoader that pins memory would rebuild that as a plain dict of tensors.

@@ -76,48 +76,86 @@ class InputTensor:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelContract:
-    """What one model takes; where a guide says otherwise than the model's code, this follows the code."""
+    """What one model takes; where a guide says otherwise than the model's code, this follows the code.
+
+    Args:
+        name: what `preset` finds it by.
+        title: the model, in words.
+        source: repository, file and lines that say so.
+        tensors: what the model takes, by the names of its own code.
+        frame: "" = the model leaves it open: it must be chosen.
+        axes: which way x, y and z point.
+        half_turn: turn half about z: x left, y up, z forward.
+        far: metres: readings beyond are dropped before anything else.
+        count: points per cloud; None = any.
+        counts: other counts that the model's code is used with.
+        any_count: the network takes any count that is stated: preset(..., num_points=2048).
+        count_range: where count is None: the usual counts.
+        sampler: the transform that brings clouds to the count.
+        samplers: others that the model's code offers.
+        pad: how short clouds are filled up.
+        voxel: edge length in metres.
+        voxel_count: where voxel is None: the size is found that leaves so many, cloud by cloud.
+        voxel_rule: which point stands for a voxel.
+        crop_before_voxels: whether the crop comes before the voxels.
+        centring: where the origin is put.
+        scaling: what the coordinates are divided by.
+        normalise: whether clouds are normalized before or after sampling.
+        crop: smallest and largest x, y, z, in the contract's frame before centring.
+        crop_is_open: the crop must be chosen: a box, or None for no crop.
+        column: edge length of a random column of the scene, metres.
+        window: (height, width) cut from the middle of the image, before it is resized.
+        holes: how an image network's code fills them.
+        image_size: (height, width).
+        table: whether the table stays in the cloud.
+        max_duplicates: share of repeated points beyond which a cloud is too thin to train on.
+        guide: what practitioners' guides say instead.
+        traps: what goes wrong silently with this model.
+        wrong_frame: what a wrong frame would have done.
+        checked: what was held against the model's own code: file, commit, outcome.
+        choices: further choices that must be given.
+    """
 
     name: str
     title: str
-    source: str  # repository, file and lines that say so
+    source: str
     tensors: tuple[InputTensor, ...]
 
     takes: Literal["cloud", "depth image"] = "cloud"
-    frame: str = CAMERA_FRAME  # "" = the model leaves it open: it must be chosen
+    frame: str = CAMERA_FRAME
     axes: str = "x right, y down, z forward"
-    half_turn: bool = False  # turn half about z: x left, y up, z forward
+    half_turn: bool = False
 
-    far: float | None = None  # metres: readings beyond are dropped before anything else
-    count: int | None = None  # points per cloud; None = any
-    counts: tuple[int, ...] = ()  # other counts that the model's code is used with
-    any_count: bool = False  # the network takes any count that is stated: preset(..., num_points=2048)
-    count_range: tuple[int, int] | None = None  # where count is None: the usual counts
+    far: float | None = None
+    count: int | None = None
+    counts: tuple[int, ...] = ()
+    any_count: bool = False
+    count_range: tuple[int, int] | None = None
     sampler: Sampler = "none"
-    samplers: tuple[Sampler, ...] = ()  # others that the model's code offers
+    samplers: tuple[Sampler, ...] = ()
     pad: Literal["error", "repeat", "tile", "zeros", "keep"] = "keep"
-    voxel: float | None = None  # edge length in metres
-    voxel_count: int | None = None  # where voxel is None: the size is found that leaves so many, cloud by cloud
+    voxel: float | None = None
+    voxel_count: int | None = None
     voxel_rule: Literal["mean", "first", "random"] = "mean"
     crop_before_voxels: bool = True
 
     centring: Literal["none", "mean", "corner", "floor"] = "none"
     scaling: Literal["none", "unit sphere"] = "none"
     normalise: Literal["before sampling", "after sampling"] = "after sampling"
-    crop: tuple[Vec3, Vec3] | None = None  # smallest and largest x, y, z, in the contract's frame before centring
-    crop_is_open: bool = False  # the crop must be chosen: a box, or None for no crop
-    column: float | None = None  # edge length of a random column of the scene, metres
-    window: tuple[int, int] | None = None  # (height, width) cut from the middle of the image, before it is resized
-    holes: Literal["nearest", "inpainted"] = "nearest"  # how an image network's code fills them
-    image_size: tuple[int, int] | None = None  # (height, width)
+    crop: tuple[Vec3, Vec3] | None = None
+    crop_is_open: bool = False
+    column: float | None = None
+    window: tuple[int, int] | None = None
+    holes: Literal["nearest", "inpainted"] = "nearest"
+    image_size: tuple[int, int] | None = None
 
     table: Literal["kept", "removed", "open"] = "kept"
-    max_duplicates: float = 0.5  # share of repeated points beyond which a cloud is too thin to train on
-    guide: str = ""  # what practitioners' guides say instead
+    max_duplicates: float = 0.5
+    guide: str = ""
     traps: tuple[str, ...] = ()
-    wrong_frame: str = ""  # what a wrong frame would have done
-    checked: tuple[str, ...] = ()  # what was held against the model's own code: file, commit, outcome
-    choices: tuple[str, ...] = field(default=())  # further choices that must be given
+    wrong_frame: str = ""
+    checked: tuple[str, ...] = ()
+    choices: tuple[str, ...] = field(default=())
 
     @property
     def main(self) -> InputTensor:

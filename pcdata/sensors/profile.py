@@ -23,20 +23,33 @@ class SensorProfile:
     The thresholds are derived, never tuned: from the noise (standard deviation sigma at that depth) and the pitch (the
     distance of neighbouring points on a surface facing the sensor). The difference of two readings has a standard
     deviation of sqrt(2) sigma.
+
+    Args:
+        name: what `sensor_profile` finds it by.
+        title: maker, model and mode.
+        kind: how it measures depth.
+        size: (height, width) pixels of the mode described; lidar: channels, firings per turn.
+        field_of_view: degrees, (vertical, horizontal).
+        focal: pixels, nominal, of the mode described; None = not a pinhole camera.
+        angular_step: degrees between neighbouring rays, (vertical, horizontal); lidar only.
+        metres_per_unit: lengths that one stored depth unit is known to have, the default first.
+        range: metres, (near, far), where the maker states it works well.
+        depth_step: metres: the depth image's own step, on top of the noise.
+        sources: figure -> where it is from; "estimate: ..." where nothing was found.
     """
 
     name: str
-    title: str  # maker, model and mode
+    title: str
     kind: Kind
-    size: tuple[int, int]  # (height, width) pixels of the mode described; lidar: channels, firings per turn
-    field_of_view: tuple[float, float]  # degrees, (vertical, horizontal)
-    focal: float | None  # pixels, nominal, of the mode described; None = not a pinhole camera
-    angular_step: tuple[float, float] | None  # degrees between neighbouring rays, (vertical, horizontal); lidar only
-    metres_per_unit: tuple[float, ...]  # lengths that one stored depth unit is known to have, the default first
-    range: tuple[float, float]  # metres, (near, far), where the maker states it works well
+    size: tuple[int, int]
+    field_of_view: tuple[float, float]
+    focal: float | None
+    angular_step: tuple[float, float] | None
+    metres_per_unit: tuple[float, ...]
+    range: tuple[float, float]
     noise: StereoNoise | PolynomialNoise
-    depth_step: float  # metres: the depth image's own step, on top of the noise
-    sources: Mapping[str, str]  # figure -> where it is from; "estimate: ..." where nothing was found
+    depth_step: float
+    sources: Mapping[str, str]
 
     @property
     def estimates(self) -> tuple[str, ...]:

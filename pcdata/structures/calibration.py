@@ -27,17 +27,30 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-/]*")
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """How one camera or transform was found, so that a reader can judge it."""
+    """How one camera or transform was found, so that a reader can judge it.
 
-    method: str  # e.g. "chessboard 9x6, squares of 0.025 m"
-    num_observations: int | None = None  # views or poses
-    residuals: Mapping[str, float] = field(default_factory=dict)  # each name ends in its unit: "reprojection_rms_px"
-    date: str | None = None  # recorded only when given, so that equal input makes equal bytes
+    Args:
+        method: e.g. "chessboard 9x6, squares of 0.025 m".
+        num_observations: views or poses.
+        residuals: each name ends in its unit: "reprojection_rms_px".
+        date: recorded only when given, so that equal input makes equal bytes.
+        notes: whatever else should be known.
+    """
+
+    method: str
+    num_observations: int | None = None
+    residuals: Mapping[str, float] = field(default_factory=dict)
+    date: str | None = None
     notes: str | None = None
 
 
 class FramePair(NamedTuple):
-    """The two frames that a transform's name joins."""
+    """The two frames that a transform's name joins.
+
+    Args:
+        to: the frame that points are in afterwards.
+        from_: the frame that points were in before.
+    """
 
     to: str
     from_: str
@@ -71,6 +84,11 @@ class Calibration:
     camera ``wrist`` sees into the frame ``base``. Between two frames there is one way at most, so no two entries can
     contradict each other.
 
+    Args:
+        cameras: cameras by name.
+        transforms: to_from -> (4, 4) float64.
+        evidence: by the name of a camera or transform.
+
     Raises:
         CalibrationError: a camera is more than one, has skew or a name of no use; evidence belongs to nothing; a loop.
         FrameError: a transform is not named ``to_from``.
@@ -78,8 +96,8 @@ class Calibration:
     """
 
     cameras: Mapping[str, Camera] = field(default_factory=dict)
-    transforms: Mapping[str, Tensor] = field(default_factory=dict)  # to_from -> (4, 4) float64
-    evidence: Mapping[str, Evidence] = field(default_factory=dict)  # by the name of a camera or transform
+    transforms: Mapping[str, Tensor] = field(default_factory=dict)
+    evidence: Mapping[str, Evidence] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, camera in self.cameras.items():

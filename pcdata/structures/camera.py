@@ -21,12 +21,18 @@ class Camera(Structure):
 
     Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) with integer coordinates is the centre of that pixel,
     so an image spans -0.5 .. width-0.5. The intrinsics belong to the stream that the depth is registered to.
+
+    Args:
+        intrinsics: (V, 3, 3) float64, pixels.
+        size: (height, width) in pixels.
+        distortion: (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]].
+        is_window: cut from a larger image, so the principal point may lie outside.
     """
 
-    intrinsics: Tensor  # (V, 3, 3) float64, pixels
-    size: tuple[int, int]  # (height, width) in pixels
-    distortion: Tensor | None = None  # (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
-    is_window: bool = False  # cut from a larger image, so the principal point may lie outside
+    intrinsics: Tensor
+    size: tuple[int, int]
+    distortion: Tensor | None = None
+    is_window: bool = False
 
     def __post_init__(self) -> None:
         check_tensors(

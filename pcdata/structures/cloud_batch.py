@@ -21,18 +21,31 @@ Step = dict[str, Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudBatch(Structure):
-    """B >= 1 clouds that know their frame, their unit, where they came from and what was done to them."""
+    """B >= 1 clouds that know their frame, their unit, where they came from and what was done to them.
 
-    frame_id: str  # the coordinate frame, e.g. "camera", "base"
-    unit: str = METRE  # "m", or "normalized" after a normalisation
-    kinds: Mapping[str, Kind] = field(default_factory=dict)  # the kind of every extra field
-    viewpoint: Tensor | None = None  # (B, 3) float32 where the sensor stood; per point: extra["viewpoint"]
-    source_from_cloud: Tensor = None  # type: ignore[assignment]  # (B, 4, 4) float64, back to source_frame in metres
-    source_frame: str = ""  # the frame that source_from_cloud leads to; "" = frame_id at construction
-    frames: Mapping[str, Tensor] = field(default_factory=dict)  # frame name -> (B, 4, 4) float64 frame_from_source
-    layout: ImageLayout | None = None  # set by Deproject, kept while rows are only dropped and moved rigidly
-    meta: Sequence[Mapping[str, Any]] = ()  # per cloud, JSON-able: what was found (planes, counts, sample id)
-    history: Sequence[Sequence[Step]] = ()  # per cloud, JSON-able: what was done, in order
+    Args:
+        frame_id: the coordinate frame, e.g. "camera", "base".
+        unit: "m", or "normalized" after a normalisation.
+        kinds: the kind of every extra field.
+        viewpoint: (B, 3) float32 where the sensor stood; per point: extra["viewpoint"].
+        source_from_cloud: (B, 4, 4) float64, back to source_frame in metres.
+        source_frame: the frame that source_from_cloud leads to; "" = frame_id at construction.
+        frames: frame name -> (B, 4, 4) float64 frame_from_source.
+        layout: set by Deproject, kept while rows are only dropped and moved rigidly.
+        meta: per cloud, JSON-able: what was found (planes, counts, sample id).
+        history: per cloud, JSON-able: what was done, in order.
+    """
+
+    frame_id: str
+    unit: str = METRE
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+    viewpoint: Tensor | None = None
+    source_from_cloud: Tensor = None  # type: ignore[assignment]
+    source_frame: str = ""
+    frames: Mapping[str, Tensor] = field(default_factory=dict)
+    layout: ImageLayout | None = None
+    meta: Sequence[Mapping[str, Any]] = ()
+    history: Sequence[Sequence[Step]] = ()
 
     def kind(self, name: str) -> Kind:
         """Return the kind of a per-point field."""

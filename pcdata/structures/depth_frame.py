@@ -30,19 +30,32 @@ class DepthFrame(Structure):
 
     Depth is the z coordinate in metres; 0 means "no reading". NaN, infinite and negative depth is refused here: the
     reader cleans or rejects it, so no later step meets it.
+
+    Args:
+        depth: (V, H, W) float32 metres, 0 = no reading.
+        camera: V cameras of size (H, W).
+        colors: (V, H, W, 3) uint8 RGB.
+        labels: (V, H, W) int64, -1 = none.
+        confidence: (V, H, W) uint8, values of Confidence; None = every reading is RELIABLE.
+        mask: (V, H, W) bool, True = inside the region of interest.
+        world_from_camera: (V, 4, 4) float64 rigid.
+        frame_id: the frame that world_from_camera leads to, e.g. "base".
+        capture_index: position in the sequence.
+        sample_id: the name of the capture within its source.
+        provenance: JSON-able facts: files, unit, sensor.
     """
 
-    depth: Tensor  # (V, H, W) float32 metres, 0 = no reading
-    camera: Camera  # V cameras of size (H, W)
-    colors: Tensor | None = None  # (V, H, W, 3) uint8 RGB
-    labels: Tensor | None = None  # (V, H, W) int64, -1 = none
-    confidence: Tensor | None = None  # (V, H, W) uint8, values of Confidence; None = every reading is RELIABLE
-    mask: Tensor | None = None  # (V, H, W) bool, True = inside the region of interest
-    world_from_camera: Tensor | None = None  # (V, 4, 4) float64 rigid
-    frame_id: str | None = None  # the frame that world_from_camera leads to, e.g. "base"
-    capture_index: int = 0  # position in the sequence
+    depth: Tensor
+    camera: Camera
+    colors: Tensor | None = None
+    labels: Tensor | None = None
+    confidence: Tensor | None = None
+    mask: Tensor | None = None
+    world_from_camera: Tensor | None = None
+    frame_id: str | None = None
+    capture_index: int = 0
     sample_id: str = ""
-    provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON-able facts: files, unit, sensor
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         where = f"DepthFrame {self.sample_id!r}" if self.sample_id else "DepthFrame"

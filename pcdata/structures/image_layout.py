@@ -13,10 +13,15 @@ from pcdata.structures.structure import Structure
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImageLayout(Structure):
-    """The depth images that the clouds of a batch still lie on, row after row in pixel order."""
+    """The depth images that the clouds of a batch still lie on, row after row in pixel order.
 
-    size: tuple[int, int]  # (height, width) of every image
-    intrinsics: Tensor  # (B, 3, 3) float64, pixels
+    Args:
+        size: (height, width) of every image.
+        intrinsics: (B, 3, 3) float64, pixels.
+    """
+
+    size: tuple[int, int]
+    intrinsics: Tensor
 
 
 def within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:

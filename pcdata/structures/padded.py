@@ -18,15 +18,24 @@ class PaddedClouds(CloudBatch):
     """B clouds padded to one length M; ``mask`` says which rows are real. Made by :meth:`PointCloud.padded`.
 
     They know all that the packed clouds did: :meth:`PointCloud.from_padded` gives those back.
+
+    Args:
+        points: (B, M, 3) float32, 0 where padded.
+        mask: (B, M) bool, True = a real point.
+        colors: (B, M, 3) float32.
+        normals: (B, M, 3) float32.
+        labels: (B, M) int64, -1 where padded.
+        source_index: (B, M) int64, -1 where padded.
+        extra: name -> (B, M, ...).
     """
 
-    points: Tensor  # (B, M, 3) float32, 0 where padded
-    mask: Tensor  # (B, M) bool, True = a real point
-    colors: Tensor | None = None  # (B, M, 3) float32
-    normals: Tensor | None = None  # (B, M, 3) float32
-    labels: Tensor | None = None  # (B, M) int64, -1 where padded
-    source_index: Tensor | None = None  # (B, M) int64, -1 where padded
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (B, M, ...)
+    points: Tensor
+    mask: Tensor
+    colors: Tensor | None = None
+    normals: Tensor | None = None
+    labels: Tensor | None = None
+    source_index: Tensor | None = None
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def counts(self) -> Tensor:

@@ -31,15 +31,24 @@ class PointCloud(CloudBatch):
 
     Frozen: every method returns a new cloud and shares what did not change. Coordinates are multiplied by a matrix only
     in :meth:`transformed`, rows are picked only in :meth:`select`, so no field can be left behind.
+
+    Args:
+        points: (N, 3) float32, metres in frame_id unless unit says "normalized".
+        ptr: (B+1,) int64; None = one cloud.
+        colors: (N, 3) float32 RGB in [0, 1].
+        normals: (N, 3) float32, unit length.
+        labels: (N,) int64 object / segment id, -1 = none.
+        source_index: (N,) int64: flat pixel v*H*W + row*W + column, or row of the source file.
+        extra: name -> (N, ...), each of a kind that ``kinds`` names.
     """
 
-    points: Tensor  # (N, 3) float32, metres in frame_id unless unit says "normalized"
-    ptr: Tensor = None  # type: ignore[assignment]  # (B+1,) int64; None = one cloud
-    colors: Tensor | None = None  # (N, 3) float32 RGB in [0, 1]
-    normals: Tensor | None = None  # (N, 3) float32, unit length
-    labels: Tensor | None = None  # (N,) int64 object / segment id, -1 = none
-    source_index: Tensor | None = None  # (N,) int64: flat pixel v*H*W + row*W + column, or row of the source file
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # name -> (N, ...), each of a kind that ``kinds`` names
+    points: Tensor
+    ptr: Tensor = None  # type: ignore[assignment]
+    colors: Tensor | None = None
+    normals: Tensor | None = None
+    labels: Tensor | None = None
+    source_index: Tensor | None = None
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._fill_defaults()

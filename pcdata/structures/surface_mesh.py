@@ -14,10 +14,15 @@ from pcdata.structures.structure import Structure
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurfaceMesh(Structure):
-    """Triangles between the points of one cloud; seen from outside, their corners run counter-clockwise."""
+    """Triangles between the points of one cloud; seen from outside, their corners run counter-clockwise.
 
-    vertices: PointCloud  # a single cloud
-    triangles: Tensor  # (T, 3) int64 rows of the vertices
+    Args:
+        vertices: a single cloud.
+        triangles: (T, 3) int64 rows of the vertices.
+    """
+
+    vertices: PointCloud
+    triangles: Tensor
 
     def __post_init__(self) -> None:
         check_tensors("SurfaceMesh", {"triangles": self.triangles}, {"triangles": "T 3 : int64"})

@@ -34,17 +34,28 @@ class TSDFVolume:
     blocks the view opens, is how fields are averaged since Curless & Levoy, and merges the sheets that noise and drift
     leave; ``"everywhere"`` also removes what has moved away, by a pass over all blocks per view; ``"never"`` keeps
     every surface that any view saw. Voxels that no view saw near a surface stay unseen.
+
+    Args:
+        voxel_size: metres.
+        truncation: metres on either side of a surface; None = 5 voxels.
+        weighting: how much a reading counts; see functional.tsdf.weight_image.
+        min_confidence: readings that are less to be trusted do not count.
+        max_bytes: refuse to grow beyond.
+        device: where the voxels are stored and fusion runs.
+        backend: see pcdata.contracts.dispatch.
+        frame_id: the frame of the surface; None = that of the first frame.
+        num_views: how many views have gone in.
     """
 
-    voxel_size: float = 0.002  # metres
-    truncation: float | None = None  # metres on either side of a surface; None = 5 voxels
-    weighting: tsdf.Weighting = "constant"  # how much a reading counts; see functional.tsdf.weight_image
+    voxel_size: float = 0.002
+    truncation: float | None = None
+    weighting: tsdf.Weighting = "constant"
     carve: tsdf.Carving = "near"
-    min_confidence: Confidence | None = None  # readings that are less to be trusted do not count
-    max_bytes: int = 4 << 30  # refuse to grow beyond
+    min_confidence: Confidence | None = None
+    max_bytes: int = 4 << 30
     device: torch.device | str = "cpu"
-    backend: str = "auto"  # see pcdata.contracts.dispatch
-    frame_id: str | None = None  # the frame of the surface; None = that of the first frame
+    backend: str = "auto"
+    frame_id: str | None = None
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
     _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)

@@ -20,13 +20,19 @@ About = Literal["origin", "centroid"]
 
 
 class RandomRotation(SpatialTransform):
-    """Rotate every cloud about an axis by a random angle, or by a random rotation."""
+    """Rotate every cloud about an axis by a random angle, or by a random rotation.
+
+    Args:
+        axis: None = any rotation, uniform over all orientations.
+        degrees: angles are drawn from [-degrees, degrees).
+        about: the fixed point.
+    """
 
     is_random = True
 
-    axis: Vec3 | None = (0.0, 0.0, 1.0)  # None = any rotation, uniform over all orientations
-    degrees: Annotated[float, Interval(ge=0, le=180)] = 180.0  # angles are drawn from [-degrees, degrees)
-    about: About = "origin"  # the fixed point
+    axis: Vec3 | None = (0.0, 0.0, 1.0)
+    degrees: Annotated[float, Interval(ge=0, le=180)] = 180.0
+    about: About = "origin"
 
     def check_fields(self) -> None:
         """Require a direction, and no angle where there is no axis to measure it about."""
@@ -64,14 +70,21 @@ class RandomTranslation(SpatialTransform):
 
 
 class RandomScale(SpatialTransform):
-    """Scale every cloud by a random factor; the unit stays, so objects really become larger or smaller."""
+    """Scale every cloud by a random factor; the unit stays, so objects really become larger or smaller.
+
+    Args:
+        low: smallest factor.
+        high: largest factor.
+        about: the point that stays: the origin, or the centroid of each cloud.
+        per_axis: a factor for every axis instead of one for all.
+    """
 
     is_random = True
 
     low: Positive = 0.9
     high: Positive = 1.1
     about: About = "origin"
-    per_axis: bool = False  # a factor for every axis instead of one for all
+    per_axis: bool = False
 
     def check_fields(self) -> None:
         """Require low <= high."""
@@ -88,11 +101,15 @@ class RandomFlip(SpatialTransform):
     """Mirror every cloud along each axis with a probability.
 
     A mirrored scene has mirrored objects: poses (grasps) cannot follow, and ``rigid.map_poses`` refuses them.
+
+    Args:
+        probability: that x, y and z are mirrored, each drawn by itself.
+        about: the point that stays: the origin, or the centroid of each cloud.
     """
 
     is_random = True
 
-    probability: tuple[Fraction, Fraction, Fraction] = (0.5, 0.0, 0.0)  # for x, y, z
+    probability: tuple[Fraction, Fraction, Fraction] = (0.5, 0.0, 0.0)
     about: About = "origin"
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:

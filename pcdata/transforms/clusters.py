@@ -30,16 +30,23 @@ class ClusterObjects(Transform):
 
     Warns:
         LeftOutWarning: a cluster is larger than ``max_size``.
+
+    Args:
+        eps: points closer than this are neighbours.
+        min_points: neighbours, the point itself included, that make a core point.
+        min_size: smaller clusters are not objects.
+        max_size: larger clusters are not objects.
+        keep: "all": keep the whole scene, with -1 where no object is.
     """
 
     runs_statistics = True
     version = 2
 
-    eps: Metres = 0.02  # points closer than this are neighbours
-    min_points: Count = 50  # neighbours, the point itself included, that make a core point
-    min_size: Count = 100  # smaller clusters are not objects
-    max_size: Count = 50_000  # larger clusters are not objects
-    keep: Literal["objects", "all"] = "objects"  # "all": keep the whole scene, with -1 where no object is
+    eps: Metres = 0.02
+    min_points: Count = 50
+    min_size: Count = 100
+    max_size: Count = 50_000
+    keep: Literal["objects", "all"] = "objects"
 
     def check_fields(self) -> None:
         """Require min_size <= max_size."""

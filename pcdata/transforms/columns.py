@@ -23,9 +23,12 @@ class ShiftToOrigin(SpatialTransform):
 
     The z axis must point up. The box's extents go into meta as ``extent``; the frame becomes ``<frame>/corner`` or
     ``<frame>/floor``.
+
+    Args:
+        anchor: corner: smallest x, y, z; floor: middle of x and y, smallest z.
     """
 
-    anchor: Literal["corner", "floor"]  # corner: smallest x, y, z; floor: middle of x and y, smallest z
+    anchor: Literal["corner", "floor"]
 
     def frame_after(self, frame: str | None) -> str | None:
         """Name the shifted frame."""
@@ -57,14 +60,18 @@ class RandomColumn(Transform):
     Columns with fewer than ``min_points`` are drawn again, 100 times at most. The point goes into meta as
     ``column_center``; the coordinates stay.
 
+    Args:
+        size: edge length in x and y.
+        min_points: the S3DIS loaders draw on until a column has more than 1024.
+
     Raises:
         TooFewPointsError: no column has enough points.
     """
 
     is_random = True
 
-    size: Metres = 1.0  # edge length in x and y
-    min_points: Count = 1025  # the S3DIS loaders draw on until a column has more than 1024
+    size: Metres = 1.0
+    min_points: Count = 1025
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw until a column is full enough."""

@@ -38,6 +38,9 @@ class CompleteDepth(Transform):
     and weights as they were at construction (not of the code of ``forward``). Such a configuration can be read,
     compared and used to load a cache, but to run the step again, make it in Python with the module.
 
+    Args:
+        reach: pixels along each axis to a trusted reading, within which a result counts as COMPLETED.
+
     Raises:
         ConfigError: the step was read from a configuration and the module is not at hand.
         CaptureError: the module needs colours and the capture has none.
@@ -48,7 +51,7 @@ class CompleteDepth(Transform):
     gives = DepthFrame
 
     completion: nn.Module | str
-    reach: Count = 10  # pixels
+    reach: Count = 10
 
     def check_fields(self) -> None:
         """Find the module, and take its identity once: hashing weights on every capture would be slow."""

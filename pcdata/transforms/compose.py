@@ -115,7 +115,11 @@ class Compose(Transform):
 
 
 class RandomApply(Transform):
-    """Apply a transform to each cloud with a probability."""
+    """Apply a transform to each cloud with a probability.
+
+    Args:
+        step: what is applied, from clouds to clouds.
+    """
 
     is_random = True
 

@@ -14,7 +14,11 @@ from pcdata.transforms.fields import ConfidenceName, confidence_named
 
 
 class KeepConfidence(SelectTransform):
-    """Drop points that are less to be trusted than a level; ``MaskDepth(min_confidence=...)`` does so in the image."""
+    """Drop points that are less to be trusted than a level; ``MaskDepth(min_confidence=...)`` does so in the image.
+
+    Args:
+        minimum: the least confidence that stays.
+    """
 
     minimum: ConfidenceName = "reliable"
 

@@ -19,14 +19,20 @@ class CropWorkspace(SelectTransform):
 
     The box is axis-aligned in ``frame``; with ``frame_from_box`` it is axis-aligned in its own coordinates and stands
     in the frame at that pose (an oriented box).
+
+    Args:
+        frame: the frame that the box is given in.
+        lower: metres, smallest x, y, z.
+        upper: metres, largest x, y, z.
+        frame_from_box: rigid pose of an oriented box; None = aligned with the frame.
     """
 
     needs_metres = True
 
-    frame: Name  # the frame that the box is given in
-    lower: Vec3  # metres, smallest x, y, z
-    upper: Vec3  # metres, largest x, y, z
-    frame_from_box: Matrix4 | None = None  # rigid pose of an oriented box; None = aligned with the frame
+    frame: Name
+    lower: Vec3
+    upper: Vec3
+    frame_from_box: Matrix4 | None = None
 
     def check_fields(self) -> None:
         """Require lower < upper and a rigid pose."""

@@ -17,7 +17,16 @@ from pcdata.transforms.fields import ConfidenceName, FromSensor, Metres, confide
 
 
 class MaskDepth(Transform):
-    """Set depth to "no reading" outside a range, outside the frame's mask, on unwanted labels or below a confidence."""
+    """Set depth to "no reading" outside a range, outside the frame's mask, on unwanted labels or below a confidence.
+
+    Args:
+        near: metres; nearer readings go. None = no bound.
+        far: metres; readings beyond go. None = no bound.
+        use_mask: drop pixels outside frame.mask where the capture has one.
+        require_mask: refuse a capture without a mask.
+        drop_labels: drop pixels with these labels.
+        min_confidence: drop pixels that are less to be trusted.
+    """
 
     takes = DepthFrame
     gives = DepthFrame
@@ -25,10 +34,10 @@ class MaskDepth(Transform):
     # Readings closer than near or beyond far are dropped.
     near: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[0])] = None
     far: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[1])] = None
-    use_mask: bool = True  # drop pixels outside frame.mask where the capture has one
-    require_mask: bool = False  # refuse a capture without a mask
-    drop_labels: Sequence[int] = ()  # drop pixels with these labels
-    min_confidence: ConfidenceName | None = None  # drop pixels that are less to be trusted
+    use_mask: bool = True
+    require_mask: bool = False
+    drop_labels: Sequence[int] = ()
+    min_confidence: ConfidenceName | None = None
 
     def check_fields(self) -> None:
         """Require near < far."""

@@ -21,16 +21,23 @@ class SpatialFilterDepth(Transform):
     """Smooth surfaces and keep edges, in disparity, with the parameters of librealsense's spatial filter.
 
     The focal length is fx of the frame's camera. Pixels filled by ``hole_fill_radius`` are COMPLETED.
+
+    Args:
+        alpha: weight of the pixel itself; 1 = no smoothing.
+        delta: 1/32 pixel of disparity: the smallest step that is an edge.
+        iterations: how often the filter runs along rows and columns.
+        hole_fill_radius: pixels filled from both ends of every gap in a row.
+        baseline: between the two imagers; it scales what delta means.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
-    alpha: Annotated[float, Gt(0), Le(1)] = 0.5  # weight of the pixel itself; 1 = no smoothing
-    delta: Positive = 20.0  # 1/32 pixel of disparity: the smallest step that is an edge
+    alpha: Annotated[float, Gt(0), Le(1)] = 0.5
+    delta: Positive = 20.0
     iterations: Count = 2
-    hole_fill_radius: Annotated[int, Ge(0)] = 0  # pixels filled from both ends of every gap in a row
-    baseline: Metres = 0.05  # between the two imagers; it scales what delta means
+    hole_fill_radius: Annotated[int, Ge(0)] = 0
+    baseline: Metres = 0.05
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Filter all views in one call."""
@@ -48,14 +55,19 @@ class FillHoles(Transform):
 
     Filled pixels are marked in the confidence: COMPLETED up to ``max_distance`` pixels from the reading they copy,
     HALLUCINATED beyond.
+
+    Args:
+        rule: which neighbor fills a hole.
+        max_size: only where no square of this many pixels + 1 without a reading fits; None = all.
+        max_distance: pixels to the nearest reading, up to which holes are filled.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
     rule: Literal["left", "farthest", "nearest"] = "farthest"
-    max_size: Count | None = None  # only where no square of this many pixels + 1 without a reading fits; None = all
-    max_distance: Count = 8  # pixels
+    max_size: Count | None = None
+    max_distance: Count = 8
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Fill all views in one call."""
@@ -67,6 +79,10 @@ class RemoveFlyingPixels(Transform):
     """Set readings to "no reading" that hang between two surfaces at a depth edge.
 
     Cheap enough for every frame, and best done before any filter that averages or fills: those would spread them.
+
+    Args:
+        tolerance: how far a reading may be off the plane through its neighbors, as a part of its depth.
+        min_neighbors: of the eight, on the reading's own surface.
     """
 
     takes = DepthFrame
@@ -74,7 +90,7 @@ class RemoveFlyingPixels(Transform):
 
     # As a part of the depth: neighbours that differ more lie on two surfaces.
     tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02
-    min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3  # of the eight, on the reading's own surface
+    min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Blank the flying pixels of all views."""

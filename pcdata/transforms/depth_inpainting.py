@@ -28,12 +28,15 @@ class InpaintDepth(Transform):
 
     Source: Bertalmio, Bertozzi & Sapiro, Navier-Stokes, fluid dynamics, and image and video inpainting, 2001; the use
     on depth is that of dougsm/ggcnn, ``utils/dataset_processing/image.py`` (DepthImage.inpaint).
+
+    Args:
+        max_distance: pixels to the nearest reading, up to which holes are filled.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
-    max_distance: Count = 8  # pixels
+    max_distance: Count = 8
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Fill view by view."""

@@ -20,6 +20,9 @@ from pcdata.transforms.fields import Count, Positive
 class CropCenter(Transform):
     """Keep the window in the middle of the images, pixel for pixel; an odd margin is smaller above and left.
 
+    Args:
+        size: (height, width) of the part that stays, in pixels.
+
     Raises:
         ShapeError: the window is larger than the images.
     """
@@ -27,7 +30,7 @@ class CropCenter(Transform):
     takes = DepthFrame
     gives = DepthFrame
 
-    size: tuple[Count, Count]  # (height, width) in pixels
+    size: tuple[Count, Count]
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Cut every image and move the principal point."""
@@ -52,14 +55,18 @@ class DecimateDepth(Transform):
 
     Labels, confidence and mask are those of the pixel with the median reading, so they describe the surface that stays;
     colours are averaged over the block.
+
+    Args:
+        rule: what becomes of a block; the mean mixes the surfaces that meet in it.
+        max_jump: as a part of the depth: what differs more is another surface.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
     factor: Annotated[int, Interval(ge=2, le=MAX_FACTOR)] = 2
-    rule: Literal["median", "mean"] = "median"  # the mean mixes the surfaces that meet in a block
-    max_jump: Positive = 0.02  # as a part of the depth: what differs more is another surface
+    rule: Literal["median", "mean"] = "median"
+    max_jump: Positive = 0.02
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Reduce every image and rewrite the intrinsics."""
@@ -81,13 +88,17 @@ class ResizeDepth(Transform):
     Depth on one surface is interpolated, exactly on planes; across edges, beside holes, and everywhere if ``max_jump``
     is None, a pixel takes the nearest reading, up to half a pixel off. Labels, confidence and mask are those of the
     nearest pixel; colours are filtered against aliasing.
+
+    Args:
+        size: (height, width) of the result, in pixels.
+        max_jump: as a part of the depth: what differs more is another surface.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
-    size: tuple[Count, Count]  # (height, width)
-    max_jump: Positive | None = 0.02  # as a part of the depth: what differs more is another surface
+    size: tuple[Count, Count]
+    max_jump: Positive | None = 0.02
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Resize every image and rewrite the intrinsics; images of that size stay."""

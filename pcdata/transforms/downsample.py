@@ -26,12 +26,17 @@ class VoxelDownsample(Transform):
     decided by vote (the lowest wins a tie); confidence is their lowest, as an average is no better than its parts;
     ``source_index`` is that of the first point in the voxel. Give the voxel size, or the count to reach: then every
     cloud gets the largest size that leaves at least so many points.
+
+    Args:
+        voxel_size: edge length of the voxels, in `unit`.
+        num_points: wanted count instead of a size.
+        unit: of voxel_size; a cloud in another one is refused.
     """
 
     # Edge length, in `unit`.
     voxel_size: Annotated[Metres | None, FromSensor(SensorProfile.voxel_size)] = None
-    num_points: Count | None = None  # wanted count instead of a size
-    unit: Unit = "m"  # of voxel_size; a cloud in another one is refused
+    num_points: Count | None = None
+    unit: Unit = "m"
 
     def check_fields(self) -> None:
         """Require exactly one of the two."""
@@ -58,10 +63,15 @@ class VoxelDownsample(Transform):
 
 
 class _Sample(SelectTransform, abstract=True):
-    """A sampler with a fixed count and a stated answer to "too few points"."""
+    """A sampler with a fixed count and a stated answer to "too few points".
+
+    Args:
+        num_points: points per cloud in the result.
+        if_short: repeat / tile: duplicate points; zeros: zero rows; keep: give fewer.
+    """
 
     num_points: Count
-    if_short: IfShort = "error"  # repeat / tile: duplicate points; zeros: zero rows; keep: give fewer
+    if_short: IfShort = "error"
 
     def wanted_counts(self, cloud: PointCloud, streams: Streams) -> list[int]:
         """The wanted count of every cloud."""
@@ -129,11 +139,14 @@ class RandomSample(_Sample):
     and thin or far objects may get none. FarthestPointSample covers evenly. A short cloud is filled up with random
     duplicates (``if_short: repeat``) or with the same permutation again (``tile``). With replacement every row is drawn
     anew, so no cloud but an empty one is short; some loaders do so even where there are enough points.
+
+    Args:
+        with_replacement: draw every row anew: about a third of the points of a full cloud come twice.
     """
 
     is_random = True
 
-    with_replacement: bool = False  # draw every row anew: about a third of the points of a full cloud come twice
+    with_replacement: bool = False
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw short clouds too with replacement, unless they are to get zero rows or to stay short."""

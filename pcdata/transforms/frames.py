@@ -24,13 +24,18 @@ class ToFrame(SpatialTransform):
     """Bring clouds into a named coordinate frame, by the capture's own poses or by a matrix from a calibration.
 
     Clouds that are in the frame already stay as they are; a matrix refuses them, since it would be applied twice.
+
+    Args:
+        frame: the frame to go to.
+        matrix: rigid frame_from_start, rows of 4; None = the pose that came with the capture.
+        start: the frame that the matrix starts from; given with it.
     """
 
     needs_metres = True
 
-    frame: Name  # the frame to go to
-    matrix: Matrix4 | None = None  # rigid frame_from_start, rows of 4; None = the pose that came with the capture
-    start: Name | None = None  # the frame that the matrix starts from; given with it
+    frame: Name
+    matrix: Matrix4 | None = None
+    start: Name | None = None
 
     def check_fields(self) -> None:
         """Require matrix and start together, and a rigid matrix."""
@@ -86,14 +91,18 @@ class MergeViews(Transform):
 
     Where views overlap the surface is there several times. With a voxel size, each voxel keeps the points of one view
     alone: of the view that put most points into it, the first of equals; so its points stay readings, none is averaged.
+
+    Args:
+        voxel_size: edge of the voxels in which views compete; None = keep every point.
+        face_cameras: turn normals towards the camera that saw the point.
     """
 
     needs_metres = True
     keeps_clouds = False
     version = 2
 
-    voxel_size: Metres | None = None  # edge of the voxels in which views compete; None = keep every point
-    face_cameras: bool = True  # turn normals towards the camera that saw the point
+    voxel_size: Metres | None = None
+    face_cameras: bool = True
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""

@@ -19,20 +19,30 @@ class FuseTSDF(Transform):
     Replaces Deproject, ToFrame and MergeViews where views overlap: noise is averaged, the overlap is there once, and
     every point has a normal. One cloud comes out, with ``num_views`` and ``weight`` per point. Points that no pixel
     gave have no ``source_index``. ``meta["fusion"]`` says how many ``min_weight`` dropped.
+
+    Args:
+        frame: the frame that the capture's poses lead to; a capture with others is refused.
+        voxel_size: metres between the samples of the field.
+        truncation: metres to each side of a surface where a reading counts; None = five voxels.
+        weighting: how much a reading counts; see TSDFVolume.
+        carve: what views see through is worn away; see TSDFVolume.
+        min_weight: of a point; with constant weights n asks for n views.
+        min_confidence: leave out readings that are less to be trusted.
+        max_megabytes: refuse to take more memory.
     """
 
     takes = DepthFrame
     gives = PointCloud
 
-    frame: Name  # the frame that the capture's poses lead to; a capture with others is refused
+    frame: Name
     voxel_size: Annotated[Metres, FromSensor(SensorProfile.voxel_size)] = 0.002
     # On either side of the surface; None = 5 voxels. Three standard deviations of the noise should fit.
     truncation: Metres | None = None
     weighting: Weighting = "constant"
-    carve: Carving = "near"  # what views see through is worn away; see TSDFVolume
-    min_weight: NonNegative = 0.0  # of a point; with constant weights n asks for n views
-    min_confidence: ConfidenceName | None = None  # leave out readings that are less to be trusted
-    max_megabytes: Count = 4096  # refuse to take more memory
+    carve: Carving = "near"
+    min_weight: NonNegative = 0.0
+    min_confidence: ConfidenceName | None = None
+    max_megabytes: Count = 4096
 
     def frame_given(self) -> str:
         """The frame that the poses lead to."""

@@ -16,12 +16,17 @@ from pcdata.transforms.fields import Fraction, NonNegative, Positive
 
 
 class RandomJitter(Transform):
-    """Add independent Gaussian noise to every point, in the cloud's unit; ``source_from_cloud`` does not undo it."""
+    """Add independent Gaussian noise to every point, in the cloud's unit; ``source_from_cloud`` does not undo it.
+
+    Args:
+        sigma: standard deviation per axis.
+        clip: the largest change per axis; None = unlimited.
+    """
 
     is_random = True
 
-    sigma: NonNegative = 0.001  # standard deviation per axis
-    clip: Positive | None = None  # the largest change per axis; None = unlimited
+    sigma: NonNegative = 0.001
+    clip: Positive | None = None
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw a seed per cloud: with it the noise can be drawn again exactly."""
@@ -39,7 +44,12 @@ class RandomJitter(Transform):
 
 
 class RandomPointDropout(SelectTransform):
-    """Drop a random fraction of every cloud's points, keeping their order; at least one point stays."""
+    """Drop a random fraction of every cloud's points, keeping their order; at least one point stays.
+
+    Args:
+        low: smallest part of the points that is dropped.
+        high: largest part of the points that is dropped.
+    """
 
     is_random = True
 

@@ -37,13 +37,19 @@ class NormalizeUnitSphere(SpatialTransform):
 
 
 class NormalizeWorkspace(SpatialTransform):
-    """Map a box given in a named frame to [-1, 1] on every axis."""
+    """Map a box given in a named frame to [-1, 1] on every axis.
+
+    Args:
+        frame: the frame that the box is given in.
+        lower: metres, smallest x, y, z.
+        upper: metres, largest x, y, z.
+    """
 
     needs_metres = True
 
-    frame: Name  # the frame that the box is given in
-    lower: Vec3  # metres, smallest x, y, z
-    upper: Vec3  # metres, largest x, y, z
+    frame: Name
+    lower: Vec3
+    upper: Vec3
 
     def check_fields(self) -> None:
         """Require lower < upper."""

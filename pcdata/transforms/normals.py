@@ -16,13 +16,17 @@ class EstimateNormals(Transform):
     """Fit a plane to the nearest neighbours within a radius; replaces any normals the cloud had.
 
     After merging, every point's normal faces the camera that saw that point.
+
+    Args:
+        max_neighbors: the nearest within the radius, the point itself among them.
+        orient: "none": the sign is arbitrary but repeatable.
     """
 
     runs_statistics = True
 
     radius: Metres = 0.02
-    max_neighbors: Count = 30  # the nearest within the radius, the point itself among them
-    orient: Literal["viewpoint", "none"] = "viewpoint"  # "none": the sign is arbitrary but repeatable
+    max_neighbors: Count = 30
+    orient: Literal["viewpoint", "none"] = "viewpoint"
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Estimate from the points of each cloud alone."""

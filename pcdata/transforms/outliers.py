@@ -17,12 +17,17 @@ from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
 
 
 class RemoveStatisticalOutliers(SelectTransform):
-    """Drop points whose mean distance to their nearest neighbours is unusual for their cloud (Open3D's rule)."""
+    """Drop points whose mean distance to their nearest neighbours is unusual for their cloud (Open3D's rule).
+
+    Args:
+        num_neighbors: nearest neighbours, the point itself among them.
+        std_ratio: standard deviations above the cloud's mean that are still usual.
+    """
 
     runs_statistics = True
 
-    num_neighbors: Count = 20  # nearest neighbours, the point itself among them
-    std_ratio: Positive = 2.0  # standard deviations above the cloud's mean that are still usual
+    num_neighbors: Count = 20
+    std_ratio: Positive = 2.0
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""

@@ -31,6 +31,14 @@ class RemovePlane(SelectTransform):
     :func:`planes_in_cloud` gives it in the cloud's present coordinates. ``faces`` says what its normal was turned to:
     ``up``, the ``origin`` of the frame it was found in, or ``neither side`` of a plane through that origin.
 
+    Args:
+        distance: inliers are closer to the plane than this.
+        num_hypotheses: planes tried through three points each.
+        seed: of the hypotheses: the same cloud always gives the same plane.
+        up: the normal's rough direction in `frame`; None = any, facing the origin of the frame.
+        frame: the frame that `up` is given in; given with it.
+        max_tilt: radians between normal and up at most.
+
     Raises:
         ConfigError: ``keep="above"`` where the plane passes the origin and no ``up`` is given, or holds ``up``.
     """
@@ -38,14 +46,14 @@ class RemovePlane(SelectTransform):
     runs_statistics = True
     version = 2
 
-    distance: Metres = 0.01  # inliers are closer to the plane than this
+    distance: Metres = 0.01
     num_hypotheses: Count = 1000
-    seed: int = 0  # of the hypotheses: the same cloud always gives the same plane
+    seed: int = 0
     # "above": also drop what lies beyond the plane, seen along its normal; then the plane must have an upper side.
     keep: Literal["both", "above"] = "both"
-    up: Vec3 | None = None  # the normal's rough direction in `frame`; None = any, facing the origin of the frame
-    frame: Name | None = None  # the frame that `up` is given in; given with it
-    max_tilt: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = None  # radians between normal and up at most
+    up: Vec3 | None = None
+    frame: Name | None = None
+    max_tilt: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = None
 
     def check_fields(self) -> None:
         """Require up and frame together, and up for max_tilt."""

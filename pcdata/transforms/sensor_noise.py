@@ -48,18 +48,26 @@ class RandomSensorNoise(Transform):
     what is there.
 
     Source: Nguyen et al., Modeling Kinect sensor noise, 2012, for which effects there are; the sizes are the profile's.
+
+    Args:
+        sensor: a name that `pcdata profiles` lists.
+        strength: times the profile's standard deviation.
+        flying_pixels: of the pixels at an edge: they read a mixture of both sides.
+        edge_dropout: of the pixels at an edge: they read nothing.
+        dropout: of all pixels: they read nothing.
+        grazing_degrees: 0 = a surface facing the sensor; 90 = off.
     """
 
     is_random = True
     takes = DepthFrame
     gives = DepthFrame
 
-    sensor: Annotated[Name, FromSensor(lambda sensor, _: sensor.name)]  # a name that `pcdata profiles` lists
-    strength: NonNegative = 1.0  # times the profile's standard deviation
-    flying_pixels: Fraction = 0.1  # of the pixels at an edge: they read a mixture of both sides
-    edge_dropout: Fraction = 0.4  # of the pixels at an edge: they read nothing
-    dropout: Fraction = 0.005  # of all pixels: they read nothing
-    grazing_degrees: Annotated[float, Interval(gt=0, le=90)] = 80.0  # 0 = a surface facing the sensor; 90 = off
+    sensor: Annotated[Name, FromSensor(lambda sensor, _: sensor.name)]
+    strength: NonNegative = 1.0
+    flying_pixels: Fraction = 0.1
+    edge_dropout: Fraction = 0.4
+    dropout: Fraction = 0.005
+    grazing_degrees: Annotated[float, Interval(gt=0, le=90)] = 80.0
 
     def check_fields(self) -> None:
         """Require a depth camera."""

@@ -35,14 +35,19 @@ class MarkUnreliableDepth(Transform):
     depth is smooth: the camera's filters were on); of the 728,267 and 668,370 good ones 8 % and 6 % are lost. The other
     wrong ones show the table through a bottle, as smooth as the table beside it: depth alone cannot tell. For certainty
     give the objects' mask.
+
+    Args:
+        sensor: a name that `pcdata profiles` lists.
+        enclosed: look for readings enclosed by holes.
+        rough: look for readings rougher than the sensor's noise.
     """
 
     takes = DepthFrame
     gives = DepthFrame
 
-    sensor: Annotated[Name, FromSensor(lambda sensor, _: sensor.name)]  # a name that `pcdata profiles` lists
-    enclosed: bool = True  # look for readings enclosed by holes
-    rough: bool = True  # look for readings rougher than the sensor's noise
+    sensor: Annotated[Name, FromSensor(lambda sensor, _: sensor.name)]
+    enclosed: bool = True
+    rough: bool = True
 
     def check_fields(self) -> None:
         """Require a depth camera."""

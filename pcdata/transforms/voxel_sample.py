@@ -20,10 +20,15 @@ def voxel_cells(points: Tensor, voxel_size: float) -> Tensor:
 
 
 class VoxelSample(SelectTransform):
-    """Keep the first point of every occupied voxel of a grid through the origin; nothing is averaged."""
+    """Keep the first point of every occupied voxel of a grid through the origin; nothing is averaged.
 
-    voxel_size: Positive  # edge length, in `unit`
-    unit: Unit = "m"  # of voxel_size; a cloud in another one is refused
+    Args:
+        voxel_size: edge length, in `unit`.
+        unit: of voxel_size; a cloud in another one is refused.
+    """
+
+    voxel_size: Positive
+    unit: Unit = "m"
 
     def unit_needed(self) -> str:
         """The unit of the voxel size."""

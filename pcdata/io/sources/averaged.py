@@ -26,6 +26,13 @@ class AveragedSource:
     Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
     readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras
     are told by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
+
+    Args:
+        mad_factor: as in average_depth.
+        resolution: as in average_depth.
+        max_jump: as in average_depth.
+        min_count: as in average_depth.
+        max_moving: the part of all readings that may jump before something must have moved.
     """
 
     source: CaptureSource
@@ -34,7 +41,7 @@ class AveragedSource:
     resolution: float = 0.001
     max_jump: float = 0.03
     min_count: int = 3
-    max_moving: float = 0.01  # the part of all readings that may jump before something must have moved
+    max_moving: float = 0.01
 
     def __post_init__(self) -> None:
         if self.num_frames < 2 or not 1 <= self.min_count <= self.num_frames or not 0 <= self.max_moving <= 1:

@@ -19,12 +19,18 @@ class TemporalFilterDepth:
 
     Holds numbers only: what is remembered goes from call to call as a ``TemporalState``, so one filter serves any
     number of streams, and None starts anew. It is no ``Transform``: a frame's result depends on the frames before.
+
+    Args:
+        alpha: weight of the new reading; 1 = no averaging.
+        delta: 1/32 pixel of disparity: the smallest change that is another surface.
+        persistence: 0..8: when a pixel without a reading repeats its last one; see PERSISTENCE_RULES.
+        baseline: metres between the two imagers; it scales what delta means.
     """
 
-    alpha: float = 0.4  # weight of the new reading; 1 = no averaging
-    delta: float = 20.0  # 1/32 pixel of disparity: the smallest change that is another surface
-    persistence: int = 3  # 0..8: when a pixel without a reading repeats its last one; see PERSISTENCE_RULES
-    baseline: float = 0.05  # metres between the two imagers; it scales what delta means
+    alpha: float = 0.4
+    delta: float = 20.0
+    persistence: int = 3
+    baseline: float = 0.05
 
     def __post_init__(self) -> None:
         in_range = 0 < self.alpha <= 1 and self.delta > 0 and self.baseline > 0
@@ -72,6 +78,10 @@ class TemporallyFilteredSource:
 
     A window instead of all the past: every sample can be loaded alone, in any order and by any worker, with the same
     result. After 12 frames the weight of older ones is below 0.4 % at the default alpha, and persistence looks at 8.
+
+    Args:
+        source: the captures, in the order of time.
+        filter: the settings of the filter.
     """
 
     source: CaptureSource
