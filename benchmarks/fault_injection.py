@@ -30,8 +30,9 @@ from pcdata.io import open_source
 from pcdata.report import text_table
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
-from pcdata.validation import Check, Verdict, check_of_error, validate_frame, validate_source
+from pcdata.validation import check_of_error, validate_frame, validate_source
 from pcdata.validation.measures import edge_votes, offset_from_votes
+from pcdata.verdicts import Finding, Verdict
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "fault_injection.json"
@@ -79,7 +80,7 @@ def file_faults(frames: Captures) -> Iterator[Row]:
                 inject(folder)
                 try:
                     source = open_source(folder)
-                    found = [check for report in validate_source(source) for check in report.checks]
+                    found = [check for report in validate_source(source) for check in report.findings]
                 except PcdataError as error:
                     found = [check_of_error(error)]
             count(row, found, check)
@@ -89,23 +90,23 @@ def file_faults(frames: Captures) -> Iterator[Row]:
 # -- measuring ---------------------------------------------------------------------------------------------------------
 
 
-def judge(recording: Recording, frames: Captures, check: str) -> list[Check]:
+def judge(recording: Recording, frames: Captures, check: str) -> list[Finding]:
     """Run what the fault needs: the series of captures where only that can tell, else the first capture alone."""
     needs_series = check in ("repeated_depth", "repeated_color") or (
         check == "pose_direction" and frames[0].num_views == 1
     )
     if needs_series:
         reports = list(validate_source(Frames(frames), limits=recording.limits))
-        return [one for report in reports for one in report.checks]
+        return [one for report in reports for one in report.findings]
     needs_views = check.startswith("view_") or check == "pose_direction"
     return validate_frame(frames[0] if needs_views else frames[0].view(0), limits=recording.limits)
 
 
-def count(row: Row, checks: Sequence[Check], name: str) -> None:
+def count(row: Row, checks: Sequence[Finding], name: str) -> None:
     verdicts = {check.verdict for check in checks if check.name in name.split(" or ")}
     if Verdict.FAIL in verdicts:
         row.caught += 1
-    elif Verdict.WARN in verdicts:
+    elif verdicts & {Verdict.WARN, Verdict.UNKNOWN}:
         row.warned += 1
     else:
         row.missed += 1
@@ -118,7 +119,7 @@ def run(recordings: Sequence[Recording], kind: str) -> tuple[list[Row], Counter[
     for recording in recordings:
         for report in validate_source(Frames(recording.frames), limits=recording.limits):
             clean["captures"] += report.sample_id != "*"
-            for check in report.checks:
+            for check in report.findings:
                 clean["checks"] += 1
                 if check.verdict is not Verdict.PASS:
                     alarms.setdefault(check.name, Counter())[

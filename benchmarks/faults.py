@@ -17,7 +17,7 @@ from pcdata.io import open_source, read_depth, read_pcd, write_color, write_dept
 from pcdata.rng import seeded
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, tabletop
-from pcdata.validation import Limits
+from pcdata.validation import CaptureLimits
 
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7071, 0.7071), (-0.7071, -0.7071))
 
@@ -30,7 +30,7 @@ class Recording:
 
     name: str
     frames: Captures
-    limits: Limits = field(default_factory=Limits)
+    limits: CaptureLimits = field(default_factory=CaptureLimits)
     checks: frozenset[str] = frozenset()  # that can be told at all; empty = every one
 
 
@@ -65,7 +65,7 @@ def real(folder: Path) -> Iterator[Recording]:
     frames = open_source(folder / "graspnet_frame")
     yield Recording("graspnet_frame", [frames.load(name) for name in frames.ids])
     scenes = open_source(folder / "seven_scenes")
-    office = Limits(workspace=(0.3, 5.0))
+    office = CaptureLimits(workspace=(0.3, 5.0))
     for begin in range(0, 50, 10):
         recording = [scenes.load(name) for name in scenes.ids[begin : begin + 10]]
         yield Recording(f"seven_scenes {begin}", recording, office)

@@ -40,6 +40,7 @@ from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from pcdata.validation import verify_overlap
 from pcdata.validation.measures.surfaces import surfaces_of
+from pcdata.verdicts import Verdict
 
 RESULT = Path(__file__).parent / "results" / "overlap.json"
 ERRORS = ((0, 0), (2, 0), (4, 0), (6, 0), (10, 0), (0, 0.25), (0, 0.5), (0, 1.0))  # mm, degrees
@@ -107,7 +108,7 @@ def detection(scenes: list[Tabletop]) -> list[dict[str, Any]]:
                 "views": scenes[0].frame.num_views,
                 "mm": millimetres,
                 "degrees": degrees,
-                **{name: verdicts[name] for name in ("pass", "not measurable", "warn", "fail")},
+                **{name: verdicts[name] for name in Verdict},
                 "right_camera_named": named,
                 "wrong_camera_named": misnamed,
                 "measured_median": round(statistics.median(off), 3),

@@ -30,8 +30,9 @@ from pcdata.io import read_pcd
 from pcdata.io.images.reading import check_plausible
 from pcdata.report import text_table
 from pcdata.synthetic import look_at, tabletop
-from pcdata.validation import Limits, Verdict
+from pcdata.validation import CaptureLimits
 from pcdata.validation.checks.depth_unit import depth_unit_check
+from pcdata.verdicts import Verdict
 
 RESULTS = Path(__file__).parent / "results" / "unit_advice.json"
 UNITS = [
@@ -106,7 +107,7 @@ def stored_as(metres: NDArray[np.float64], unit: DepthUnit) -> NDArray[Any] | No
 
 
 def judge_once(
-    seen: dict[DepthUnit, Judgement], stored: NDArray[Any], focal: float, limits: Limits, unit: DepthUnit
+    seen: dict[DepthUnit, Judgement], stored: NDArray[Any], focal: float, limits: CaptureLimits, unit: DepthUnit
 ) -> Judgement:
     """Judge a unit, the first time that it is asked for."""
     if unit not in seen:
@@ -114,7 +115,7 @@ def judge_once(
     return seen[unit]
 
 
-def judge(stored: NDArray[Any], unit: DepthUnit, focal: float, limits: Limits) -> Judgement:
+def judge(stored: NDArray[Any], unit: DepthUnit, focal: float, limits: CaptureLimits) -> Judgement:
     """Return the verdict on a declared unit, the words, and the median in metres."""
     if stored.dtype != np.uint16 and unit.encoding != "plain":
         return Verdict.FAIL, "", float("nan")  # refused by the reader: floats have no order of bits
@@ -139,7 +140,7 @@ def main() -> None:
     counts: dict[tuple[str, str, str], Counter[str]] = {}
     wrong = []
     for scene in scenes:
-        limits = Limits(workspace=(0.3, 6.0)) if scene.name.startswith(("room", "seven")) else Limits()
+        limits = CaptureLimits(workspace=(0.3, 6.0)) if scene.name.startswith(("room", "seven")) else CaptureLimits()
         for true in UNITS:
             stored = stored_as(scene.metres, true)
             if stored is None or not (stored > 0).any():

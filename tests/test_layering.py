@@ -22,6 +22,7 @@ LAYERS = [
     {"geometry"},
     {"functional"},
     {"kernels"},  # registers beside the functions, which load it by name when it is first asked for
+    {"verdicts"},
     {"structures"},
     {"alignment", "sensors"},
     {"yaml_nodes"},
@@ -48,6 +49,7 @@ OUTSIDE = {
     "geometry": {"torch", "numpy"},
     "functional": {"torch", "numpy"},
     "kernels": {"torch", "numpy"},
+    "verdicts": set(),
     "structures": {"torch", "numpy"},
     "alignment": {"torch", "numpy"},
     "yaml_nodes": {"yaml"},

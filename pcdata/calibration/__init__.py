@@ -3,10 +3,9 @@
 from pcdata.calibration.board_images import read_board_images
 from pcdata.calibration.board_pose import locate_board
 from pcdata.calibration.boards import Board, BoardView, Charuco, Chessboard, parse_board
-from pcdata.calibration.findings import Finding
 from pcdata.calibration.hand_eye import HandEyeLimits, HandEyeResult, calibrate_hand_eye
 from pcdata.calibration.intrinsics import IntrinsicsLimits, IntrinsicsResult, calibrate_intrinsics, find_board
-from pcdata.calibration.plane_check import PlaneCheck, PlaneLimits, check_plane
+from pcdata.calibration.plane_check import PlaneLimits, PlaneResult, check_plane
 from pcdata.calibration.refine import CameraRefinement, Refinement, refine_extrinsics
 from pcdata.calibration.robot_poses import RobotPoses, read_robot_poses
 from pcdata.structures import Calibration, Evidence
@@ -19,13 +18,12 @@ __all__ = [
     "Charuco",
     "Chessboard",
     "Evidence",
-    "Finding",
     "HandEyeLimits",
     "HandEyeResult",
     "IntrinsicsLimits",
     "IntrinsicsResult",
-    "PlaneCheck",
     "PlaneLimits",
+    "PlaneResult",
     "Refinement",
     "RobotPoses",
     "calibrate_hand_eye",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.calibration.findings import Finding, all_passed, at_most
 from pcdata.calibration.hand_eye_opencv import opencv_solutions
 from pcdata.calibration.hand_eye_refine import mean_pose, refine
 from pcdata.calibration.motions import Poses, check_motions, inverse, motions_between, rotation_vectors
@@ -21,6 +20,7 @@ from pcdata.calibration.park_martin import park_martin
 from pcdata.calibration.robot_poses import RobotPoses
 from pcdata.errors import ConfigError
 from pcdata.structures.calibration import Evidence
+from pcdata.verdicts import Finding, Limits, Verdict, at_most, worst
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 
@@ -31,11 +31,13 @@ FINAL = "least squares over all poses"
 # name good poses; an error that matters (a pose of another moment, a slipped board) is far larger.
 _OUTLIER = 6.0
 _SMALLEST_OUTLIER = (0.0005, math.radians(0.5))  # metres, radians; a pose nearer than this is not worth leaving out
+_DISAGREE = "look at the poses with the largest residuals: was the robot at rest, did the target or the camera slip?"
+_UNDETERMINED = "add poses that turn the gripper by 30 to 60 degrees about different axes"
 _CLEARLY_BETTER = 0.2  # of the residual; poses read the right way round fit many times better
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandEyeLimits:
+class HandEyeLimits(Limits):
     """What a hand-eye transform that one may use keeps."""
 
     max_translation_rms: float = 0.003  # metres
@@ -59,13 +61,12 @@ class HandEyeResult:
     rotation_spread: float
     translation_sigma: float  # standard deviation of the answer, all axes together
     rotation_sigma: float
-    advice: str | None  # what to change where the poses do not fit
     findings: tuple[Finding, ...]
 
     @property
-    def passed(self) -> bool:
+    def verdict(self) -> Verdict:
         """Whether every limit held."""
-        return all_passed(self.findings)
+        return worst(finding.verdict for finding in self.findings)
 
     @property
     def mount(self) -> str:
@@ -123,14 +124,28 @@ def calibrate_hand_eye(poses: RobotPoses, *, setup: Setup, limits: HandEyeLimits
     outliers = _outliers(translation, _SMALLEST_OUTLIER[0]) | _outliers(rotation, _SMALLEST_OUTLIER[1])
     translation_spread, rotation_spread = _spread(list(solutions.values()))
     limits = limits or HandEyeLimits()
-    findings = (
-        at_most("translation RMS", _root_mean_square(translation), limits.max_translation_rms, "mm", factor=1000),
-        at_most("rotation RMS", _root_mean_square(rotation), limits.max_rotation_rms, "degrees", factor=180 / math.pi),
-        at_most("solvers apart", translation_spread, limits.max_translation_spread, "mm", factor=1000),
-        at_most("solvers apart", rotation_spread, limits.max_rotation_spread, "degrees", factor=180 / math.pi),
-        Finding("standard deviation of the position", f"{1000 * best.translation_sigma:.2g} mm"),
-        Finding("standard deviation of the rotation", f"{math.degrees(best.rotation_sigma):.2g} degrees"),
-    )
+    translation_rms = _root_mean_square(translation)
+    findings = [
+        _length("translation RMS", translation_rms, limits.max_translation_rms, _DISAGREE),
+        _angle("rotation RMS", _root_mean_square(rotation), limits.max_rotation_rms, _DISAGREE),
+        _length("solvers apart, position", translation_spread, limits.max_translation_spread, _UNDETERMINED),
+        _angle("solvers apart, rotation", rotation_spread, limits.max_rotation_spread, _UNDETERMINED),
+        Finding(
+            name="standard deviation of the position",
+            found=f"{1000 * best.translation_sigma:.2g} mm",
+            value=best.translation_sigma,
+            unit="m",
+        ),
+        Finding(
+            name="standard deviation of the rotation",
+            found=f"{math.degrees(best.rotation_sigma):.2g} degrees",
+            value=best.rotation_sigma,
+            unit="rad",
+        ),
+    ]
+    failed = any(finding.verdict is Verdict.FAIL for finding in findings)
+    if failed and (other := _other_reading(robot, target, setup, translation_rms)):
+        findings = [replace(one, advice=other) if one.verdict is Verdict.FAIL else one for one in findings]
     return HandEyeResult(
         setup=setup,
         mount_from_camera=torch.from_numpy(best.mount_from_camera),
@@ -143,8 +158,7 @@ def calibrate_hand_eye(poses: RobotPoses, *, setup: Setup, limits: HandEyeLimits
         rotation_spread=rotation_spread,
         translation_sigma=best.translation_sigma,
         rotation_sigma=best.rotation_sigma,
-        advice=None if all_passed(findings) else _advice(robot, target, setup, _root_mean_square(translation)),
-        findings=findings,
+        findings=tuple(findings),
     )
 
 
@@ -163,7 +177,7 @@ def _outliers(residuals: NDArray[np.float64], smallest: float) -> NDArray[np.boo
     return residuals > max(_OUTLIER * float(np.median(residuals)), smallest)
 
 
-def _advice(robot: Poses, target: Poses, setup: Setup, residual: float) -> str | None:
+def _other_reading(robot: Poses, target: Poses, setup: Setup, residual: float) -> str | None:
     """Say which other reading of the same numbers fits far better, if one does."""
     other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     readings = {
@@ -179,6 +193,14 @@ def _advice(robot: Poses, target: Poses, setup: Setup, residual: float) -> str |
         found[advice] = _root_mean_square(_distances(placed, mean_pose(placed))[0])
     best = min(found, key=lambda advice: found[advice])
     return f"{best} (residual {1000 * found[best]:.2g} mm)" if found[best] < _CLEARLY_BETTER * residual else None
+
+
+def _length(name: str, value: float, limit: float, advice: str) -> Finding:
+    return at_most(name, value, limit, advice, unit="m", shown=("mm", 1000.0))
+
+
+def _angle(name: str, value: float, limit: float, advice: str) -> Finding:
+    return at_most(name, value, limit, advice, unit="rad", shown=("degrees", 180 / math.pi))
 
 
 def _root_mean_square(values: NDArray[np.float64]) -> float:

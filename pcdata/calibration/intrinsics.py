@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.calibration.boards import Board, BoardView, GreyImage
-from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
 from pcdata.structures import Camera
 from pcdata.structures.calibration import Evidence
+from pcdata.verdicts import Finding, Limits, Verdict, at_least, at_most, worst
 
 COEFFICIENT_COUNTS = (0, 4, 5, 8)
 
@@ -32,7 +32,7 @@ _POOR_VIEW = 2.0  # a view whose error is this many times the median is named
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntrinsicsLimits:
+class IntrinsicsLimits(Limits):
     """What a calibration that one may use keeps."""
 
     max_rms: float = 0.5  # pixels
@@ -55,9 +55,9 @@ class IntrinsicsResult:
     findings: tuple[Finding, ...]
 
     @property
-    def passed(self) -> bool:
+    def verdict(self) -> Verdict:
         """Whether every limit held."""
-        return all_passed(self.findings)
+        return worst(finding.verdict for finding in self.findings)
 
     @property
     def poor_views(self) -> list[str]:
@@ -143,10 +143,34 @@ def calibrate_intrinsics(
     _refuse_degenerate(tilt, focal)
     coverage = _coverage(views, size)
     findings = (
-        at_most("reprojection RMS", solved.rms, limits.max_rms, "px"),
-        at_most("focal length uncertainty", focal, limits.max_focal_uncertainty, "%", factor=100),
-        at_least("image covered by corners", coverage, limits.min_coverage, "%", factor=100),
-        Finding("largest angle between boards", f"{math.degrees(tilt):.0f} degrees"),
+        at_most(
+            "reprojection RMS",
+            solved.rms,
+            limits.max_rms,
+            "look at the views with the largest errors and leave out what is blurred; is the board flat?",
+            unit="pixels",
+            shown=("px", 1.0),
+        ),
+        at_most(
+            "focal length uncertainty",
+            focal,
+            limits.max_focal_uncertainty,
+            "add views that are tilted by 30 to 45 degrees, to all four sides, and closer ones",
+            shown=("%", 100.0),
+        ),
+        at_least(
+            "image covered by corners",
+            coverage,
+            limits.min_coverage,
+            "add views with the board in the edges and corners of the image",
+            shown=("%", 100.0),
+        ),
+        Finding(
+            name="largest angle between boards",
+            found=f"{math.degrees(tilt):.0f} degrees",
+            value=math.degrees(tilt),
+            unit="degrees",
+        ),
     )
     return IntrinsicsResult(
         camera=_camera(solved, size, num_coefficients),

@@ -10,12 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pcdata.calibration.findings import Finding, all_passed, at_least, at_most
 from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
 from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.planes import ransac_plane
 from pcdata.geometry.plane_fit import fit_plane
 from pcdata.structures import DepthFrame
+from pcdata.verdicts import Finding, Limits, Verdict, at_least, at_most, worst
 
 Along = Literal["axis", "normal"]
 
@@ -28,9 +28,18 @@ _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _MIN_CLIP = 1e-4  # metres; depth without any noise must not clip its own rounding
 _MAX_ROUNDS = 20
 
+_UNLIT = "is the surface within the sensor's range, dull, lit by the projector, and does it fill the region?"
+_CLUTTER = "clear what stands before the surface, or look at a smaller part of the image (roi)"
+_NOISY = "raise the exposure or the projector's power, keep reflections off the surface, or come nearer"
+_BENT = (
+    "is the surface flat? Then intrinsics and distortion are not those of this resolution, or the depth needs the "
+    "maker's own calibration"
+)
+_OFF = "measure the distance again, from the depth origin of the data sheet; then run the maker's own calibration"
+
 
 @dataclass(frozen=True, kw_only=True)
-class PlaneLimits:
+class PlaneLimits(Limits):
     """What a sensor in order keeps; parts of the distance where not said otherwise.
 
     With a noise model it decides instead of the plain parts, since noise and systematic error both come from matching
@@ -53,7 +62,7 @@ class PlaneLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlaneCheck:
+class PlaneResult:
     """One capture of a flat surface, measured. Lengths are metres, angles radians."""
 
     num_readings: int  # in the region
@@ -71,9 +80,9 @@ class PlaneCheck:
     findings: tuple[Finding, ...]
 
     @property
-    def passed(self) -> bool:
+    def verdict(self) -> Verdict:
         """Whether every limit held."""
-        return all_passed(self.findings)
+        return worst(finding.verdict for finding in self.findings)
 
 
 def check_plane(
@@ -85,7 +94,7 @@ def check_plane(
     noise: Callable[[float], float] | None = None,
     limits: PlaneLimits | None = None,
     seed: int = 0,
-) -> PlaneCheck:
+) -> PlaneResult:
     """Measure a capture of a wall or an empty table top.
 
     The plane is found by RANSAC in the central part of the image, then refitted by least squares to all readings within
@@ -126,7 +135,7 @@ def check_plane(
     normal_distance, cosine = float(plane[3].abs()), float(plane[2].abs())
     axis_distance = normal_distance / cosine if cosine > 0 else math.inf
     measured = axis_distance if along == "axis" else normal_distance
-    check = PlaneCheck(
+    check = PlaneResult(
         num_readings=num_readings,
         fill=num_readings / num_pixels,
         inlier_share=float(inlier.double().mean()),
@@ -169,35 +178,41 @@ def fit_dominant_plane(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor
     return (-plane if float(plane[3]) < 0 else plane), inlier
 
 
-def _judged(check: PlaneCheck, limits: PlaneLimits, distance: float | None, along: Along) -> PlaneCheck:
+def _judged(check: PlaneResult, limits: PlaneLimits, distance: float | None, along: Along) -> PlaneResult:
     way = {"axis": "along the optical axis", "normal": "shortest way"}
     findings = [
-        at_least("fill rate", check.fill, limits.min_fill, "%", factor=100),
-        at_least("readings on the plane", check.inlier_share, limits.min_inliers, "%", factor=100),
-        Finding("distance along the optical axis", f"{check.axis_distance:.4f} m"),
-        Finding("distance by the shortest way", f"{check.normal_distance:.4f} m"),
-        Finding("tilt", f"{math.degrees(check.tilt):.1f} degrees"),
-        Finding("plane-fit RMS", f"{1000 * check.plane_rms:.3g} mm"),
+        at_least("fill rate", check.fill, limits.min_fill, _UNLIT, shown=("%", 100.0)),
+        at_least("readings on the plane", check.inlier_share, limits.min_inliers, _CLUTTER, shown=("%", 100.0)),
+        _told("distance along the optical axis", check.axis_distance, f"{check.axis_distance:.4f} m"),
+        _told("distance by the shortest way", check.normal_distance, f"{check.normal_distance:.4f} m"),
+        _told("tilt", check.tilt, f"{math.degrees(check.tilt):.1f} degrees", unit="rad"),
+        _told("plane-fit RMS", check.plane_rms, f"{1000 * check.plane_rms:.3g} mm"),
     ]
     expected = check.expected_noise
     if expected is None:
         part = check.depth_rms / check.axis_distance
-        findings.append(at_most("depth RMS, part of the distance", part, limits.max_rms, "%", factor=100))
+        findings.append(at_most("depth RMS, part of the distance", part, limits.max_rms, _NOISY, shown=("%", 100.0)))
     else:
-        findings.append(Finding("expected depth noise", f"{1000 * expected:.3g} mm"))
+        findings.append(_told("expected depth noise", expected, f"{1000 * expected:.3g} mm"))
         ratio = check.depth_rms / expected
-        findings.append(at_most("depth RMS over expected noise", ratio, limits.max_noise_ratio, ""))
+        findings.append(at_most("depth RMS over expected noise", ratio, limits.max_noise_ratio, _NOISY))
     systematic = None if expected is None else max(limits.max_systematic_ratio * expected, limits.measurable)
     most = limits.max_warp * check.axis_distance if systematic is None else systematic
-    findings.append(at_most("warp", check.warp, most, "mm", factor=1000))
+    findings.append(at_most("warp", check.warp, most, _BENT, unit="m", shown=("mm", 1000.0)))
     if check.bias is not None and distance is not None:
-        findings.append(Finding(f"bias, {way[along]}", f"{1000 * check.bias:+.2f} mm"))
+        findings.append(_told(f"bias, {way[along]}", check.bias, f"{1000 * check.bias:+.2f} mm"))
         if systematic is None:
             part = abs(check.bias) / distance
-            findings.append(at_most("bias, part of the distance", part, limits.max_bias, "%", factor=100))
+            findings.append(at_most("bias, part of the distance", part, limits.max_bias, _OFF, shown=("%", 100.0)))
         else:
-            findings.append(at_most("size of the bias", abs(check.bias), systematic, "mm", factor=1000))
-    return PlaneCheck(**{**vars(check), "findings": tuple(findings)})
+            findings.append(
+                at_most("size of the bias", abs(check.bias), systematic, _OFF, unit="m", shown=("mm", 1000.0))
+            )
+    return PlaneResult(**{**vars(check), "findings": tuple(findings)})
+
+
+def _told(name: str, value: float, found: str, unit: str = "m") -> Finding:
+    return Finding(name=name, found=found, value=value, unit=unit)
 
 
 def _warp(

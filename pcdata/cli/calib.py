@@ -14,8 +14,9 @@ from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
 
 if TYPE_CHECKING:
-    from pcdata.calibration import Board, Calibration, Finding, PlaneCheck
+    from pcdata.calibration import Board, Calibration, PlaneResult
     from pcdata.structures import DepthFrame
+    from pcdata.verdicts import Finding, Verdict
 
 FAILED = 1  # exit code of a step whose limits do not hold
 
@@ -106,9 +107,10 @@ def _board(text: str) -> Board:
 def _check(arguments: argparse.Namespace) -> int:
     from pcdata.errors import CaptureError
     from pcdata.structures import DepthFrame
+    from pcdata.verdicts import Verdict
 
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
-    checks: dict[str, PlaneCheck] = {}
+    checks: dict[str, PlaneResult] = {}
     for sample_id in source.ids:
         frame = source.load(sample_id)
         if not isinstance(frame, DepthFrame):
@@ -117,16 +119,15 @@ def _check(arguments: argparse.Namespace) -> int:
             name = sample_id if frame.num_views == 1 else f"{sample_id} view {view}"
             checks[name] = _check_view(frame.view(view), arguments)
     print(_check_table(checks))
-    failed = {name: check for name, check in checks.items() if not check.passed}
+    failed = {name: check for name, check in checks.items() if check.verdict is Verdict.FAIL}
     for name, check in failed.items():
-        for finding in check.findings:
-            if not finding.passed:
-                print(f"{name}: {finding.name} is {finding.value}, must be {finding.limit}")
+        for line in _failures(check.findings):
+            print(f"{name}: {line}")
     print(f"\nverdict  {'FAIL' if failed else 'pass'}: {len(checks) - len(failed)} of {len(checks)} captures in order")
     return FAILED if failed else 0
 
 
-def _check_view(frame: DepthFrame, arguments: argparse.Namespace) -> PlaneCheck:
+def _check_view(frame: DepthFrame, arguments: argparse.Namespace) -> PlaneResult:
     from pcdata.calibration import check_plane
 
     noise = None
@@ -144,7 +145,7 @@ def _noise_of(sensor: str, focal: float) -> Callable[[float], float]:
     return lambda depth: math.hypot(profile.noise_at(depth, focal=focal), rounding)
 
 
-def _check_table(checks: dict[str, PlaneCheck]) -> str:
+def _check_table(checks: dict[str, PlaneResult]) -> str:
     from pcdata.report.table import text_table
 
     header = ["capture", "axis m", "normal m", "tilt deg", "fill %", "on plane %", "plane RMS mm", "depth RMS mm"]
@@ -160,7 +161,7 @@ def _check_table(checks: dict[str, PlaneCheck]) -> str:
         row += [f"{1000 * check.expected_noise:.2f}"] if check.expected_noise is not None else []
         row += [f"{1000 * check.bias:+.2f}"] if check.bias is not None else []
         row += [f"{1000 * check.warp:.2f}"]
-        rows.append([*row, "pass" if check.passed else "FAIL"])
+        rows.append([*row, _shown(check.verdict)])
     return text_table([*header, "verdict"], rows)
 
 
@@ -190,7 +191,7 @@ def _intrinsics(arguments: argparse.Namespace) -> int:
     print("\n" + _findings_table(result.findings))
     return _conclude(
         arguments,
-        result.passed,
+        result.verdict,
         lambda known: known.with_camera(arguments.camera, result.camera, result.evidence(arguments.date)),
     )
 
@@ -218,14 +219,12 @@ def _hand_eye(arguments: argparse.Namespace) -> int:
     print("\n" + _findings_table(result.findings))
     if result.outliers:
         print(f"\nlook at {', '.join(result.outliers)}: more than six times the median residual")
-    if result.advice is not None:
-        print(f"\n{result.advice}")
     mount = {"gripper": arguments.gripper, "base": arguments.base}[result.mount]
     name = f"{mount}_from_{arguments.camera}"
     print(f"\n{name}\n" + "\n".join("  ".join(f"{v:10.6f}" for v in row) for row in result.mount_from_camera.tolist()))
     return _conclude(
         arguments,
-        result.passed,
+        result.verdict,
         lambda known: known.with_transform(name, result.mount_from_camera, result.evidence(arguments.date)),
     )
 
@@ -268,18 +267,29 @@ def _locate(path: Path, board: Board, camera: Any) -> Any:
 def _findings_table(findings: Sequence[Finding]) -> str:
     from pcdata.report.table import text_table
 
-    verdicts = {True: "pass", False: "FAIL"}
-    rows = [[f.name, f.value, f.limit, verdicts[f.passed] if f.limit else ""] for f in findings]
-    return text_table(["measure", "value", "limit", "verdict"], rows)
+    rows = [[f.name, f.found, "" if f.threshold is None else _shown(f.verdict)] for f in findings]
+    table = text_table(["measure", "found", "verdict"], rows)
+    return "\n\n".join([table, *_failures(findings)])
 
 
-def _conclude(arguments: argparse.Namespace, passed: bool, add: Callable[[Calibration], Calibration]) -> int:
+def _failures(findings: Sequence[Finding]) -> list[str]:
+    """Return a line for each finding that does not pass: what was found, and what to do."""
+    return [f"{one.name} is {one.found}: {one.advice}" for one in findings if one.advice]
+
+
+def _shown(verdict: Verdict) -> str:
+    return "FAIL" if verdict == "fail" else str(verdict)
+
+
+def _conclude(arguments: argparse.Namespace, verdict: Verdict, add: Callable[[Calibration], Calibration]) -> int:
     """Say the verdict; write the file only when it is a pass."""
     from pcdata.io import read_calibration, write_calibration
     from pcdata.structures import Calibration
+    from pcdata.verdicts import Verdict
 
-    print(f"\nverdict  {'pass' if passed else 'FAIL: nothing is written'}")
-    if not passed:
+    failed = verdict is Verdict.FAIL
+    print(f"\nverdict  {'FAIL: nothing is written' if failed else verdict}")
+    if failed:
         return FAILED
     if arguments.out is not None:
         known = read_calibration(arguments.out) if Path(arguments.out).exists() else Calibration()

@@ -35,7 +35,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from pcdata.files.opening import replacing
     from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.validation import validation_text
-    from pcdata.validation import Verdict
+    from pcdata.verdicts import Verdict
 
     if arguments.keys:
         summary = _check_foreign(arguments)

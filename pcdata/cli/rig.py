@@ -62,6 +62,7 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     from pcdata.files.opening import replacing
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
+    from pcdata.verdicts import Verdict
 
     rig = _open(arguments, arguments.calibration)
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
@@ -72,7 +73,7 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
             temporary.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
     if arguments.figure:
         save_overlap_figure(arguments.figure, captures[0], result)
-    return FAILED if result.verdict == "fail" else None
+    return FAILED if result.verdict is Verdict.FAIL else None
 
 
 def _refine(arguments: argparse.Namespace) -> None:

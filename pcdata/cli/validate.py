@@ -37,11 +37,12 @@ def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.errors import CaptureError, PoseError, UnitError
     from pcdata.files.opening import replacing
     from pcdata.report.validation import validation_text
-    from pcdata.validation import WHOLE, Limits, SampleReport, Summary, Verdict, check_of_error, validate_source
+    from pcdata.validation import WHOLE, CaptureLimits, SampleReport, Summary, check_of_error, validate_source
+    from pcdata.verdicts import Verdict
 
-    limits = Limits.for_sensor(arguments.sensor) if arguments.sensor else Limits()
+    limits = CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
     if arguments.workspace:
-        limits = Limits(workspace=tuple(arguments.workspace))
+        limits = CaptureLimits(workspace=tuple(arguments.workspace))
     summary = Summary()
     total = 0
     unread: list[str] = []

@@ -69,7 +69,7 @@ def check_export(
     unit = unit or ("" if "unit" in target.left_to_loader else contract(target.model).unit_of_tensors())
     summary = Summary()
     reports = (
-        SampleReport(f"{path.name}/{report.sample_id}" if len(files) > 1 else report.sample_id, report.checks)
+        SampleReport(f"{path.name}/{report.sample_id}" if len(files) > 1 else report.sample_id, report.findings)
         for path, array in files.items()
         for report in reports_of_file(path, model, {"points": array.name}, frame_id, unit, choices, channels)
     )

@@ -21,7 +21,8 @@ from pcdata.models.preset import batch_of
 from pcdata.models.rules import cheap_checks
 from pcdata.models.value_rules import value_checks
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.validation import Check, SampleReport, Summary, Verdict
+from pcdata.validation import SampleReport, Summary
+from pcdata.verdicts import Finding, Verdict
 
 
 def check(
@@ -146,7 +147,7 @@ def require(data: Any, model: str, /, *, but: Collection[str] = (), **options: A
 
 def _checks(
     sample: Any, model: str, choices: Mapping[str, Any], declared: Mapping[str, Any], cheap: bool
-) -> Iterable[Check]:
+) -> Iterable[Finding]:
     if isinstance(sample, ModelBatch) and sample.model == model:
         choices = {**sample.choices, **choices}
     contract = contract_named(model, **choices)
@@ -154,7 +155,7 @@ def _checks(
         batch = _as_batch(sample, contract, choices, declared)
     except PcdataError as error:
         # The model's tensors cannot even be made of it.
-        return [Check(name="channels", verdict=Verdict.FAIL, found=str(error), advice="use the preset's pipeline")]
+        return [Finding(name="channels", verdict=Verdict.FAIL, found=str(error), advice="use the preset's pipeline")]
     checks = list(cheap_checks(batch, contract))
     return checks if cheap else [*checks, *value_checks(batch, contract)]
 

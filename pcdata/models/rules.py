@@ -11,10 +11,10 @@ from pcdata.models.catalogue import CONTRACTS, possible_choices
 from pcdata.models.contract import MIN_POINTS, InputTensor, ModelContract
 from pcdata.models.images import size_step
 from pcdata.structures import METRE
-from pcdata.validation import Check, Verdict
+from pcdata.verdicts import Finding, Verdict
 
 
-def cheap_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
+def cheap_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Finding]:
     """Yield one check per rule."""
     yield _layout(batch, contract)
     yield _dtype(batch, contract)
@@ -36,52 +36,50 @@ def layout_fault(tensor: Tensor, spec: InputTensor, contract: ModelContract) -> 
     return f"{spec.key} is {tuple(tensor.shape)}: there is nothing in it" if tensor.numel() == 0 else ""
 
 
-def verdict(name: str, fault: str, advice: str, *, found: str, unknown: bool = False) -> Check:
-    """Fail with the fault, or warn where nothing is known, or pass."""
-    if fault:
-        return Check(name=name, verdict=Verdict.WARN if unknown else Verdict.FAIL, found=fault, advice=advice)
-    return Check(name=name, verdict=Verdict.PASS, found=found)
+def ruled(name: str, fault: str, advice: str, *, found: str, if_fault: Verdict = Verdict.FAIL) -> Finding:
+    """Pass without a fault; with one, say it, and what to do."""
+    return (
+        Finding(name=name, verdict=if_fault, found=fault, advice=advice) if fault else Finding(name=name, found=found)
+    )
 
 
-def _layout(batch: ModelBatch, contract: ModelContract) -> Check:
+def _layout(batch: ModelBatch, contract: ModelContract) -> Finding:
     keys = [spec.key for spec in contract.tensors]
     missing = [key for key in keys if key not in batch.tensors]
     faults = [f"no tensor {key!r}; there are {sorted(batch.tensors)}" for key in missing]
     faults += [layout_fault(batch[spec.key], spec, contract) for spec in contract.tensors if spec.key in batch.tensors]
     layouts = ", ".join(f"{spec.key} ({', '.join(spec.axes)})" for spec in contract.tensors)
     advice = f"the model takes {layouts}: transpose or rename, or let the preset's collate do it"
-    return verdict("layout", "; ".join(fault for fault in faults if fault), advice, found=layouts)
+    return ruled("layout", "; ".join(fault for fault in faults if fault), advice, found=layouts)
 
 
-def _dtype(batch: ModelBatch, contract: ModelContract) -> Check:
+def _dtype(batch: ModelBatch, contract: ModelContract) -> Finding:
     faults = []
     for spec in contract.tensors:
         if spec.key in batch.tensors:
             dtype = str(batch[spec.key].dtype).removeprefix("torch.")
             if dtype != spec.dtype:
                 faults.append(f"{spec.key} is {dtype}, not {spec.dtype}")
-    return verdict(
-        "dtype", "; ".join(faults), "convert with .to(dtype) before the model", found="as the model takes it"
-    )
+    return ruled("dtype", "; ".join(faults), "convert with .to(dtype) before the model", found="as the model takes it")
 
 
-def _frame(batch: ModelBatch, contract: ModelContract) -> Check:
+def _frame(batch: ModelBatch, contract: ModelContract) -> Finding:
     if not contract.frame:
-        return verdict(
+        return ruled(
             "frame",
             f"the model leaves the frame open; the data are in {batch.frame_id or 'an unknown frame'!r}",
             "say which frame you train in: frame='base'",
             found="",
-            unknown=True,
+            if_fault=Verdict.UNKNOWN,
         )
     wanted = contract.frame_of_tensors()
     if not batch.frame_id:
-        return verdict(
+        return ruled(
             "frame",
             "the frame is not known",
             f"the model works in {wanted!r}: declare the frame",
             found="",
-            unknown=True,
+            if_fault=Verdict.UNKNOWN,
         )
     # Files that others wrote do not say whether they are centred: there the values decide, under normalisation.
     whole = batch.steps is not None
@@ -89,25 +87,27 @@ def _frame(batch: ModelBatch, contract: ModelContract) -> Check:
     fault = "" if ours == theirs else f"the data are in {ours!r}, the model works in {theirs!r}"
     steps = [f"ToFrame(frame={contract.frame!r})"] if ours.split("/")[0] != theirs.split("/")[0] else []
     steps += ["the preset's centring"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
-    return verdict(
+    return ruled(
         "frame", fault, f"add {' and '.join(steps)}, or use the preset. {contract.wrong_frame}", found=batch.frame_id
     )
 
 
-def _unit(batch: ModelBatch, contract: ModelContract) -> Check:
+def _unit(batch: ModelBatch, contract: ModelContract) -> Finding:
     wanted = contract.unit_of_tensors()
     if not batch.unit:
-        return verdict("unit", "the unit is not known", f"declare the unit, {wanted!r}", found="", unknown=True)
+        return ruled(
+            "unit", "the unit is not known", f"declare the unit, {wanted!r}", found="", if_fault=Verdict.UNKNOWN
+        )
     fault = "" if batch.unit == wanted else f"the data are in {batch.unit!r}, the model takes {wanted!r}"
     advice = (
         "remove the normalisation: the model's radii are in metres"
         if wanted == METRE
         else "add NormalizeUnitSphere where the preset has it"
     )
-    return verdict("unit", fault, advice, found=batch.unit)
+    return ruled("unit", fault, advice, found=batch.unit)
 
 
-def _count(batch: ModelBatch, contract: ModelContract) -> Check:
+def _count(batch: ModelBatch, contract: ModelContract) -> Finding:
     sizes = _sizes(batch, contract)
     if contract.image_size is not None:
         tensor, spec = batch.tensors.get(contract.main.key), contract.main
@@ -115,25 +115,26 @@ def _count(batch: ModelBatch, contract: ModelContract) -> Check:
         if tensor is not None and tensor.ndim == len(spec.axes):
             size = (tensor.shape[spec.axes.index("H")], tensor.shape[spec.axes.index("W")])
         fault = "" if size == contract.image_size else f"images of {size}, not (height, width) {contract.image_size}"
-        return verdict("count", fault, f"end with {size_step(contract)}", found=str(size))
+        return ruled("count", fault, f"end with {size_step(contract)}", found=str(size))
     if not sizes:
-        return verdict("count", "the counts are not known", "give whole clouds", found="", unknown=True)
+        return ruled("count", "the counts are not known", "give whole clouds", found="", if_fault=Verdict.UNKNOWN)
     low, high = min(sizes), max(sizes)
     found = f"{low}" if low == high else f"{low} to {high}"
     if contract.count is not None and {low, high} == {contract.count}:
-        return verdict("count", "", "", found=found)
+        return ruled("count", "", "", found=found)
     if contract.count is not None:
         return _other_count(contract, low, high, found)
     lowest, highest = contract.count_range or (MIN_POINTS, None)
     fault = "" if lowest <= low and (highest is None or high <= highest) else f"{found} points per cloud"
     wanted = f"at least {lowest}" if highest is None else f"{lowest} to {highest}"
     remedy = denser(contract) if low < lowest else sparser(contract)
-    return verdict("count", fault, f"the model takes {wanted}: {remedy}", found=found)
+    return ruled("count", fault, f"the model takes {wanted}: {remedy}", found=found)
 
 
-def _other_count(contract: ModelContract, low: int, high: int, found: str) -> Check:
+def _other_count(contract: ModelContract, low: int, high: int, found: str) -> Finding:
     """Judge counts that are not the contract's: known ones warn, all may be stated where the network takes any."""
     known = low == high and low in contract.counts
+    if_fault = Verdict.WARN if known else Verdict.FAIL
     how = "FarthestPointSample" if contract.sampler == "farthest point" else "RandomSample"
     advice = f"end with {how}(num_points={contract.count}, if_short={contract.pad!r})"
     if known:
@@ -141,7 +142,7 @@ def _other_count(contract: ModelContract, low: int, high: int, found: str) -> Ch
     elif contract.any_count and low == high >= MIN_POINTS:
         advice += f", or say num_points={low}: the network takes any count that is stated"
     takes = "the model's default is" if known else "the model takes"
-    return verdict("count", f"{found} points per cloud, {takes} {contract.count}", advice, found=found, unknown=known)
+    return ruled("count", f"{found} points per cloud, {takes} {contract.count}", advice, found=found, if_fault=if_fault)
 
 
 def denser(contract: ModelContract) -> str:
@@ -177,7 +178,7 @@ def _sizes(batch: ModelBatch, contract: ModelContract) -> list[int]:
     return sizes
 
 
-def _channels(batch: ModelBatch, contract: ModelContract) -> Check:
+def _channels(batch: ModelBatch, contract: ModelContract) -> Finding:
     faults, unknown = [], []
     for spec in contract.tensors:
         if not spec.channels:
@@ -190,7 +191,11 @@ def _channels(batch: ModelBatch, contract: ModelContract) -> Check:
     wanted = "; ".join(f"{spec.key}: {', '.join(spec.channel_names)}" for spec in contract.tensors if spec.channels)
     advice = f"put the channels in the model's order ({wanted})"
     if faults or not unknown:
-        return verdict("channels", "; ".join(faults), advice, found=wanted)
-    return verdict(
-        "channels", f"the order of the channels of {', '.join(unknown)} is not known", advice, found="", unknown=True
+        return ruled("channels", "; ".join(faults), advice, found=wanted)
+    return ruled(
+        "channels",
+        f"the order of the channels of {', '.join(unknown)} is not known",
+        advice,
+        found="",
+        if_fault=Verdict.UNKNOWN,
     )

@@ -12,10 +12,9 @@ from pcdata.functional.planes import ransac_plane
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import is_camera
 from pcdata.models.contract import MIN_POINTS, Channel, InputTensor, ModelContract, Role
-from pcdata.models.rules import denser, layout_fault, verdict
+from pcdata.models.rules import denser, layout_fault, ruled
 from pcdata.structures import METRE
-from pcdata.validation import Check
-from pcdata.validation.check import graded
+from pcdata.verdicts import Finding, Verdict, graded
 
 # The longest side of a cloud in metres. Below: a cloud in kilometres or a lone point; above: millimetres, where a cup
 # is 80 and a table 800.
@@ -30,7 +29,7 @@ _OBJECT_STEPS = {"RemovePlane", "ClusterObjects", "SplitObjects"}
 _ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.118, 2.6401), "rgb_255": (0.0, 255.0)}
 
 
-def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
+def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Finding]:
     """Yield one check per rule; tensors of a wrong layout or kind of number, which other rules say, are left out."""
     sound = [
         spec
@@ -51,7 +50,7 @@ def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Check]:
         return
     clouds = [cloud for cloud in positions(batch, contract) if len(cloud)]
     if not clouds:
-        yield verdict("scale", "there are no points", "check crop and frame", found="")
+        yield ruled("scale", "there are no points", "check crop and frame", found="")
         return
     yield _scale(clouds, contract)
     yield _normalisation(clouds, contract)
@@ -90,17 +89,17 @@ def positions(batch: ModelBatch, contract: ModelContract) -> list[Tensor]:
     return clouds
 
 
-def _finite(batch: ModelBatch) -> Check:
+def _finite(batch: ModelBatch) -> Finding:
     faults = [
         f"{key} has {count} values that are NaN or infinite"
         for key, tensor in batch.items()
         if tensor.is_floating_point() and (count := int((~torch.isfinite(tensor)).sum()))
     ]
     advice = "find the step that makes them (step_through); one NaN spoils the weights for good"
-    return verdict("finite", "; ".join(faults), advice, found="all values are finite")
+    return ruled("finite", "; ".join(faults), advice, found="all values are finite")
 
 
-def _ranges(batch: ModelBatch, specs: list[InputTensor]) -> Check:
+def _ranges(batch: ModelBatch, specs: list[InputTensor]) -> Finding:
     faults = [
         fault
         for spec in specs
@@ -108,7 +107,7 @@ def _ranges(batch: ModelBatch, specs: list[InputTensor]) -> Check:
         if channel.low is not None
         if (fault := _range_fault(channel_values(batch[spec.key], spec, channel), channel))
     ]
-    return verdict("range", "; ".join(faults), "convert the channel, or use the preset's collate", found="as expected")
+    return ruled("range", "; ".join(faults), "convert the channel, or use the preset's collate", found="as expected")
 
 
 def _range_fault(values: Tensor, channel: Channel) -> str:
@@ -143,28 +142,28 @@ def _encoding_fault(values: Tensor, channel: Channel, said: str) -> str:
     return ""
 
 
-def _scale(clouds: list[Tensor], contract: ModelContract) -> Check:
+def _scale(clouds: list[Tensor], contract: ModelContract) -> Finding:
     extents = [float((cloud.amax(0) - cloud.amin(0)).max()) for cloud in clouds]
     low, high = min(extents), max(extents)
     found = f"the clouds are {low:.3g} to {high:.3g} long"
     if contract.unit_of_tensors() != METRE:
         fault = found if high > 2 + _TOLERANCE or low < 0.1 else ""
-        return verdict("scale", fault, "normalise as the preset does: the longest side is at most 2", found=found)
+        return ruled("scale", fault, "normalise as the preset does: the longest side is at most 2", found=found)
     fault = found if low < EXTENT[0] or high > EXTENT[1] else ""
     fitting = [f"by {unit:g} if they are {name}" for name, unit in plausible_units(high).items() if unit < 1]
     hint = f"multiply the coordinates {' or '.join(fitting) or 'by their unit'}, where they are read or before"
     hint = hint if high > EXTENT[1] else "a crop that leaves nothing, or a unit that was applied twice?"
-    return verdict("scale", fault, f"the model works in metres: {hint}", found=f"{found}, in metres")
+    return ruled("scale", fault, f"the model works in metres: {hint}", found=f"{found}, in metres")
 
 
-def _normalisation(clouds: list[Tensor], contract: ModelContract) -> Check:
+def _normalisation(clouds: list[Tensor], contract: ModelContract) -> Finding:
     faults = [fault for cloud in clouds if (fault := _normalisation_fault(cloud, contract))]
     rule = {"none": "not centred", "mean": "mean at the origin", "corner": "corner at the origin", "floor": "on z = 0"}
     wanted = rule[contract.centring] + (", farthest point at 1" if contract.scaling != "none" else "")
     if contract.centring != "none":
         wanted += f", {contract.normalise}"
     advice = f"the model takes clouds that are: {wanted}; follow the preset's order of steps"
-    return verdict("normalisation", faults[0] if faults else "", advice, found=wanted)
+    return ruled("normalisation", faults[0] if faults else "", advice, found=wanted)
 
 
 def _normalisation_fault(cloud: Tensor, contract: ModelContract) -> str:
@@ -197,21 +196,21 @@ def _normalisation_fault(cloud: Tensor, contract: ModelContract) -> str:
     return "the mean is at the origin: it was subtracted" if offset < 1e-5 * extent else ""
 
 
-def _in_front(clouds: list[Tensor]) -> Check:
+def _in_front(clouds: list[Tensor]) -> Finding:
     behind = float((torch.cat(clouds)[:, 2] <= 0).float().mean())
     fault = f"{behind:.1%} of the points have z <= 0, behind the camera" if behind > _STRAY else ""
     advice = "the model takes camera coordinates, z forward: leave ToFrame out, or undo the change of axes"
-    return verdict("axes", fault, advice, found="all points lie before the camera")
+    return ruled("axes", fault, advice, found="all points lie before the camera")
 
 
-def _crop(clouds: list[Tensor], contract: ModelContract) -> Check:
+def _crop(clouds: list[Tensor], contract: ModelContract) -> Finding:
     assert contract.crop is not None
     points = torch.cat(clouds)
     lower, upper = points.new_tensor(contract.crop)
     outside = float(((points < lower - _TOLERANCE) | (points > upper + _TOLERANCE)).any(dim=1).float().mean())
     fault = f"{outside:.1%} of the points lie outside the crop {contract.crop}" if outside > _STRAY else ""
     advice = f"add CropWorkspace(frame={contract.frame!r}, lower={contract.crop[0]}, upper={contract.crop[1]})"
-    return verdict("crop", fault, advice, found="all points lie inside")
+    return ruled("crop", fault, advice, found="all points lie inside")
 
 
 def _distinct_rows(cloud: Tensor) -> int:
@@ -223,14 +222,14 @@ def _distinct_rows(cloud: Tensor) -> int:
     return int(group.max()) + 1 if len(cloud) else 0
 
 
-def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Check:
+def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Finding:
     distinct = [_distinct_rows(cloud) for cloud in clouds]
     share = max(1.0 - count / len(cloud) for count, cloud in zip(distinct, clouds))
     found = f"{share:.0%} of the points are repeated"
     fault = found if share > contract.max_duplicates else ""
     if min(distinct) < MIN_POINTS:  # filled up with zeros, none is repeated
         fault = f"a cloud has {min(distinct)} different points, and fewer than {MIN_POINTS} describe no surface"
-    return verdict(
+    return ruled(
         "duplicates",
         fault,
         f"at most {contract.max_duplicates:.0%} repeated is usual: the clouds are too thin; {denser(contract)}",
@@ -238,23 +237,25 @@ def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Check:
     )
 
 
-def _table(batch: ModelBatch, clouds: list[Tensor], contract: ModelContract) -> Check:
+def _table(batch: ModelBatch, clouds: list[Tensor], contract: ModelContract) -> Finding:
     removed = None if batch.steps is None else bool(_OBJECT_STEPS & set(batch.steps))
     if contract.table == "kept":
         if removed:
-            return verdict("table", "the table was removed", "leave RemovePlane out: the model expects it", found="")
+            return ruled("table", "the table was removed", "leave RemovePlane out: the model expects it", found="")
         fault = ""
         if removed is None and (share := _plane_share(clouds[0])) < 0.1:
             fault = f"the largest plane holds {share:.0%} of the points: was the table removed?"
-        return verdict("table", fault, "the model is trained with the table in view", found="kept", unknown=True)
+        return ruled("table", fault, "the model is trained with the table in view", found="kept", if_fault=Verdict.WARN)
     if contract.table == "removed":
         fault = ""
         if removed is False:
             fault = "no step removed the table or cut objects out"
         elif removed is None and (share := _plane_share(clouds[0])) > 0.5:
             fault = f"one plane holds {share:.0%} of the points: is the table still there?"
-        return verdict("table", fault, "the model takes one object: cut it out first", found="removed", unknown=True)
-    return verdict("table", "", "", found="left to you")
+        return ruled(
+            "table", fault, "the model takes one object: cut it out first", found="removed", if_fault=Verdict.WARN
+        )
+    return ruled("table", "", "", found="left to you")
 
 
 def _plane_share(cloud: Tensor) -> float:
@@ -267,24 +268,23 @@ def _plane_share(cloud: Tensor) -> float:
     return float(inliers.float().mean())
 
 
-def _image_scale(images: Tensor, contract: ModelContract) -> Check:
+def _image_scale(images: Tensor, contract: ModelContract) -> Finding:
     depth = channel_values(images, contract.main, contract.main.channels[0])
     if contract.main.channels[0].name == "depth_relative":
         clipped = float((depth.abs() >= 1).float().mean())
         return graded(
             "scale",
             clipped,
-            threshold=0.2,
-            fails_at=0.6,
+            limits=(0.2, 0.6),
             found=f"{clipped:.0%} of the image is clipped, 1 m from the mean depth",
             advice="in millimetres? the clip takes metres; a far background? mask it before the holes are filled",
         )
     middle = float(depth.median())
     fault = f"the median depth is {middle:.3g}" if not 0.05 <= middle <= 10 else ""
-    return verdict("scale", fault, "the model takes metres", found=f"the median depth is {middle:.3g} m")
+    return ruled("scale", fault, "the model takes metres", found=f"the median depth is {middle:.3g} m")
 
 
-def _image_normalisation(images: Tensor, contract: ModelContract) -> Check:
+def _image_normalisation(images: Tensor, contract: ModelContract) -> Finding:
     channel = contract.main.channels[0]
     depth = channel_values(images, contract.main, channel)
     if channel.name == "depth_relative":
@@ -292,10 +292,9 @@ def _image_normalisation(images: Tensor, contract: ModelContract) -> Check:
         return graded(
             "normalisation",
             offset,
-            threshold=0.1,
-            fails_at=0.5,
+            limits=(0.1, 0.5),
             found=f"the mean of an image is at most {offset:.3g} from 0",
             advice="subtract the image's mean, then clip to [-1, 1]; a far background shifts the mean",
         )
     fault = "there are depths of 0 or less" if float(depth.min()) <= 0 else ""
-    return verdict("normalisation", fault, "give plain metres: the network subtracts by itself", found="plain metres")
+    return ruled("normalisation", fault, "give plain metres: the network subtracts by itself", found="plain metres")

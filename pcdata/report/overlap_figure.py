@@ -15,9 +15,15 @@ from pcdata.functional.rows import cloud_of_rows, transform_points
 from pcdata.report.labels import label_text
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.overlap_result import OverlapResult
+from pcdata.verdicts import Verdict
 
 _PALETTE = ("#4269d0", "#ff725c", "#3ca951", "#efb118", "#a463f2", "#6cc5b0", "#9c6b4e", "#ff8ab7")
-_VERDICT_COLORS = {"pass": "#3ca951", "not measurable": "#9498a0", "warn": "#efb118", "fail": "#d62728"}
+_VERDICT_COLORS = {
+    Verdict.PASS: "#3ca951",
+    Verdict.UNKNOWN: "#9498a0",
+    Verdict.WARN: "#efb118",
+    Verdict.FAIL: "#d62728",
+}
 _MAX_DRAWN = 30_000  # points per view: more only cost time
 _REACH = 0.6  # metres around the middle of the overlap: about one workspace
 _SLICE = 0.01  # metres, thickness of the cut that shows double surfaces
@@ -99,7 +105,7 @@ def _draw_gaps(axis: Any, result: OverlapResult) -> None:
     for pair in result.pairs:
         if pair.num_samples:
             share = np.array(pair.histogram) / pair.num_samples
-            line = "-" if pair.verdict == "pass" else "--"
+            line = "-" if pair.verdict is Verdict.PASS else "--"
             label = label_text(f"{pair.first} - {pair.second}: {1e3 * pair.median:.1f} mm")
             axis.stairs(share, edges, label=label, linestyle=line)
     axis.axvspan(-1e3 * result.limits.residual[0], 1e3 * result.limits.residual[0], color="#3ca951", alpha=0.12)

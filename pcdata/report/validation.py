@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pcdata.errors import told_apart
 from pcdata.report.table import text_table
-from pcdata.validation import Check, Summary, Verdict
+from pcdata.validation import Summary
 from pcdata.validation.report import Message
+from pcdata.verdicts import Finding, Verdict
 
 
 def validation_text(summary: Summary) -> str:
@@ -25,7 +26,7 @@ def validation_text(summary: Summary) -> str:
             notes += [_note(f"{name}{of_view}", message) for message in entry.messages.values()]
             if entry.untold:
                 notes.append(f"     {name}{of_view}: other words in {entry.untold} captures more")
-    table = text_table(["check", "view", "pass", "warn", "fail", "worst", "passes"], rows)
+    table = text_table(["check", "view", *map(str, Verdict), "worst", "passes"], rows)
     shares = ", ".join(f"{summary.samples[verdict]} {verdict.value}" for verdict in Verdict)
     end = f"{summary.verdict.value.upper()}: of {sum(summary.samples.values())} captures {shares}"
     return "\n\n".join(part for part in (table, "\n".join(notes), end) if part)
@@ -38,7 +39,7 @@ def _note(name: str, message: Message) -> str:
     return f"{check.verdict.value.upper()} {name} ({where}): {check.found}{advice}"
 
 
-def _value_and_limit(check: Check) -> tuple[str, str]:
+def _value_and_limit(check: Finding) -> tuple[str, str]:
     """Return the number and its limit with digits that show which is larger."""
     value, limit = check.value, check.threshold
     if value is not None and limit is not None:

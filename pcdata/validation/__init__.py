@@ -1,7 +1,6 @@
 """Judging captures: do they hold what training needs, and do several cameras agree."""
 
-from pcdata.validation.check import Check, Verdict
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.report import WHOLE, SampleReport, Summary
@@ -10,14 +9,12 @@ from pcdata.validation.run import check_of_error, validate_frame, validate_sourc
 __all__ = [
     "WHOLE",
     "CameraOverlap",
-    "Check",
-    "Limits",
+    "CaptureLimits",
     "OverlapLimits",
     "OverlapResult",
     "PairOverlap",
     "SampleReport",
     "Summary",
-    "Verdict",
     "check_of_error",
     "validate_frame",
     "validate_source",

@@ -1,22 +1,19 @@
-"""The thresholds of the checks, each with its reason."""
+"""The limits of the checks on captures, each with its reason."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
+from pcdata.verdicts import Limits
 
 _TABLE = (0.2, 2.0)  # metres, of a camera above a table
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Where checks stop passing and where they fail; the defaults suit a camera above a table.
-
-    Pairs are (last value that passes, last value that does not fail).
-    """
+class CaptureLimits(Limits):
+    """What a capture keeps that one may train on; the defaults suit a camera above a table."""
 
     # Depth that the task is about, (nearest, farthest) in metres.
     workspace: tuple[float, float] = _TABLE
@@ -44,7 +41,7 @@ class Limits:
     sync: tuple[float, float] = (0.0167, 0.0334)
 
     @classmethod
-    def for_sensor(cls, name: str) -> Limits:
+    def for_sensor(cls, name: str) -> CaptureLimits:
         """Return limits whose workspace is the range of the named sensor, with the units that it stores.
 
         Raises:
@@ -59,6 +56,9 @@ class Limits:
         return self.workspace != _TABLE and not self.units
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         near, far = self.workspace
-        if not (0 < near < far and math.isfinite(far)):
-            raise ConfigError(f"Limits: workspace must be (near, far) in metres with 0 < near < far, got {near}, {far}")
+        if not 0 < near < far:
+            raise ConfigError(
+                f"CaptureLimits: workspace must be (near, far) in metres with 0 < near < far, got {near}, {far}"
+            )

@@ -18,6 +18,7 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.validation.measures.surfaces import surfaces_of
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
+from pcdata.verdicts import Verdict, judged, worst
 
 _MIN_MATCHES = 100  # samples; a smaller overlap says nothing about six unknowns
 _MAX_SAMPLES = 4000  # per view and capture: what two cores align well within a second
@@ -68,8 +69,8 @@ def verify_overlap(
         return found
     # A view that is far off spoils the fit of all by partners found by chance: look whether the rest agree without it.
     rests = {view: _without(view, surfaces, poses[0], names, limits) for view in range(num_views)}
-    agreeing = [view for view, rest in rests.items() if rest.verdict in ("pass", "not measurable")]
-    confirmed = {view: sum(pair.verdict == "pass" for pair in rests[view].pairs) for view in agreeing}
+    agreeing = [view for view, rest in rests.items() if rest.verdict in (Verdict.PASS, Verdict.UNKNOWN)]
+    confirmed = {view: sum(pair.verdict is Verdict.PASS for pair in rests[view].pairs) for view in agreeing}
     best = [view for view in agreeing if confirmed[view] == max(confirmed.values())]
     return _far_off(best[0], found, rests[best[0]]) if len(best) == 1 and confirmed[best[0]] else found
 
@@ -95,7 +96,7 @@ def _far_off(view: int, joint: OverlapResult, rest: OverlapResult) -> OverlapRes
         rotation_degrees=math.inf,
         correction=torch.eye(4, dtype=torch.float64, device="cpu").tolist(),
         unmeasurable=(),
-        verdict="fail",
+        verdict=Verdict.FAIL,
     )
     cameras = [*rest.cameras[:view], lost, *rest.cameras[view:]]
     return replace(joint, cameras=tuple(cameras), wrong=(lost.name,), candidates=(), reference=rest.reference)
@@ -146,11 +147,11 @@ def _pair(fit: PairFit, back: PairFit, names: Sequence[str], limits: OverlapLimi
     meets = len(residual) / visible if visible else 0.0
     apart = visible >= _MIN_MATCHES and meets < _MIN_MEETING and fit.knows_visibility
     if apart:
-        verdict = "fail"
+        verdict = Verdict.FAIL
     elif not enough:
-        verdict = "not measurable"
+        verdict = Verdict.UNKNOWN
     else:
-        verdict = limits.verdict(values[0], limits.residual)
+        verdict = judged(values[0], *limits.residual)
     return PairOverlap(
         first=names[fit.source],
         second=names[fit.target],
@@ -192,13 +193,11 @@ def _camera(
         consensus.twists[view, :3], covariance[:3, :3], math.radians(limits.max_rotation_sigma_degrees)
     )
     degrees = math.degrees(float(turn.norm()))
-    verdict = limits.worse(
-        limits.verdict(float(shift.norm()), limits.shift), limits.verdict(degrees, limits.rotation_degrees)
-    )
-    if verdict == "pass" and unknown:
-        verdict = "not measurable"
-    if is_suspect and consensus.candidates and verdict in ("pass", "not measurable"):
-        verdict = "warn"  # it may be this one as well as the other
+    verdict = worst((judged(float(shift.norm()), *limits.shift), judged(degrees, *limits.rotation_degrees)))
+    if verdict is Verdict.PASS and unknown:
+        verdict = Verdict.UNKNOWN
+    if is_suspect and consensus.candidates and verdict in (Verdict.PASS, Verdict.UNKNOWN):
+        verdict = Verdict.WARN  # it may be this one as well as the other
     return CameraOverlap(
         name=names[view],
         shift=float(shift.norm()),

@@ -8,16 +8,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pcdata.errors import ConfigError, told_apart
+from pcdata.verdicts import Limits, Verdict, finite_json, worst
 
-# From best to worst: what could not be measured is no pass, but nothing was found wrong either.
-VERDICTS = ("pass", "not measurable", "warn", "fail")
 # Intrinsics of another resolution or another unit of depth move surfaces as a bent mount does.
 _FIRST = "make sure that its intrinsics are those of these images (size, fx) and its unit of depth is right"
 
 
 @dataclass(frozen=True, kw_only=True)
-class OverlapLimits:
-    """Pairs are (last value that passes, last value that does not fail); in between it warns.
+class OverlapLimits(Limits):
+    """What cameras that agree keep.
 
     0.25 and 0.4 degrees move a point at 0.7 m, the reach of a table-top workspace, by 3 and 5 mm.
     """
@@ -29,24 +28,10 @@ class OverlapLimits:
     max_rotation_sigma_degrees: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("residual", "shift", "rotation_degrees"):
-            passes, fails = getattr(self, name)
-            if not 0 < passes <= fails < math.inf:
-                raise ConfigError(
-                    f"OverlapLimits: {name} must be (pass, fail) with 0 < pass <= fail, got {passes, fails}"
-                )
-        if not (self.max_shift_sigma > 0 and self.max_rotation_sigma_degrees > 0):
-            raise ConfigError("OverlapLimits: the largest sigmas must be more than 0")
-
-    @staticmethod
-    def verdict(value: float, limit: tuple[float, float]) -> str:
-        """Judge one number."""
-        return "pass" if value <= limit[0] else "warn" if value <= limit[1] else "fail"
-
-    @staticmethod
-    def worse(*verdicts: str) -> str:
-        """Return the worst."""
-        return max(verdicts, key=VERDICTS.index)
+        super().__post_init__()
+        for name, value in vars(self).items():
+            if 0 in (value if isinstance(value, tuple) else (value,)):  # no surface is met so well
+                raise ConfigError(f"OverlapLimits: {name} must be more than 0, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +46,7 @@ class PairOverlap:
     median: float  # of the absolute distances; NaN = too few samples
     p90: float  # of the absolute distances
     mean: float  # signed, of the central 80 per cent: positive where ``first`` lies nearer to the cameras
-    verdict: str
+    verdict: Verdict
     histogram: tuple[int, ...]  # 60 bins of the signed distances from -15 to +15 mm
 
 
@@ -80,7 +65,7 @@ class CameraOverlap:
     center: tuple[float, ...]  # the middle of what it shares with others, in the common frame
     correction: list[list[float]]  # 4x4 in the common frame: better_pose = correction @ world_from_camera
     unmeasurable: tuple[str, ...]  # directions about which the scene says too little
-    verdict: str
+    verdict: Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,40 +80,43 @@ class OverlapResult:
     limits: OverlapLimits
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """The worst of all pairs that overlap and of all cameras."""
         found = [camera.verdict for camera in self.cameras]
-        found += [pair.verdict for pair in self.pairs if pair.verdict != "not measurable"]
-        return self.limits.worse(*found)
+        found += [pair.verdict for pair in self.pairs if pair.verdict is not Verdict.UNKNOWN]
+        return worst(found)
 
     @property
     def advice(self) -> tuple[str, ...]:
         """What to do, most urgent first; empty when everything passes."""
         return tuple(self._advice())
 
+    def advice_about(self, camera: CameraOverlap) -> str:
+        """Return what to do about one camera: of one that is known to be wrong what concerns it alone, else all."""
+        return _recalibrate(camera) if camera.name in self.wrong else "; ".join(self.advice)
+
     def _advice(self) -> Iterable[str]:
-        by_name = {camera.name: camera for camera in self.cameras}
-        for name in self.wrong:
-            found = by_name[name]
-            if math.isinf(found.shift):
-                yield (
-                    f"recalibrate {name}: the others agree without it, and it is too far off to be measured; first "
-                    f"{_FIRST}"
-                )
-                continue
-            yield (
-                f"recalibrate {name}: the others agree without it, and it is off by {1e3 * found.shift:.1f} mm and "
-                f"{found.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose; first {_FIRST}"
-            )
+        yield from (_recalibrate(camera) for camera in self.cameras if camera.name in self.wrong)
         if self.candidates:
             yield (
                 f"{' and '.join(self.candidates)} contradict each other and the views cannot tell which is wrong; "
                 f"first {_FIRST}, then check the mounts, add a third camera, or recalibrate them"
             )
         for pair in self.pairs:
-            if pair.verdict == "fail":
+            if pair.verdict is Verdict.FAIL:
                 yield f"{pair.first} and {pair.second}: {self._why_failed(pair)}"
+            elif pair.verdict is Verdict.WARN:
+                apart, passes = told_apart(1e3 * pair.median, 1e3 * self.limits.residual[0])
+                yield (
+                    f"{pair.first} and {pair.second}: their surfaces lie {apart} mm apart, up to {passes} pass; give "
+                    "more captures to be sure, or let pcdata calib refine propose poses"
+                )
         for camera in self.cameras:
+            if camera.verdict is Verdict.WARN and camera.name not in self.candidates:
+                yield (
+                    f"{camera.name}: off by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees, "
+                    "more than passes; give more captures to be sure, or let pcdata calib refine propose its pose"
+                )
             if camera.unmeasurable:
                 yield (
                     f"{camera.name}: not measurable here: {'; '.join(camera.unmeasurable)}; put objects with upright "
@@ -149,7 +137,7 @@ class OverlapResult:
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON; numbers that are not finite become None."""
         plain = {"verdict": self.verdict, "advice": list(self.advice), **asdict(self)}
-        return _finite(plain)
+        return finite_json(plain)
 
     def text(self) -> str:
         """Return the numbers as lines for a terminal."""
@@ -167,9 +155,13 @@ class OverlapResult:
         return "\n".join([*lines, *(f"  -> {line}" for line in self.advice)])
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _recalibrate(camera: CameraOverlap) -> str:
+    if math.isinf(camera.shift):
+        return (
+            f"recalibrate {camera.name}: the others agree without it, and it is too far off to be measured; first "
+            f"{_FIRST}"
+        )
+    return (
+        f"recalibrate {camera.name}: the others agree without it, and it is off by {1e3 * camera.shift:.1f} mm and "
+        f"{camera.rotation_degrees:.2f} degrees; pcdata calib refine can propose its pose; first {_FIRST}"
+    )

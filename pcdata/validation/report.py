@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from pcdata.validation.check import Check, Verdict, worst
+from pcdata.verdicts import Finding, Verdict, worst
 
 WHOLE = "*"  # the sample id of checks on the capture as a whole
 _EXAMPLES = 5  # samples named for every message
@@ -21,16 +21,16 @@ class SampleReport:
     """All checks on one sample."""
 
     sample_id: str  # WHOLE = all samples together
-    checks: tuple[Check, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def verdict(self) -> Verdict:
         """The worst verdict of all checks."""
-        return worst(self.checks)
+        return worst(finding.verdict for finding in self.findings)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        checks = [check.to_json() for check in self.checks]
+        checks = [finding.to_json() for finding in self.findings]
         return {"sample_id": self.sample_id, "verdict": self.verdict.value, "checks": checks}
 
 
@@ -38,7 +38,7 @@ class SampleReport:
 class Message:
     """What one check said of some samples, in the same words but for numbers."""
 
-    check: Check  # the first that said so
+    check: Finding  # the first that said so
     count: int = 0
     examples: list[str] = field(default_factory=list)  # the first samples
 
@@ -54,12 +54,12 @@ class CheckSummary:
     """One check on one view, over all samples."""
 
     counts: Counter[Verdict] = field(default_factory=Counter)
-    worst: Check | None = None  # the first one of the worst verdict
+    worst: Finding | None = None  # the first one of the worst verdict
     examples: list[str] = field(default_factory=list)  # the first samples of the worst verdict
     messages: dict[str, Message] = field(default_factory=dict)  # of the worst verdict, by their words
     untold: int = 0  # samples of the worst verdict whose message is one too many to keep
 
-    def add(self, sample_id: str, check: Check) -> None:
+    def add(self, sample_id: str, check: Finding) -> None:
         """Count one more check."""
         self.counts[check.verdict] += 1
         if self.worst is None or check.verdict.severity > self.worst.verdict.severity:
@@ -88,14 +88,14 @@ class Summary:
         """Count the checks of one more sample."""
         if report.sample_id != WHOLE:
             self.samples[report.verdict] += 1
-        for check in report.checks:
+        for check in report.findings:
             key = (f"{check.name} (all captures)" if report.sample_id == WHOLE else check.name, check.view)
             self.checks.setdefault(key, CheckSummary()).add(report.sample_id, check)
 
     @property
     def verdict(self) -> Verdict:
         """The worst verdict of all checks on all samples."""
-        return worst(entry.worst for entry in self.checks.values() if entry.worst is not None)
+        return worst(entry.worst.verdict for entry in self.checks.values() if entry.worst is not None)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""

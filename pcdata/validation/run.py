@@ -9,7 +9,6 @@ from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataErr
 from pcdata.io.sources.source import Source, checked_ids
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
-from pcdata.validation.check import Check, Verdict, worst
 from pcdata.validation.checks.cameras import intrinsics_checks, pose_checks
 from pcdata.validation.checks.clouds import cloud_checks
 from pcdata.validation.checks.color_registration import frame_votes, registration_check
@@ -20,9 +19,10 @@ from pcdata.validation.checks.readings import reading_checks
 from pcdata.validation.checks.sequence import ClockChecks, RepeatChecks
 from pcdata.validation.checks.stored_files import raw_value_checks
 from pcdata.validation.checks.view_overlap import overlap_checks
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.edge_offset import EdgeVotes
 from pcdata.validation.report import WHOLE, SampleReport
+from pcdata.verdicts import Finding, Verdict, worst
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
 READABLE = "readable"
@@ -44,7 +44,7 @@ class Captures(Protocol):
 
 
 @torch_on_one_thread()
-def validate_frame(frame: DepthFrame, *, limits: Limits | None = None) -> list[Check]:
+def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) -> list[Finding]:
     """Check every view of one capture on its own, then the views against each other.
 
     Args:
@@ -59,10 +59,10 @@ def validate_frame(frame: DepthFrame, *, limits: Limits | None = None) -> list[C
             f"validate_frame: frame must be a DepthFrame, got {type(frame).__name__}; source.load(id) makes one, and "
             "validate_source judges a source with all its captures"
         )
-    return _frame_checks(frame, frame_votes(frame), limits or Limits())
+    return _frame_checks(frame, frame_votes(frame), limits or CaptureLimits())
 
 
-def validate_source(source: Captures, *, limits: Limits | None = None) -> Iterator[SampleReport]:
+def validate_source(source: Captures, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
     """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
@@ -78,10 +78,10 @@ def validate_source(source: Captures, *, limits: Limits | None = None) -> Iterat
         DTypeError: it is no source.
         CaptureError: it has no captures, or two with one id.
     """
-    return _reports(source, checked_ids("validate_source", source), limits or Limits())
+    return _reports(source, checked_ids("validate_source", source), limits or CaptureLimits())
 
 
-def _reports(source: Captures, ids: list[str], limits: Limits) -> Iterator[SampleReport]:
+def _reports(source: Captures, ids: list[str], limits: CaptureLimits) -> Iterator[SampleReport]:
     series = _Series(limits)
     for sample_id in ids:
         yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
@@ -89,10 +89,10 @@ def _reports(source: Captures, ids: list[str], limits: Limits) -> Iterator[Sampl
         yield SampleReport(WHOLE, tuple(whole))
 
 
-def check_of_error(error: PcdataError) -> Check:
+def check_of_error(error: PcdataError) -> Finding:
     """Turn what a reader refused into the failed check that its type names."""
     names = (name for kind, name in _CHECK_OF_ERROR.items() if isinstance(error, kind))
-    return Check(
+    return Finding(
         name=next(names, READABLE),
         verdict=Verdict.FAIL,
         found=str(error),
@@ -104,7 +104,7 @@ def check_of_error(error: PcdataError) -> Check:
 class _Series:
     """Checks captures one after another and remembers what the next ones are compared with."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: CaptureLimits) -> None:
         self._limits = limits
         self._repeats = RepeatChecks()
         self._clock = ClockChecks(limits)
@@ -113,8 +113,8 @@ class _Series:
         self._voted = 0
 
     @torch_on_one_thread()
-    def check(self, source: Captures, sample_id: str) -> list[Check]:
-        checks: list[Check] = []
+    def check(self, source: Captures, sample_id: str) -> list[Finding]:
+        checks: list[Finding] = []
         try:
             if isinstance(source, Source):
                 source.check_links(sample_id)
@@ -135,7 +135,7 @@ class _Series:
         return checks
 
     @torch_on_one_thread()
-    def whole(self) -> list[Check]:
+    def whole(self) -> list[Finding]:
         """Judge what all captures tell together."""
         checks = self._poses.whole()
         if self._voted >= 2:
@@ -156,8 +156,8 @@ class _Series:
 
 
 def _frame_checks(
-    frame: DepthFrame, votes: Iterable[EdgeVotes], limits: Limits, repeated: Collection[int] = ()
-) -> list[Check]:
+    frame: DepthFrame, votes: Iterable[EdgeVotes], limits: CaptureLimits, repeated: Collection[int] = ()
+) -> list[Finding]:
     checks = []
     for view, depth in enumerate(frame.depth):
         checks += coverage_checks(depth > 0, limits, view)
@@ -167,12 +167,14 @@ def _frame_checks(
     checks += pose_checks(frame)
     direction = direction_checks(frame, {*repeated, *_views_failing(checks, "depth_unit")})
     checks += direction
-    if worst(direction) is not Verdict.FAIL:  # views carried the wrong way have no gap worth a number
+    if (
+        worst(one.verdict for one in direction) is not Verdict.FAIL
+    ):  # views carried the wrong way have no gap worth a number
         checks += overlap_checks(frame)
     checks += [registration_check(one, limits, view) for view, one in enumerate(votes)]
     return checks
 
 
-def _views_failing(checks: Iterable[Check], *names: str) -> set[int]:
+def _views_failing(checks: Iterable[Finding], *names: str) -> set[int]:
     failed = (check for check in checks if check.name in names and check.verdict is Verdict.FAIL)
     return {check.view for check in failed if check.view is not None}

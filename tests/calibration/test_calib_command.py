@@ -61,7 +61,7 @@ def test_check_fails_on_bias_and_names_the_limit(capsys, walls: Path):
     code, out, _ = run(capsys, "calib", "check", walls, "--distance", "1.2", "--along", "normal")
     assert code == 1
     assert "near: bias, part of the distance is" in out
-    assert "must be <= 0.5 %" in out
+    assert "at most 0.5 %: measure the distance again" in out
     assert "verdict  FAIL: 1 of 2 captures in order" in out
 
 

@@ -17,6 +17,7 @@ from pcdata.calibration.motions import motions_between
 from pcdata.calibration.park_martin import park_martin
 from pcdata.errors import CalibrationError, ConfigError, PoseError, ShapeError
 from pcdata.geometry import rigid
+from pcdata.verdicts import Verdict
 from tests.calibration.robots import (
     HOLDER_FROM_TARGET,
     MOUNT_FROM_CAMERA,
@@ -43,7 +44,7 @@ def test_exact_poses_give_the_exact_answer(setup, count):
         millimetres, degrees = apart(found, truth)
         assert millimetres < 1e-4
         assert degrees < 1e-5
-    assert result.passed
+    assert result.verdict is Verdict.PASS
     assert result.outliers == ()
     assert result.mount == ("gripper" if setup == "eye-in-hand" else "base")
 
@@ -56,7 +57,7 @@ def test_corner_noise_of_a_fifth_of_a_pixel_leaves_half_a_millimetre(setup, seed
     millimetres, degrees = apart(result.mount_from_camera, MOUNT_FROM_CAMERA)
     assert millimetres < 0.5
     assert degrees < 0.05
-    assert result.passed
+    assert result.verdict is Verdict.PASS
 
 
 def test_the_fit_over_all_poses_is_better_than_the_closed_forms():
@@ -148,23 +149,23 @@ def test_a_pose_of_another_moment_is_named_and_does_not_spoil_the_answer():
 def test_the_wrong_setup_fails_and_is_recognised(setup):
     other = SETUPS[1 - SETUPS.index(setup)]
     result = calibrate_hand_eye(robot_poses(camera_poses(12), setup=setup, noise=0.2), setup=other)
-    assert not result.passed
-    assert result.advice is not None
-    assert f"the poses fit as {setup}: check --setup" in result.advice
+    assert result.verdict is Verdict.FAIL
+    (advice,) = {finding.advice for finding in result.findings if finding.advice}
+    assert f"the poses fit as {setup}: check --setup" in advice
 
 
 def test_target_poses_the_wrong_way_round_are_recognised():
     poses = robot_poses(camera_poses(12), noise=0.2)
     wrong = replace(poses, camera_from_target=rigid.invert_rigid(poses.camera_from_target))
     result = calibrate_hand_eye(wrong, setup="eye-in-hand")
-    assert not result.passed
-    assert result.advice is not None
-    assert "they are target_from_camera, give camera_from_target" in result.advice
+    assert result.verdict is Verdict.FAIL
+    (advice,) = {finding.advice for finding in result.findings if finding.advice}
+    assert "they are target_from_camera, give camera_from_target" in advice
 
 
 def test_each_limit_can_fail():
     poses = robot_poses(camera_poses(12), noise=0.2)
-    assert calibrate_hand_eye(poses, setup="eye-in-hand").passed
+    assert calibrate_hand_eye(poses, setup="eye-in-hand").verdict is Verdict.PASS
     for change in (
         {"max_translation_rms": 1e-5},
         {"max_rotation_rms": 1e-5},
@@ -172,8 +173,8 @@ def test_each_limit_can_fail():
         {"max_rotation_spread": 1e-6},
     ):
         result = calibrate_hand_eye(poses, setup="eye-in-hand", limits=HandEyeLimits(**change))
-        assert [finding.passed for finding in result.findings].count(False) == 1
-        assert result.advice is None  # nothing else fits better
+        assert [finding.verdict for finding in result.findings].count(Verdict.FAIL) == 1
+        assert not any("the poses fit" in finding.advice for finding in result.findings)  # nothing else fits better
 
 
 # -- refusing ------------------------------------------------------------------------------------------------------

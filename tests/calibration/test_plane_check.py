@@ -12,10 +12,15 @@ from pcdata.calibration import PlaneLimits, check_plane
 from pcdata.errors import ConfigError, ShapeError, TooFewPointsError
 from pcdata.functional.depth.deproject import pixel_rays
 from pcdata.structures import Camera, DepthFrame
+from pcdata.verdicts import Verdict
 
 SIZE = (240, 320)
 DISTORTION = [0.05, -0.1, 0.001, -0.001]
 CAMERA = Camera.pinhole(fx=300, fy=300, cx=159.5, cy=119.5, size=SIZE, distortion=DISTORTION)
+
+
+def failed(result):
+    return [finding.name for finding in result.findings if finding.verdict is Verdict.FAIL]
 
 
 def wall(
@@ -81,8 +86,8 @@ def test_the_fill_rate_counts_the_region_alone() -> None:
     depth[:, :60] = 0  # above the central half
     check = check_plane(DepthFrame(depth=depth, camera=CAMERA))
     assert check.fill == pytest.approx(0.9, abs=0.01)
-    assert not check.passed
-    assert [finding.name for finding in check.findings if not finding.passed] == ["fill rate"]
+    assert check.verdict is Verdict.FAIL
+    assert failed(check) == ["fill rate"]
 
 
 def test_clutter_before_the_wall_neither_tilts_it_nor_counts_as_noise() -> None:
@@ -93,28 +98,28 @@ def test_clutter_before_the_wall_neither_tilts_it_nor_counts_as_noise() -> None:
     assert check.depth_rms == pytest.approx(0.002, rel=0.02)
     assert math.degrees(check.tilt) == pytest.approx(5.0, abs=0.02)
     assert check.inlier_share == pytest.approx(1 - 2400 / 19200, abs=0.002)
-    assert not check.passed
+    assert check.verdict is Verdict.FAIL
 
 
 def test_noise_is_judged_by_the_sensor_s_own_model_where_there_is_one() -> None:
     frame = wall(noise=0.004)
     fine = check_plane(frame, noise=lambda z: 0.004 * z**2)
-    assert fine.passed
+    assert fine.verdict is Verdict.PASS
     assert fine.expected_noise == pytest.approx(0.004, rel=0.01)
     poor = check_plane(frame, noise=lambda z: 0.002 * z**2)
-    assert [finding.name for finding in poor.findings if not finding.passed] == ["depth RMS over expected noise"]
+    assert failed(poor) == ["depth RMS over expected noise"]
 
 
 def test_each_limit_can_fail_alone() -> None:
     frame = wall(noise=0.003, scale=1.004)
-    assert check_plane(frame, distance=1.0).passed
+    assert check_plane(frame, distance=1.0).verdict is Verdict.PASS
     for limits, name in [
         (PlaneLimits(max_rms=0.002), "depth RMS, part of the distance"),
         (PlaneLimits(max_bias=0.003), "bias, part of the distance"),
         (PlaneLimits(max_warp=0.00001), "warp"),
     ]:
         check = check_plane(frame, distance=1.0, limits=limits)
-        assert [finding.name for finding in check.findings if not finding.passed] == [name]
+        assert failed(check) == [name]
 
 
 @pytest.mark.parametrize("bowl", [0.008, -0.008])
@@ -124,7 +129,7 @@ def test_a_bowl_is_measured_by_its_height_and_fails_though_its_rms_is_small(bowl
     check = check_plane(wall(bowl=bowl, tilt=tilt, noise=0.001))
     assert check.warp == pytest.approx(0.008, rel=0.05)
     assert check.depth_rms < 0.003
-    assert [finding.name for finding in check.findings if not finding.passed] == ["warp"]
+    assert failed(check) == ["warp"]
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.005])
@@ -136,14 +141,16 @@ def test_a_bias_of_8_mm_at_1_m_fails_with_and_without_a_sensor_s_model() -> None
     frame = wall(normal_distance=1.0, scale=0.992, noise=0.001)
     plain = check_plane(frame, distance=1.0)
     modelled = check_plane(frame, distance=1.0, noise=lambda z: 0.0037 * z**2)
-    assert [finding.name for finding in plain.findings if not finding.passed] == ["bias, part of the distance"]
-    assert [finding.name for finding in modelled.findings if not finding.passed] == ["size of the bias"]
-    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0055 * z**2).passed, "1.5 times 5.5 mm is more than 8"
+    assert failed(plain) == ["bias, part of the distance"]
+    assert failed(modelled) == ["size of the bias"]
+    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0055 * z**2).verdict is Verdict.PASS, (
+        "1.5 times 5.5 mm is more than 8"
+    )
 
 
 def test_no_model_asks_for_more_than_a_wall_and_a_tape_measure_can_show() -> None:
     frame = wall(scale=1.0005, noise=0.0001, bowl=0.0008)
-    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0003 * z**2).passed
+    assert check_plane(frame, distance=1.0, noise=lambda z: 0.0003 * z**2).verdict is Verdict.PASS
 
 
 def test_quantised_depth_without_noise_is_no_clutter() -> None:

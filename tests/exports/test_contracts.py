@@ -15,7 +15,7 @@ from pcdata.models import CONTRACTS, check
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Deproject
-from pcdata.validation import Verdict
+from pcdata.verdicts import Verdict
 from tests.exports.samples import Samples, cloud, shape
 
 CLOUDS: dict[str, PointCloud] = {

@@ -11,7 +11,8 @@ import torch
 from pcdata.errors import ConfigError, ContractError, DTypeError
 from pcdata.models import CONTRACTS, check, contract, require
 from pcdata.structures import PointCloud
-from pcdata.validation import Summary, Verdict
+from pcdata.validation import Summary
+from pcdata.verdicts import Verdict
 from tests.models.captures import answers, correct_batch, sample_of, with_tensor
 from tests.models.violations import CHEAP, VIOLATIONS
 
@@ -75,11 +76,11 @@ def test_a_removed_table_is_told_from_the_history():
     assert failed(summary) == {"table"}
 
 
-def test_named_arrays_warn_where_nothing_is_declared_and_pass_where_it_is():
+def test_named_arrays_are_unknown_where_nothing_is_declared_and_pass_where_it_is():
     array = correct_batch("graspnet_baseline")["point_clouds"].numpy()
     bare = check({"point_clouds": array}, "graspnet_baseline")
-    warned = {rule for (rule, _), entry in bare.checks.items() if entry.counts[Verdict.WARN]}
-    assert warned == {"frame", "unit", "channels"}
+    unknown = {rule for (rule, _), entry in bare.checks.items() if entry.counts[Verdict.UNKNOWN]}
+    assert unknown == {"frame", "unit", "channels"}
     assert not failed(bare)
     declared = check(
         {"point_clouds": array},

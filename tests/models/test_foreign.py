@@ -13,7 +13,7 @@ import pytest
 from pcdata.cli import main
 from pcdata.errors import CacheError, ConfigError, ContractError, DTypeError, PcdataError, ShapeError
 from pcdata.models import check, check_files, require
-from pcdata.validation import Verdict
+from pcdata.verdicts import Verdict
 from tests.models.captures import correct_batch
 from tests.models.test_check import failed
 

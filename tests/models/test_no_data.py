@@ -12,7 +12,7 @@ import torch
 from pcdata.errors import ConfigError
 from pcdata.models import CONTRACTS, ModelBatch, check, contract
 from pcdata.structures import PointCloud
-from pcdata.validation import Verdict
+from pcdata.verdicts import Verdict
 from tests.models.captures import answers, capture, correct_batch
 
 each_contract = pytest.mark.parametrize("name", CONTRACTS)

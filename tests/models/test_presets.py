@@ -16,7 +16,7 @@ from pcdata.rng import seeded
 from pcdata.structures import NORMALIZED, PointCloud
 from pcdata.synthetic import SyntheticSource, tabletop
 from pcdata.transforms import Pipeline, RandomSample
-from pcdata.validation import Verdict
+from pcdata.verdicts import Verdict
 from tests.models.captures import answers, capture, correct_batch, made_preset, sample_of
 
 each_contract = pytest.mark.parametrize("name", CONTRACTS)

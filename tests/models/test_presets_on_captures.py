@@ -18,7 +18,7 @@ from pcdata.rng import seeded
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import DecimateDepth, VoxelDownsample
-from pcdata.validation import Verdict
+from pcdata.verdicts import Verdict
 from tests.models.captures import answers, made_preset
 
 each_contract = pytest.mark.parametrize("name", CONTRACTS)

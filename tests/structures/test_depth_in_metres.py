@@ -8,7 +8,8 @@ import torch
 from pcdata.calibration import RobotPoses
 from pcdata.errors import CalibrationError, PoseError, UnitError
 from pcdata.structures import Calibration, Camera, DepthFrame
-from pcdata.validation import Verdict, validate_frame
+from pcdata.validation import validate_frame
+from pcdata.verdicts import Verdict
 
 CAMERA = Camera.pinhole(fx=50, fy=50, cx=19.5, cy=14.5, size=(30, 40))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from pcdata.io import write_color, write_depth, write_pose
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import Tabletop, tabletop
-from pcdata.validation import Check, Verdict
+from pcdata.verdicts import Finding, Verdict
 
 SIZE = HEIGHT, WIDTH = 240, 320  # pixels
 
@@ -35,7 +35,7 @@ def scene(seed: int = 0, num_views: int = 2) -> Tabletop:
     return tabletop(seed, num_views=num_views, noise="stereo", size=SIZE)
 
 
-def verdicts(checks: Sequence[Check], name: str) -> list[Verdict]:
+def verdicts(checks: Sequence[Finding], name: str) -> list[Verdict]:
     """The verdicts of one check on all views; there must be one."""
     found = [check.verdict for check in checks if check.name == name]
     assert found, f"{name} was not among {sorted({check.name for check in checks})}"

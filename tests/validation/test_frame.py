@@ -14,11 +14,12 @@ from pcdata.errors import ConfigError
 from pcdata.geometry import rigid
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, tabletop
-from pcdata.validation import Check, Limits, Verdict
+from pcdata.validation import CaptureLimits
+from pcdata.verdicts import Finding, Verdict
 from tests.validation.captures import HEIGHT, SIZE, WIDTH, scene, verdicts
 
 
-def failed(frame: DepthFrame, limits: Limits | None = None) -> set[str]:
+def failed(frame: DepthFrame, limits: CaptureLimits | None = None) -> set[str]:
     return {check.name for check in validate_frame(frame, limits=limits) if check.verdict is Verdict.FAIL}
 
 
@@ -67,7 +68,7 @@ def test_a_far_scene_is_no_wrong_unit_once_the_workspace_is_given() -> None:
     frame = scene(num_views=1).frame
     far = replace(frame, depth=frame.depth * 5)
     assert {"depth_unit", "workspace_fraction"} <= failed(far)
-    assert not {"depth_unit", "workspace_fraction"} & failed(far, Limits(workspace=(2.5, 30.0)))
+    assert not {"depth_unit", "workspace_fraction"} & failed(far, CaptureLimits(workspace=(2.5, 30.0)))
 
 
 @pytest.mark.parametrize("distance", [2.01, 2.5, 3.0])
@@ -79,7 +80,7 @@ def test_a_scene_at_the_end_of_the_workspace_is_no_wrong_unit(distance: float) -
     check = next(one for one in validate_frame(spread) if one.name == "depth_unit")
     assert check.verdict is Verdict.PASS
     assert check.value == pytest.approx(distance, abs=0.01)
-    assert check.threshold == 2 * Limits().workspace[1]
+    assert check.threshold == 2 * CaptureLimits().workspace[1]
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,7 @@ def test_a_background_that_was_cut_away_warns_and_says_that_this_may_be_right() 
     cut = replace(frame, depth=frame.depth * ((u - WIDTH / 2).abs() + (v - HEIGHT / 2).abs() < 0.35 * WIDTH))
     check = next(one for one in validate_frame(cut) if one.name == "missing_region")
     assert check.value is not None
-    assert check.value > Limits().missing_region[1]
+    assert check.value > CaptureLimits().missing_region[1]
     assert check.verdict is Verdict.WARN
     assert "cut away on purpose" in check.advice
 
@@ -130,11 +131,11 @@ def test_shifted_colour_fails_and_the_shift_is_told(x: int, y: int) -> None:
     assert check.value == pytest.approx((x * x + y * y) ** 0.5, abs=1.25)
 
 
-def test_registration_that_cannot_be_measured_warns_with_the_reason() -> None:
+def test_registration_that_cannot_be_measured_is_unknown_with_the_reason() -> None:
     frame = scene(num_views=1).frame
     flat = replace(frame, depth=torch.full_like(frame.depth, 0.8))
     check = next(one for one in validate_frame(flat) if one.name == "color_registration")
-    assert check.verdict is Verdict.WARN
+    assert check.verdict is Verdict.UNKNOWN
     assert check.value is None
     assert check.found.startswith("not measurable: only 0 points")
 
@@ -260,9 +261,9 @@ def test_65535_read_as_depth_fails_and_the_cure_is_told() -> None:
 def test_a_workspace_that_is_none_is_refused() -> None:
     for near, far in ((2.0, 0.2), (0.0, 1.0), (0.5, float("inf")), (float("nan"), 1.0)):
         with pytest.raises(ConfigError, match="workspace must be"):
-            Limits(workspace=(near, far))
+            CaptureLimits(workspace=(near, far))
 
 
 def test_validation_is_public() -> None:
     assert pcdata.validate_frame is validate_frame
-    assert isinstance(validate_frame(scene(num_views=1).frame)[0], Check)
+    assert isinstance(validate_frame(scene(num_views=1).frame)[0], Finding)

@@ -14,7 +14,8 @@ from pcdata.cli import main
 from pcdata.io import open_source, write_calibration
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import Miscalibration, tabletop
-from pcdata.validation import Check, Verdict, validate_source
+from pcdata.validation import validate_source
+from pcdata.verdicts import Finding, Verdict
 from tests.rigs import CAMERAS, calibration_of, write_rig
 from tests.validation.captures import SIZE, verdicts
 
@@ -33,9 +34,9 @@ def rig(tmp_path: Path, frame: DepthFrame) -> Path:
     return write_rig(tmp_path / "rig", [frame])
 
 
-def checks_of(rig: Path, calibration: Path) -> list[Check]:
+def checks_of(rig: Path, calibration: Path) -> list[Finding]:
     (report,) = validate_source(open_source(rig, calibration=calibration, frame_id="base"))
-    return list(report.checks)
+    return list(report.findings)
 
 
 def test_a_true_rig_passes_every_check_between_cameras(rig: Path) -> None:

@@ -8,13 +8,13 @@ import torch
 
 from pcdata.contracts.lengths import FARTHEST
 from pcdata.structures import Camera, DepthFrame
-from pcdata.validation.check import Check, Verdict, graded
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
+from pcdata.verdicts import Finding, Verdict, graded
 
 _MAX_SKEWED = 1e-3  # of R R^T - I; more is refused where a frame is made
 
 
-def intrinsics_checks(camera: Camera, limits: Limits) -> list[Check]:
+def intrinsics_checks(camera: Camera, limits: CaptureLimits) -> list[Finding]:
     """Judge each view's principal point, field of view and pixel shape; the first two only of uncropped images."""
     checks = []
     for view, k in enumerate(camera.intrinsics.tolist()):
@@ -28,8 +28,7 @@ def intrinsics_checks(camera: Camera, limits: Limits) -> list[Check]:
             graded(
                 "pixel_aspect",
                 abs(fx / fy - 1),
-                threshold=limits.pixel_aspect,
-                fails_at=None,
+                limits=(limits.pixel_aspect, None),
                 found=f"fx {fx:.1f}, fy {fy:.1f} pixels",
                 advice="right only if the image was resized unevenly and K with it; else take the K of this resolution",
                 view=view,
@@ -38,14 +37,13 @@ def intrinsics_checks(camera: Camera, limits: Limits) -> list[Check]:
     return checks
 
 
-def _principal_point(cx: float, cy: float, size: tuple[int, int], limits: Limits, view: int) -> Check:
+def _principal_point(cx: float, cy: float, size: tuple[int, int], limits: CaptureLimits, view: int) -> Finding:
     height, width = size
     off = max(abs(cx + 0.5 - width / 2) / width, abs(cy + 0.5 - height / 2) / height)
     return graded(
         "principal_point",
         off,
-        threshold=limits.principal_point[0],
-        fails_at=limits.principal_point[1],
+        limits=limits.principal_point,
         found=f"({cx:.1f}, {cy:.1f}) in an image of {width}x{height}",
         advice=f"such intrinsics belong to an image of about {2 * cx + 1:.0f}x{2 * cy + 1:.0f}: if this one was "
         f"resized, use Camera.resized(({height}, {width})); if cropped, Camera.cropped",
@@ -53,13 +51,13 @@ def _principal_point(cx: float, cy: float, size: tuple[int, int], limits: Limits
     )
 
 
-def _field_of_view(fx: float, cx: float, width: int, limits: Limits, view: int) -> Check:
+def _field_of_view(fx: float, cx: float, width: int, limits: CaptureLimits, view: int) -> Finding:
     """The angle across the image through the principal point, without the lens distortion."""
     degrees = math.degrees(math.atan((cx + 0.5) / fx) + math.atan((width - 0.5 - cx) / fx))
     least, most = limits.field_of_view
     bound = least if degrees < math.sqrt(least * most) else most
     ok = least <= degrees <= most
-    return Check(
+    return Finding(
         name="field_of_view",
         verdict=Verdict.PASS if ok else Verdict.FAIL,
         found=f"{degrees:.0f} degrees across {width} pixels at fx {fx:.1f}",
@@ -67,12 +65,13 @@ def _field_of_view(fx: float, cx: float, width: int, limits: Limits, view: int) 
         threshold=bound,
         fails_at=bound,
         unit="degrees",
+        at_least=bound == least,
         advice="" if ok else "K belongs to another resolution, or fx is in other units than pixels (mm?)",
         view=view,
     )
 
 
-def pose_checks(frame: DepthFrame) -> list[Check]:
+def pose_checks(frame: DepthFrame) -> list[Finding]:
     """Judge how far each pose is from rigid; poses that are not are refused before a frame exists."""
     if frame.world_from_camera is None:
         return []
@@ -85,8 +84,7 @@ def pose_checks(frame: DepthFrame) -> list[Check]:
         else graded(
             "pose",
             float(off),
-            threshold=_MAX_SKEWED,
-            fails_at=_MAX_SKEWED,
+            limits=(_MAX_SKEWED, _MAX_SKEWED),
             found=f"R R^T differs from the identity by {float(off):.1g}",
             advice="write rotations with more digits, or make them orthonormal again",
             view=view,
@@ -95,8 +93,8 @@ def pose_checks(frame: DepthFrame) -> list[Check]:
     ]
 
 
-def _far_pose(metres: float, frame_id: str, view: int) -> Check:
-    return Check(
+def _far_pose(metres: float, frame_id: str, view: int) -> Finding:
+    return Finding(
         name="pose",
         verdict=Verdict.WARN,
         found=f"the camera stands {metres:.4g} m from the origin of {frame_id!r}",

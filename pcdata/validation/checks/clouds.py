@@ -5,15 +5,15 @@ from __future__ import annotations
 import torch
 
 from pcdata.structures import PointCloud
-from pcdata.validation.check import Check, graded
 from pcdata.validation.checks.coverage import coverage_checks
 from pcdata.validation.checks.readings import reading_checks
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
+from pcdata.verdicts import Finding, graded
 
 _CAMERA = "camera"
 
 
-def cloud_checks(cloud: PointCloud, limits: Limits) -> list[Check]:
+def cloud_checks(cloud: PointCloud, limits: CaptureLimits) -> list[Finding]:
     """Judge a single cloud: coverage where its rows are the pixels of an image; unit, range and clipping always.
 
     Depth is z in a camera's frame, elsewhere the distance from the viewpoint.
@@ -34,12 +34,11 @@ def cloud_checks(cloud: PointCloud, limits: Limits) -> list[Check]:
     return checks + reading_checks((cloud.points - viewpoint).norm(dim=1), limits)
 
 
-def _behind(fraction: float) -> Check:
+def _behind(fraction: float) -> Finding:
     return graded(
         "behind_camera",
         fraction,
-        threshold=0.0,
-        fails_at=0.01,
+        limits=(0.0, 0.01),
         found=f"{100 * fraction:.2g} % of the points have a negative z",
         advice="z points backwards (OpenGL axes), or the cloud is in another frame than the camera's: give frame_id",
     )

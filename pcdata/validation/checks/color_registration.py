@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pcdata.structures import DepthFrame
-from pcdata.validation.check import Check, Verdict
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.edge_offset import (
     SHIFT_LIMIT,
     TELLABLE,
@@ -13,6 +12,7 @@ from pcdata.validation.measures.edge_offset import (
     edge_votes,
     offset_from_votes,
 )
+from pcdata.verdicts import Finding, Verdict
 
 NAME = "color_registration"
 
@@ -24,11 +24,11 @@ def frame_votes(frame: DepthFrame) -> list[EdgeVotes]:
     return [edge_votes(depth, colors) for depth, colors in zip(frame.depth, frame.colors)]
 
 
-def registration_check(votes: EdgeVotes, limits: Limits, view: int) -> Check:
+def registration_check(votes: EdgeVotes, limits: CaptureLimits, view: int) -> Finding:
     """Judge the shift between colour and depth at the rims of near surfaces.
 
     It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it and one of 3
-    pixels can be ruled out, and says "not measurable" otherwise.
+    pixels can be ruled out, and is unknown otherwise.
     """
     offset = offset_from_votes(votes)
     if offset.problem is None and offset.least_length > limits.color_shift:
@@ -36,12 +36,12 @@ def registration_check(votes: EdgeVotes, limits: Limits, view: int) -> Check:
     elif offset.problem is None and offset.length <= limits.color_shift and offset.greatest_length < TELLABLE:
         verdict, advice = Verdict.PASS, ""
     else:
-        verdict = Verdict.WARN
+        verdict = Verdict.UNKNOWN
         advice = "show the camera objects that stand clear of their background on all sides, or look at an overlay"
-    return Check(
+    return Finding(
         name=NAME,
         verdict=verdict,
-        found=_in_words(offset) if verdict is not Verdict.WARN else f"not measurable: {_reason(offset)}",
+        found=_in_words(offset) if verdict is not Verdict.UNKNOWN else f"not measurable: {_reason(offset)}",
         value=offset.length if offset.problem is None else None,
         threshold=limits.color_shift,
         fails_at=limits.color_shift,

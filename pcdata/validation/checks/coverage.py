@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from pcdata.validation.check import Check, graded
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.missing_region import largest_missing_block, largest_missing_region
+from pcdata.verdicts import Finding, graded
 
 
 def coverage_checks(
     valid: Tensor,  # (H, W) bool, True = has a reading
-    limits: Limits,
+    limits: CaptureLimits,
     view: int | None = None,
     *,
     may_be_cut: bool = False,
-) -> list[Check]:
+) -> list[Finding]:
     """Judge the share of pixels that have a reading, and the largest region that has none.
 
     A region without straight ends only warns: someone may have taken the background away on purpose, or something stood
@@ -32,9 +32,8 @@ def coverage_checks(
         graded(
             "valid_fraction",
             fraction,
-            threshold=limits.valid_fraction[0],
-            fails_at=limits.valid_fraction[1],
-            higher_is_better=True,
+            limits=limits.valid_fraction,
+            at_least=True,
             found=f"{count:,} of {valid.numel():,} pixels have a reading",
             advice="raise the exposure or the projector's power, turn away from windows and mirrors, keep to the "
             "sensor's range, or drop the capture",
@@ -43,8 +42,7 @@ def coverage_checks(
         graded(
             "missing_region",
             region.fraction,
-            threshold=limits.missing_region[0],
-            fails_at=limits.missing_region[1] if is_block and not may_be_cut else None,
+            limits=(limits.missing_region[0], limits.missing_region[1] if is_block and not may_be_cut else None),
             found=f"{100 * region.fraction:.0f} % of the image in one piece have no reading, {where}"
             if region.fraction
             else "no region without readings",

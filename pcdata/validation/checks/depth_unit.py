@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, UnitFit, encoded, unit_fits, units_in_words
-from pcdata.validation.check import Check, Verdict
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
+from pcdata.verdicts import Finding, Verdict
 
 NAME = "depth_unit"
 _SURE = 0.94  # probability of a unit that passes; wrong ones reach 0.90 on scenes without noise to judge by
@@ -33,12 +33,12 @@ class Stored(NamedTuple):
 
 def depth_unit_check(
     depth: Tensor,  # (H, W) metres, or (1, N) where there is no image; 0 = no reading
-    limits: Limits,
+    limits: CaptureLimits,
     facts: Mapping[str, Any],  # provenance: metres_per_unit, depth_encoding, unit_is_recorded
     *,
     focal: float | None = None,
     view: int | None = None,
-) -> Check:
+) -> Finding:
     """Pass a unit that alone fits the numbers, warn where others fit too and name them, fail one that does not fit.
 
     Half of the readings beyond twice the workspace warn, whatever the unit.
@@ -78,7 +78,7 @@ def depth_unit_check(
             advice = "no other usual unit fits better: if the scene is that near, say so with workspace"
     else:
         verdict, advice = Verdict.PASS, ""
-    return Check(
+    return Finding(
         name=NAME,
         verdict=verdict,
         found=found,

@@ -10,7 +10,6 @@ import torch
 
 from pcdata.alignment.view_agreement import Agreement
 from pcdata.structures import DepthFrame
-from pcdata.validation.check import Check, Verdict
 from pcdata.validation.measures.pose_conventions import (
     AGREE,
     CONVENTIONS,
@@ -23,11 +22,13 @@ from pcdata.validation.measures.pose_conventions import (
     posed_views,
     share,
 )
+from pcdata.verdicts import Finding, Verdict
 
 NAME = "pose_direction"
 _SURE = 0.9  # when so many agree, no other convention can agree much better
 _CLOSE = 0.1  # difference of mean shares below which two explanations are as good as each other
 _FAR = 100.0  # metres from every other camera: no rig of depth cameras is so large
+_SHARE = "let more of what one view sees lie in another one: without that no pose can be told from its inverse"
 
 Pair = tuple[int, int]
 
@@ -41,7 +42,7 @@ class Explanation(NamedTuple):
     score: float  # mean of the same over all views
 
 
-def direction_checks(frame: DepthFrame, doubtful: Collection[int] = ()) -> list[Check]:
+def direction_checks(frame: DepthFrame, doubtful: Collection[int] = ()) -> list[Finding]:
     """Judge the poses of a frame with several views, all together and each alone.
 
     Args:
@@ -61,7 +62,7 @@ def direction_checks(frame: DepthFrame, doubtful: Collection[int] = ()) -> list[
     return [_explained(best, given) if best else _unexplained(views, given)]
 
 
-def _explained(best: list[Explanation], given: dict[Pair, Agreement]) -> Check:
+def _explained(best: list[Explanation], given: dict[Pair, Agreement]) -> Finding:
     """Fail the poses of all views, or name the one whose pose alone is read wrongly; or those it may be."""
     name, blamed = best[0].convention, sorted({number for one in best for number in one.views})
     of_blamed = _total(found for pair, found in given.items() if set(pair) & set(blamed))
@@ -79,7 +80,7 @@ def _explained(best: list[Explanation], given: dict[Pair, Agreement]) -> Check:
     return direction_check(Verdict.FAIL, of_blamed, found, advice, blamed[0] if len(blamed) == 1 else None)
 
 
-def _unexplained(views: dict[int, PosedView], given: dict[Pair, Agreement]) -> Check:
+def _unexplained(views: dict[int, PosedView], given: dict[Pair, Agreement]) -> Finding:
     total = _total(given.values())
     found = _in_words("the views agree", total)
     if far := _far_away(views):
@@ -93,25 +94,26 @@ def _in_words(who: str, found: Agreement) -> str:
     return f"{who} at {100 * share(found):.0f} % of {found.compared:,} readings that both can see"
 
 
-def judged_as_given(given: Agreement, found: str, who: str) -> Check:
+def judged_as_given(given: Agreement, found: str, who: str) -> Finding:
     """Judge agreement where no other convention explains what contradicts."""
     if given.compared < LEAST_COMPARED:
-        return direction_check(Verdict.WARN, given, f"not measurable: {who} see hardly anything in common", "")
+        return direction_check(Verdict.UNKNOWN, given, f"not measurable: {who} see hardly anything in common", _SHARE)
     if share(given) < AGREE:
         advice = f"{who} agree under no convention: is the calibration old, the scene moving, the unit wrong?"
         return direction_check(Verdict.WARN, given, found, advice)
     return direction_check(Verdict.PASS, given, found, "")
 
 
-def direction_check(verdict: Verdict, given: Agreement, found: str, advice: str, view: int | None = None) -> Check:
+def direction_check(verdict: Verdict, given: Agreement, found: str, advice: str, view: int | None = None) -> Finding:
     """Make the check: its number is the share that agrees with the poses as given."""
-    return Check(
+    return Finding(
         name=NAME,
         verdict=verdict,
         found=found,
         value=share(given) if given.compared >= LEAST_COMPARED else None,
         threshold=AGREE,
         fails_at=AGREE,
+        at_least=True,
         advice=advice,
         view=view,
     )

@@ -6,7 +6,6 @@ from collections import Counter
 
 from pcdata.alignment.view_agreement import Agreement
 from pcdata.structures import DepthFrame
-from pcdata.validation.check import Check, Verdict
 from pcdata.validation.checks.pose_direction import direction_check, judged_as_given
 from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
@@ -17,6 +16,7 @@ from pcdata.validation.measures.pose_conventions import (
     posed_views,
     share,
 )
+from pcdata.verdicts import Finding, Verdict
 
 _PAIRS = 2  # pairs of captures that must speak for a convention: one may be an accident
 _OUTNUMBERED = 3  # times as many must speak for it as against it
@@ -32,7 +32,7 @@ class PoseDirectionOverTime:
         self._for: Counter[str] = Counter()  # pairs that a convention explains clearly better than what is given
         self._against: Counter[str] = Counter()  # pairs that it explains clearly worse
 
-    def check(self, frame: DepthFrame) -> list[Check]:
+    def check(self, frame: DepthFrame) -> list[Finding]:
         """Judge the pose of the next capture; says nothing until the camera has moved.
 
         A convention is named once two pairs of captures speak for it, and three times as many as against it.
@@ -62,7 +62,7 @@ class PoseDirectionOverTime:
             return [direction_check(Verdict.WARN, given, found, advice)]
         return [judged_as_given(given, found, who)]
 
-    def whole(self) -> list[Check]:
+    def whole(self) -> list[Finding]:
         """Judge what all pairs of captures tell together; a recording of two captures has one pair alone."""
         if not self._compared:
             return []
@@ -89,6 +89,6 @@ class PoseDirectionOverTime:
         return self._for[name] >= max(needed, _OUTNUMBERED * self._against[name])
 
 
-def _fails(given: Agreement, found: str, name: str) -> Check:
+def _fails(given: Agreement, found: str, name: str) -> Finding:
     advice = f"the poses look like {name}: convert them to world_from_camera with OpenCV axes, in metres"
     return direction_check(Verdict.FAIL, given, found, advice)

@@ -8,22 +8,22 @@ from typing import Any
 from torch import Tensor
 
 from pcdata.io.images.reading import MARKS
-from pcdata.validation.check import Check, graded
 from pcdata.validation.checks.depth_unit import depth_unit_check
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.extremes import pile_at_extreme
+from pcdata.verdicts import Finding, graded
 
 _SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
 
 
 def reading_checks(
     depth: Tensor,  # (H, W), or (N,) where there is no image; metres, 0 = no reading
-    limits: Limits,
+    limits: CaptureLimits,
     *,
     facts: Mapping[str, Any] | None = None,  # provenance: the unit and the order of bits of the file, where known
     focal: float | None = None,  # pixels
     view: int | None = None,
-) -> list[Check]:
+) -> list[Finding]:
     """Judge the unit, the range and the ends of the range of the readings."""
     flat = depth.flatten()
     flat = flat[:: max(1, len(flat) // _SAMPLES)]
@@ -37,12 +37,12 @@ def reading_checks(
     ]
 
 
-def _share_inside(readings: Tensor, limits: Limits) -> float:
+def _share_inside(readings: Tensor, limits: CaptureLimits) -> float:
     near, far = limits.workspace
     return float(((readings >= near) & (readings <= far)).float().mean())
 
 
-def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
+def _range(readings: Tensor, limits: CaptureLimits, view: int | None) -> Finding:
     near, far = limits.workspace
     one_percent = len(readings) // 100
     low = float(readings.kthvalue(1 + one_percent).values)
@@ -51,16 +51,15 @@ def _range(readings: Tensor, limits: Limits, view: int | None) -> Check:
     return graded(
         "workspace_fraction",
         fraction,
-        threshold=limits.workspace_fraction[0],
-        fails_at=limits.workspace_fraction[1],
-        higher_is_better=True,
+        limits=limits.workspace_fraction,
+        at_least=True,
         found=f"98 % of the readings lie between {low:.3g} and {high:.3g} m",
         advice=f"move the camera, or give the workspace of this task instead of {near:g} to {far:g} m",
         view=view,
     )
 
 
-def _saturation(readings: Tensor, limits: Limits, metres_per_unit: float | None, view: int | None) -> Check:
+def _saturation(readings: Tensor, limits: CaptureLimits, metres_per_unit: float | None, view: int | None) -> Finding:
     piles = [pile for end in ("far", "near") if (pile := pile_at_extreme(readings, end=end)) is not None]
     pile = max(piles, key=lambda one: one.fraction, default=None)
     found, advice = "no pile of readings at either end of the range", ""
@@ -81,8 +80,7 @@ def _saturation(readings: Tensor, limits: Limits, metres_per_unit: float | None,
     return graded(
         "saturation",
         0.0 if pile is None else pile.fraction,
-        threshold=limits.saturation[0],
-        fails_at=limits.saturation[1],
+        limits=limits.saturation,
         found=found,
         advice=advice,
         view=view,

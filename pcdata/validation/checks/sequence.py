@@ -9,9 +9,9 @@ from statistics import median
 from torch import Tensor
 
 from pcdata.structures import DepthFrame
-from pcdata.validation.check import Check, Verdict, graded
-from pcdata.validation.limits import Limits
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.view_names import view_names
+from pcdata.verdicts import Finding, Verdict, graded
 
 _REMEMBERED = 10_000  # captures: an image that comes again later than this goes unnoticed
 _INTERVALS = 100  # the usual interval is the median of so many
@@ -26,7 +26,7 @@ class RepeatChecks:
         self._seen: dict[tuple[str, int], OrderedDict[bytes, tuple[int, str]]] = {}
         self._count = 0
 
-    def check(self, frame: DepthFrame) -> list[Check]:
+    def check(self, frame: DepthFrame) -> list[Finding]:
         """Judge the views of the next capture."""
         self._count += 1
         checks = []
@@ -50,7 +50,7 @@ class RepeatChecks:
         return None if before is None else (self._count - before[0], before[1])
 
 
-def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Check:
+def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Finding:
     what = "depth" if name == "repeated_depth" else "colour"
     found = f"the {what} image is a new one"
     if before is not None:
@@ -59,8 +59,7 @@ def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Check:
     return graded(
         name,
         float(before is not None),
-        threshold=0.0,
-        fails_at=0.0,
+        limits=(0.0, 0.0),
         found=found,
         advice=f"{_SENSORS_DIFFER}; drop the repetitions (a simulator without noise may repeat itself on purpose)",
         view=view,
@@ -70,12 +69,12 @@ def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Check:
 class ClockChecks:
     """Judges ``provenance["timestamps"]``, the seconds of every view, where a capture has them."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: CaptureLimits) -> None:
         self._limits = limits
         self._last: list[float] = []
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
 
-    def check(self, frame: DepthFrame) -> list[Check]:
+    def check(self, frame: DepthFrame) -> list[Finding]:
         """Judge the times of the next capture."""
         times = frame.provenance.get("timestamps")
         if times is None:
@@ -86,20 +85,19 @@ class ClockChecks:
         self._last = list(times)
         return checks
 
-    def _sync(self, times: list[float], names: list[str]) -> Check:
+    def _sync(self, times: list[float], names: list[str]) -> Finding:
         apart = max(times) - min(times)
         early, late = times.index(min(times)), times.index(max(times))
         return graded(
             "sync",
             apart,
-            threshold=self._limits.sync[0],
-            fails_at=self._limits.sync[1],
+            limits=self._limits.sync,
             found=f"{names[late]} is {1e3 * apart:.1f} ms later than {names[early]}",
             advice="trigger the cameras together, or pair their images by nearest time; what moves is in two places",
             unit="s",
         )
 
-    def _interval(self, interval: float) -> Check:
+    def _interval(self, interval: float) -> Finding:
         usual = median(self._intervals) if self._intervals else interval
         if interval > 0:
             self._intervals.append(interval)
@@ -109,7 +107,7 @@ class ClockChecks:
             Verdict.WARN: "captures are missing here: do not treat the two as consecutive",
             Verdict.FAIL: "time runs backwards or stands still: sort the captures by time, drop the repetitions",
         }[verdict]
-        return Check(
+        return Finding(
             name="clock",
             verdict=verdict,
             found=f"{interval:.4g} s after the capture before, usually {usual:.4g} s",

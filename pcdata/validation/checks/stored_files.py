@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from pcdata.io.images.stored_faults import RawFaults, count_raw_faults
-from pcdata.validation.check import Check, Verdict
+from pcdata.verdicts import Finding, Verdict
 
 
-def raw_value_checks(paths: Sequence[Path]) -> list[Check]:
+def raw_value_checks(paths: Sequence[Path]) -> list[Finding]:
     """Judge the stored values of every view: NaN and infinity warn, as programs differ on them; negative depth fails.
 
     Raises:
@@ -21,10 +21,10 @@ def raw_value_checks(paths: Sequence[Path]) -> list[Check]:
     return [replace(_judged_file(path), view=view) for view, path in enumerate(paths)]
 
 
-def _judged_file(path: Path) -> Check:
+def _judged_file(path: Path) -> Finding:
     faults = count_raw_faults(path)
     if faults is None:
-        return Check(
+        return Finding(
             name="raw_values",
             verdict=Verdict.PASS,
             found="whole numbers: none can be NaN, infinite or negative",
@@ -34,7 +34,7 @@ def _judged_file(path: Path) -> Check:
     return _judged(faults)
 
 
-def _judged(faults: RawFaults) -> Check:
+def _judged(faults: RawFaults) -> Finding:
     bad = faults.nan + faults.infinite + faults.negative
     verdict = Verdict.FAIL if faults.negative else Verdict.WARN if bad else Verdict.PASS
     advice = {
@@ -42,7 +42,7 @@ def _judged(faults: RawFaults) -> Check:
         Verdict.WARN: "pcdata reads them as 0, no reading; store 0 so that every program does",
         Verdict.FAIL: "is z pointing backwards (OpenGL axes)? Flip the sign when exporting, write 0 for 'no reading'",
     }[verdict]
-    return Check(
+    return Finding(
         name="raw_values",
         verdict=verdict,
         found=f"of {faults.num_pixels:,} values {faults.nan:,} are NaN, {faults.infinite:,} infinite, "

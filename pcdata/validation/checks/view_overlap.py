@@ -6,20 +6,15 @@ import math
 
 from pcdata.errors import PcdataError, told_apart
 from pcdata.structures import DepthFrame
-from pcdata.validation.check import Check, Verdict
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult
 from pcdata.validation.view_names import view_names
+from pcdata.verdicts import Finding, Verdict
 
-_VERDICTS = {
-    "pass": Verdict.PASS,
-    "not measurable": Verdict.WARN,
-    "warn": Verdict.WARN,
-    "fail": Verdict.FAIL,
-}
+_SHOW = "put objects with upright sides where the cameras overlap"
 
 
-def overlap_checks(frame: DepthFrame) -> list[Check]:
+def overlap_checks(frame: DepthFrame) -> list[Finding]:
     """Judge the gap between the surfaces of the views, and how far each camera is out of place.
 
     Nothing is said of a frame with one view or without poses.
@@ -29,21 +24,22 @@ def overlap_checks(frame: DepthFrame) -> list[Check]:
     try:
         result = verify_overlap(frame, names=view_names(frame.provenance, frame.num_views))
     except PcdataError as error:
-        return [Check(name="view_gap", verdict=Verdict.WARN, found=f"not measurable: {error}")]
+        return [Finding(name="view_gap", verdict=Verdict.UNKNOWN, found=f"not measurable: {error}", advice=_SHOW)]
     return [_gap(result), *(_pose(result, view) for view in range(frame.num_views))]
 
 
-def _gap(result: OverlapResult) -> Check:
+def _gap(result: OverlapResult) -> Finding:
     """The widest median gap between two views that overlap, where any do."""
     measured = [pair for pair in result.pairs if math.isfinite(pair.median)]
-    failed = [pair for pair in result.pairs if pair.verdict == "fail"]
+    failed = [pair for pair in result.pairs if pair.verdict is Verdict.FAIL]
     worst = max(failed or measured, key=lambda pair: (pair.median, pair.first), default=None)
     passes, fails = result.limits.residual
     if worst is None:
-        return Check(
+        return Finding(
             name="view_gap",
-            verdict=Verdict.WARN,
+            verdict=Verdict.UNKNOWN,
             found="not measurable: no two views overlap",
+            advice=_SHOW,
             threshold=passes,
             fails_at=fails,
             unit="m",
@@ -52,22 +48,21 @@ def _gap(result: OverlapResult) -> Check:
     found = f"half of the surface that {pair} share lies within {told_apart(1e3 * worst.median, 1e3 * passes)[0]} mm"
     if not math.isfinite(worst.median):
         found = f"{pair} look at one place and share no surface"
-    verdict = _VERDICTS[worst.verdict]
-    return Check(
+    return Finding(
         name="view_gap",
-        verdict=verdict,
+        verdict=worst.verdict,
         found=found,
         value=worst.median if math.isfinite(worst.median) else None,
         threshold=passes,
         fails_at=fails,
         unit="m",
-        advice="" if verdict is Verdict.PASS else "; ".join(result.advice),
+        advice="" if worst.verdict is Verdict.PASS else "; ".join(result.advice),
     )
 
 
-def _pose(result: OverlapResult, view: int) -> Check:
+def _pose(result: OverlapResult, view: int) -> Finding:
     camera = result.cameras[view]
-    verdict = _VERDICTS[camera.verdict]
+    verdict = camera.verdict
     passes, fails = result.limits.shift
     shift, turn = camera.shift, camera.rotation_degrees
     shown = told_apart(1e3 * shift, 1e3 * passes)[0], told_apart(turn, result.limits.rotation_degrees[0])[0]
@@ -79,12 +74,12 @@ def _pose(result: OverlapResult, view: int) -> Check:
     if math.isinf(camera.shift):
         found = "too far out of place to be measured; the others agree without it"
     elif verdict is not Verdict.PASS and not _is_certain(camera, result.limits):
-        verdict, found = Verdict.WARN, f"not measurable: {'; '.join(camera.unmeasurable) or found}"
-    return Check(
+        verdict, found = Verdict.UNKNOWN, f"not measurable: {'; '.join(camera.unmeasurable) or found}"
+    return Finding(
         name="view_pose",
         verdict=verdict,
         found=found,
-        value=None if found.startswith("not measurable") or math.isinf(camera.shift) else camera.shift,
+        value=None if verdict is Verdict.UNKNOWN or math.isinf(camera.shift) else camera.shift,
         threshold=passes,
         fails_at=fails,
         unit="m",
@@ -105,7 +100,5 @@ def _is_certain(camera: CameraOverlap, limits: OverlapLimits) -> bool:
 
 def _advice(result: OverlapResult, camera: CameraOverlap) -> str:
     if not _is_certain(camera, result.limits):
-        return "put objects with upright sides where the cameras overlap"
-    if camera.name in result.wrong:
-        return next(line for line in result.advice if line.startswith(f"recalibrate {camera.name}:"))
-    return "; ".join(result.advice)
+        return _SHOW
+    return result.advice_about(camera)

@@ -229,8 +229,8 @@ def test_validate_reads_nothing_outside(tmp_path: Path) -> None:
     (root / "depth" / "1.png").rename(tmp_path / "stored.png")
     (root / "depth" / "1.png").symlink_to(tmp_path / "stored.png")
     (report,) = validate_source(open_source(root))
-    assert [check.name for check in report.checks] == ["readable"]
-    assert "leads out of" in report.checks[0].found
+    assert [check.name for check in report.findings] == ["readable"]
+    assert "leads out of" in report.findings[0].found
 
 
 def test_a_named_file_may_be_a_link_to_anywhere(tmp_path: Path) -> None:

@@ -15,8 +15,9 @@ from pcdata.functional.depth.unit_fit import DepthUnit, encoded, unit_fits
 from pcdata.io import open_source
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import look_at, tabletop
-from pcdata.validation import Check, Limits, Verdict
+from pcdata.validation import CaptureLimits
 from pcdata.validation.checks.depth_unit import depth_unit_check
+from pcdata.verdicts import Finding, Verdict
 
 UNITS = [
     DepthUnit(0.001),
@@ -62,7 +63,7 @@ def capture(folder: Path, metres: np.ndarray, unit: DepthUnit) -> Path:
 
 
 @cache
-def judged(folder: Path, unit: DepthUnit, limits: Limits | None = None) -> tuple[Verdict, str, float]:
+def judged(folder: Path, unit: DepthUnit, limits: CaptureLimits | None = None) -> tuple[Verdict, str, float]:
     """The verdict on a declared unit, all that is said, and the median in metres."""
     from pcdata.errors import UnitError
 
@@ -70,7 +71,7 @@ def judged(folder: Path, unit: DepthUnit, limits: Limits | None = None) -> tuple
         frame = open_source(folder, metres_per_unit=unit.metres, depth_encoding=unit.encoding).load("0")
     except UnitError as error:
         return Verdict.FAIL, str(error), float("nan")
-    check: Check = depth_unit_check(frame.depth[0], limits or Limits(), frame.provenance, focal=FOCAL)
+    check: Finding = depth_unit_check(frame.depth[0], limits or CaptureLimits(), frame.provenance, focal=FOCAL)
     return check.verdict, f"{check.found}; {check.advice}", check.value or 0.0
 
 
@@ -103,7 +104,7 @@ def test_the_true_unit_is_named_and_no_advice_passes_at_a_wrong_scale(
 @pytest.mark.parametrize("seed", [31, 32])
 @pytest.mark.parametrize("unit", [DepthUnit(0.001), DepthUnit(1.0)], ids=str)
 def test_millimetres_and_metres_that_are_right_pass(tmp_path: Path, unit: DepthUnit, seed: int) -> None:
-    scenes = [(table(seed), None), (table(seed, None), None), (room(seed % 5), Limits(workspace=(0.3, 6.0)))]
+    scenes = [(table(seed), None), (table(seed, None), None), (room(seed % 5), CaptureLimits(workspace=(0.3, 6.0)))]
     for number, (scene, limits) in enumerate(scenes):
         verdict, text, _ = judged(capture(tmp_path / str(number), scene, unit), unit, limits)
         assert verdict is Verdict.PASS, text
@@ -113,10 +114,10 @@ def test_a_sensor_or_a_measured_workspace_tells_units_apart_that_fit_alike(tmp_p
     true = DepthUnit(1 / 256)
     folder = capture(tmp_path / "c", table(24), true)
     assert judged(folder, true)[0] is Verdict.WARN
-    assert judged(folder, true, Limits(workspace=(0.5, 1.5)))[0] is Verdict.PASS
-    assert judged(folder, DepthUnit(0.001), Limits(workspace=(0.5, 1.5)))[0] is not Verdict.PASS
+    assert judged(folder, true, CaptureLimits(workspace=(0.5, 1.5)))[0] is Verdict.PASS
+    assert judged(folder, DepthUnit(0.001), CaptureLimits(workspace=(0.5, 1.5)))[0] is not Verdict.PASS
     fine = capture(tmp_path / "d", table(24), DepthUnit(0.0001))
-    assert judged(fine, DepthUnit(0.0001), Limits.for_sensor("realsense_d415"))[0] is Verdict.PASS
+    assert judged(fine, DepthUnit(0.0001), CaptureLimits.for_sensor("realsense_d415"))[0] is Verdict.PASS
 
 
 def test_depth_made_in_memory_is_told_the_factor() -> None:
@@ -124,7 +125,7 @@ def test_depth_made_in_memory_is_told_the_factor() -> None:
     depth = torch.from_numpy(table(25)).float()
     for factor, cure in ((5.0, "0.2"), (4.0, "0.25"), (0.2, "5"), (10.0, "0.1")):
         frame = DepthFrame(depth=(factor * depth)[None], camera=camera)
-        check = depth_unit_check(frame.depth[0], Limits(), frame.provenance, focal=FOCAL)
+        check = depth_unit_check(frame.depth[0], CaptureLimits(), frame.provenance, focal=FOCAL)
         assert check.verdict is not Verdict.PASS
         assert f"multiply depth by {cure} (" in check.advice or f"or {cure} (" in check.advice
 

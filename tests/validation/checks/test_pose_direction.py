@@ -13,7 +13,8 @@ from pcdata import validate_frame, validate_source
 from pcdata.geometry import rigid
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import look_at, tabletop
-from pcdata.validation import WHOLE, Check, SampleReport, Verdict
+from pcdata.validation import WHOLE, SampleReport
+from pcdata.verdicts import Finding, Verdict
 from tests.validation.captures import Frames, scene, verdicts
 
 
@@ -46,7 +47,7 @@ def with_pose(frame: DepthFrame, view: int, change: Callable[[Tensor], Tensor]) 
     return replace(frame, world_from_camera=poses)
 
 
-def direction(checks: list[Check]) -> Check:
+def direction(checks: list[Finding]) -> Finding:
     return next(check for check in checks if check.name == "pose_direction")
 
 
@@ -112,10 +113,10 @@ def test_depth_that_repeats_is_its_own_failure_and_accuses_neither_its_pose_nor_
     frames[4] = replace(frames[4], depth=frames[1].depth)
     reports = judged(frames)
     names = ("repeated_depth", "pose_direction")
-    bad = {(i, check.name) for i, one in reports.items() for check in one.checks if check.verdict is not Verdict.PASS}
+    bad = {(i, check.name) for i, one in reports.items() for check in one.findings if check.verdict is not Verdict.PASS}
     assert {(i, name) for i, name in bad if name in names} == {("f4", "repeated_depth")}
-    assert "pose_direction" not in {check.name for check in reports["f4"].checks}
-    assert verdicts(list(reports["f5"].checks), "pose_direction") == [Verdict.PASS]
+    assert "pose_direction" not in {check.name for check in reports["f4"].findings}
+    assert verdicts(list(reports["f5"].findings), "pose_direction") == [Verdict.PASS]
 
 
 def test_depth_of_another_moment_without_repetition_names_no_convention() -> None:
@@ -123,7 +124,7 @@ def test_depth_of_another_moment_without_repetition_names_no_convention() -> Non
     frames = recording()
     other = frames[1].depth
     frames[4] = replace(frames[4], depth=torch.where(other > 0, other + 0.001, other))
-    found = [check for one in judged(frames).values() for check in one.checks if check.name == "pose_direction"]
+    found = [check for one in judged(frames).values() for check in one.findings if check.name == "pose_direction"]
     assert not [check for check in found if check.verdict is Verdict.FAIL]
     assert not [check for check in found if "look like" in check.advice]
     assert found[-1].verdict is Verdict.PASS, "over all captures"
@@ -132,9 +133,9 @@ def test_depth_of_another_moment_without_repetition_names_no_convention() -> Non
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_wrong_unit_of_depth_is_not_told_as_one_of_the_poses(factor: float) -> None:
     reports = judged([replace(frame, depth=factor * frame.depth) for frame in recording(4)])
-    names = {check.name for one in reports.values() for check in one.checks if check.verdict is Verdict.FAIL}
+    names = {check.name for one in reports.values() for check in one.findings if check.verdict is Verdict.FAIL}
     assert "depth_unit" in names
-    assert "pose_direction" not in {check.name for one in reports.values() for check in one.checks}
+    assert "pose_direction" not in {check.name for one in reports.values() for check in one.findings}
 
 
 @pytest.mark.parametrize(("mistake", "words"), [(rigid.invert_rigid, "camera_from_world"), (opengl, "OpenGL")])
@@ -142,13 +143,13 @@ def test_a_convention_is_named_from_the_second_pair_on_and_over_the_whole_record
     mistake: Callable[[Tensor], Tensor], words: str
 ) -> None:
     reports = judged([with_pose(frame, 0, mistake) for frame in recording()])
-    assert verdicts(list(reports["f1"].checks), "pose_direction") == [Verdict.WARN]
+    assert verdicts(list(reports["f1"].findings), "pose_direction") == [Verdict.WARN]
     for name in ("f2", "f3", "f4", "f5", WHOLE):
-        check = direction(list(reports[name].checks))
+        check = direction(list(reports[name].findings))
         assert check.verdict is Verdict.FAIL
         assert words in check.advice
 
 
 def test_a_recording_of_two_captures_is_judged_by_its_one_pair() -> None:
     reports = judged([with_pose(frame, 0, rigid.invert_rigid) for frame in recording(2)])
-    assert direction(list(reports[WHOLE].checks)).verdict is Verdict.FAIL
+    assert direction(list(reports[WHOLE].findings)).verdict is Verdict.FAIL
