@@ -21,7 +21,7 @@ from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.kinds import FIELDS
-from pcdata.transforms.author_errors import UndeclaredStreams
+from pcdata.transforms.class_checks import UndeclaredStreams, check_class, watched
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
 Data = DepthFrame | PointCloud
@@ -46,8 +46,11 @@ class Transform(nn.Module):
 
     def __init_subclass__(cls, *, abstract: bool = False, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls.no_streams = UndeclaredStreams(cls.__name__)
+        cls.no_streams = UndeclaredStreams(cls)
         dataclasses.dataclass(eq=False, repr=False, kw_only=True)(cls)
+        check_class(cls)
+        if not cls.__module__.startswith("pcdata."):  # those of pcdata are proven by the laws of the contract suite
+            cls.forward = watched(cls.forward)  # type: ignore[method-assign]
         if not abstract:
             if cls.__name__ in REGISTRY and REGISTRY[cls.__name__].__module__ != cls.__module__:
                 raise ConfigError(f"a transform called {cls.__name__} is registered already; choose another name")
@@ -77,8 +80,8 @@ class Transform(nn.Module):
         return {}
 
     def transform(self, data: Any, params: Params) -> Any:
-        """Do: pure given the params; never draws from the generator, never changes its input."""
-        raise NotImplementedError
+        """Do: pure given the params; never draws, never changes its input."""
+        raise NotImplementedError(f"{type(self).__name__}: write the method transform(self, data, params)")
 
     def frame_needed(self) -> str | None:
         """The coordinate frame that the fields are written in, or None when any will do."""
