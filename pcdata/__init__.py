@@ -73,6 +73,9 @@ _HOMES = {
     ],
     "pcdata.io": [
         "AveragedSource",
+        "CaptureSource",
+        "JoinedSource",
+        "SubsetSource",
         "TemporalFilterDepth",
         "TemporallyFilteredSource",
         "open_source",
@@ -81,6 +84,7 @@ _HOMES = {
         "read_ply",
         "read_volume",
         "refused_captures",
+        "register_combinator",
         "register_layout",
         "write_calibration",
         "write_pcd",

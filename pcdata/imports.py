@@ -16,7 +16,7 @@ from typing import Any
 
 from pcdata.errors import ConfigError, PcdataError
 from pcdata.files.opening import read_bytes
-from pcdata.io.sources.detect import LAYOUTS
+from pcdata.io.sources.registry import LAYOUTS
 from pcdata.transforms.base import REGISTRY
 
 _MAX_BYTES = 1 << 20

@@ -21,7 +21,15 @@ from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, Wri
 from pcdata.files.inputs import recording
 from pcdata.files.whole_folders import complete_or_nothing
 from pcdata.imports import imported_files, step_names
-from pcdata.io.sources.source import REFUSALS, CaptureSource, checked_ids, inputs_of, reason_of, skipped_of
+from pcdata.io.sources.capture_source import (
+    REFUSALS,
+    CaptureSource,
+    checked_ids,
+    inputs_of,
+    kinds_of,
+    reason_of,
+    skipped_of,
+)
 from pcdata.io.store.manifest import Manifest, Sample, key_of
 from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
@@ -92,7 +100,8 @@ def build_dataset(
         steps = {name for file in imported_files() for name in file.transforms} & step_names(
             config.pipeline.to_config()
         )
-        imports = [file for file in imported_files() if steps & {*file.transforms} or _reads(source) & {*file.layouts}]
+        kinds = {*kinds_of(source)}
+        imports = [file for file in imported_files() if steps & {*file.transforms} or kinds & {*file.layouts}]
         samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -190,15 +199,6 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
             f"build_dataset: {random[0]} in the section depth is random, so no cloud is the same in every epoch and "
             "none can be stored; leave it out here, or load captures on the fly with CloudDataset"
         )
-
-
-def _reads(source: Any) -> set[str]:
-    """Return the layouts that a source, or the one that it is made around, reads."""
-    kinds = set()
-    while source is not None:
-        kinds.add(str(getattr(source, "kind", "")))
-        source = getattr(source, "source", None)
-    return kinds
 
 
 def _model_of(config: BuildConfig) -> dict[str, Any]:

@@ -11,9 +11,9 @@ from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.io.sources.averaged import AveragedSource
-from pcdata.io.sources.detect import LAYOUTS
-from pcdata.io.sources.selection import open_selected, read_skip_file
-from pcdata.io.sources.source import Source
+from pcdata.io.sources.combine import Selectable
+from pcdata.io.sources.opening import open_source, read_skip_file
+from pcdata.io.sources.registry import LAYOUTS
 from pcdata.io.sources.temporal import TemporallyFilteredSource
 from pcdata.yaml_nodes import YamlDocument
 
@@ -43,7 +43,7 @@ class SourceSettings:
         skip: Sequence[str] = (),
         skip_refused: bool = False,
         **options: Any,
-    ) -> Source | AveragedSource | TemporallyFilteredSource:
+    ) -> Selectable[Any]:
         """Open the captures.
 
         Args:
@@ -69,7 +69,7 @@ class SourceSettings:
         if where is None:
             raise ConfigError("source: nothing says where the captures are; give --source PATH, or source: {path: ...}")
         limits = [number for number in (limit, self.limit) if number is not None]
-        source = open_selected(
+        source = open_source(
             where,
             limit=min(limits, default=None),
             skip=[*dict.fromkeys([*self.skip, *skip])],

@@ -70,6 +70,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
 _NO_OPTIONS = {  # of opening captures, not of their layout
     "path": "the path itself",
     "kind": "--kind",
+    "only": "--only",
     "limit": "--limit",
     "skip": "--skip",
     "skip_refused": "--skip-refused",
@@ -118,6 +119,9 @@ def add_layout_options(command: argparse.ArgumentParser, names: tuple[str, ...])
 
 def add_skip_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:
     """Add what leaves captures out."""
+    command.add_argument(
+        "--only", action="append", metavar="PATTERN", help="keep captures whose ids fit, such as 'left_*'; repeatable"
+    )
     command.add_argument("--skip", action="append", metavar="ID", help="leave this capture out; repeatable")
     command.add_argument("--skip-file", metavar="FILE", help="leave out the captures listed in FILE, one id on a line")
     if can_skip_refused:
@@ -155,13 +159,21 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
     """Return the flags about captures, and those of ``others``, that the command line states."""
-    flags = ["--kind", *(flag for flag, _ in _FLAGS.values()), "--option", "--skip", "--skip-file", "--skip-refused"]
+    flags = [
+        "--kind",
+        *(flag for flag, _ in _FLAGS.values()),
+        "--option",
+        "--only",
+        "--skip",
+        "--skip-file",
+        "--skip-refused",
+    ]
     return [flag for flag in (*flags, *others) if getattr(arguments, attribute_of(flag), None)]
 
 
 def skip_list(arguments: argparse.Namespace) -> list[str]:
     """Return the ids that the command line leaves out."""
-    from pcdata.io.sources.selection import read_skip_file
+    from pcdata.io.sources.opening import read_skip_file
 
     listed = list(arguments.skip or [])
     return listed + (read_skip_file(arguments.skip_file) if arguments.skip_file else [])
@@ -169,11 +181,12 @@ def skip_list(arguments: argparse.Namespace) -> list[str]:
 
 def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = None) -> Any:
     """Open the captures at a path as the options say; captures that are left out are told on stderr."""
-    from pcdata.io.sources.selection import open_selected
+    from pcdata.io import open_source
 
-    source = open_selected(
+    source = open_source(
         path,
         kind=arguments.kind,
+        only=arguments.only or (),
         limit=limit,
         skip=skip_list(arguments),
         skip_refused=bool(getattr(arguments, "skip_refused", False)),

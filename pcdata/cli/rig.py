@@ -100,14 +100,15 @@ def _refine(arguments: argparse.Namespace) -> None:
 
 
 def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> RigSource:
-    from pcdata.io.sources.selection import open_selected
+    from pcdata.io import open_source
 
     options = given_options(arguments)
     options["frame_id"] = arguments.frame or (None if calibration is None else "base")
     options["calibration"] = calibration
-    source = open_selected(
+    source = open_source(
         arguments.source,
         kind="rig",
+        only=arguments.only or (),
         limit=arguments.limit,
         skip=skip_list(arguments),
         skip_refused=bool(arguments.skip_refused),

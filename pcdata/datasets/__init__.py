@@ -1,7 +1,7 @@
 """Datasets of clouds and the collate functions that feed a DataLoader."""
 
 from pcdata.datasets.cached import CachedCloudDataset
-from pcdata.datasets.clouds import CaptureSource, CloudDataset
+from pcdata.datasets.clouds import CloudDataset
 from pcdata.datasets.collate import collate_fixed, collate_packed, collate_padded
 from pcdata.datasets.copies import CountedSampler
 from pcdata.datasets.passes import RepeatedEpochWarning
@@ -9,7 +9,6 @@ from pcdata.datasets.samples import SampleDataset
 
 __all__ = [
     "CachedCloudDataset",
-    "CaptureSource",
     "CloudDataset",
     "CountedSampler",
     "RepeatedEpochWarning",

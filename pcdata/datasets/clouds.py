@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from pcdata.datasets.samples import SampleDataset
 from pcdata.errors import DTypeError
+from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Transform
-
-
-class CaptureSource(Protocol):
-    """Anything with ids that loads a capture or a cloud by id; :func:`pcdata.open_source` returns one."""
-
-    @property
-    def ids(self) -> list[str]:
-        """The sample ids, unique and in a fixed order."""
-
-    def load(self, sample_id: str) -> DepthFrame | PointCloud:
-        """Load one sample."""
 
 
 class CloudDataset(SampleDataset):

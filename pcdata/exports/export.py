@@ -19,7 +19,7 @@ from pcdata.files.inputs import recording
 from pcdata.files.interrupts import shielded
 from pcdata.files.scratch import scratch_beside
 from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
-from pcdata.io.sources.source import CaptureSource, inputs_of
+from pcdata.io.sources.capture_source import CaptureSource, inputs_of
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 

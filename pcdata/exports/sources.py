@@ -8,9 +8,10 @@ from typing import Any
 from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import ConfigError
 from pcdata.exports.target import Target
+from pcdata.files.sample_names import check_known
 from pcdata.io import open_source
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids
 from pcdata.io.sources.listing import absolute
-from pcdata.io.sources.source import CaptureSource, checked_ids
 from pcdata.io.store.manifest import FILE_NAME
 from pcdata.structures import PointCloud
 
@@ -24,12 +25,25 @@ class BuiltClouds:
         self.fingerprint = self._dataset.manifest.fingerprint
 
     @property
+    def name(self) -> str:
+        """The name of the dataset's folder."""
+        return self._dataset.folder.name
+
+    @property
     def ids(self) -> list[str]:
         """The sample ids."""
-        return list(self._dataset.ids)
+        return list(self._position)
+
+    def __len__(self) -> int:
+        return len(self._position)
 
     def load(self, sample_id: str) -> PointCloud:
-        """Read one cloud."""
+        """Read one cloud.
+
+        Raises:
+            CaptureError: no sample has this id. CacheError: it is damaged.
+        """
+        check_known(repr(self), sample_id, self._position)
         return self._dataset[self._position[sample_id]]
 
     def __repr__(self) -> str:

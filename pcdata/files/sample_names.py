@@ -6,10 +6,10 @@ import itertools
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from decimal import Decimal
 
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, near_matches
 
 _SHOWN = 5  # names in a message before "and n more"
 _LONGEST = 200  # characters of a name in a message
@@ -111,6 +111,22 @@ def check_text(where: str, names: Iterable[str]) -> None:
             f"{where}: names must be UTF-8 text, but {shown}{_more(broken)} {'is' if len(broken) == 1 else 'are'} not: "
             "what is built from them could not be read back; rename, such as with convmv or in a file manager"
         )
+
+
+def check_known(where: str, sample_id: str, known: Collection[str], told: str = "") -> None:
+    """Require the id of a sample that is there.
+
+    Args:
+        where: what has the samples, for the message.
+        sample_id: the id.
+        known: the ids that there are; of a long list pass what answers ``in`` at once.
+        told: what the reader should know of these ids, such as "; a group is called after its first capture".
+
+    Raises:
+        CaptureError: names those nearest to it.
+    """
+    if sample_id not in known:
+        raise CaptureError(f"{where}: no sample {sample_id!r:.{_LONGEST}}{told}{near_matches(str(sample_id), known)}")
 
 
 def name_some(names: Iterable[str]) -> str:

@@ -15,20 +15,26 @@ from pcdata.io.images.confidence import read_confidence, write_confidence
 from pcdata.io.images.reading import read_color, read_depth, read_labels, read_mask
 from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
 from pcdata.io.sources.averaged import AveragedSource
-from pcdata.io.sources.detect import LAYOUTS, open_source, register_layout
-from pcdata.io.sources.selection import open_selected
-from pcdata.io.sources.source import Source, refused_captures
+from pcdata.io.sources.capture_source import CaptureSource, refused_captures
+from pcdata.io.sources.combine import CombinedSource, JoinedSource, SubsetSource
+from pcdata.io.sources.opening import open_source
+from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, register_combinator, register_layout
+from pcdata.io.sources.source import Source
 from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
 from pcdata.io.store.volumes import read_volume, write_volume
 
 __all__ = [
+    "COMBINATORS",
     "LAYOUTS",
     "AveragedSource",
     "CaptureCamera",
+    "CaptureSource",
+    "CombinedSource",
+    "JoinedSource",
     "Source",
+    "SubsetSource",
     "TemporalFilterDepth",
     "TemporallyFilteredSource",
-    "open_selected",
     "open_source",
     "read_calibration",
     "read_capture_camera",
@@ -43,6 +49,7 @@ __all__ = [
     "read_pose",
     "read_volume",
     "refused_captures",
+    "register_combinator",
     "register_layout",
     "write_calibration",
     "write_capture_camera",

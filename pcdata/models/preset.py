@@ -7,8 +7,9 @@ from typing import Any
 
 import yaml
 
-from pcdata.datasets import CaptureSource, CloudDataset
+from pcdata.datasets import CloudDataset
 from pcdata.errors import ConfigError, DTypeError
+from pcdata.io import CaptureSource
 from pcdata.models.batch import ModelBatch
 from pcdata.models.catalogue import contract as contract_named
 from pcdata.models.catalogue import missing_choices

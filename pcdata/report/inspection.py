@@ -9,7 +9,7 @@ from statistics import median
 
 from pcdata.build import BuildReport
 from pcdata.datasets import CachedCloudDataset
-from pcdata.io.sources.source import Source
+from pcdata.io.sources.capture_source import CaptureSource, kinds_of, unread_of
 from pcdata.report.table import text_table
 from pcdata.structures import DepthFrame, PointCloud
 
@@ -69,13 +69,17 @@ def dataset_text(folder: str | Path) -> str:
     return f"{tables}\n\n{skipped_text(manifest.skipped)}" if manifest.skipped else tables
 
 
-def capture_text(source: Source) -> str:
+def capture_text(source: CaptureSource) -> str:
     """Tell what a source holds; loads its first capture."""
     first = source.load(source.ids[0])
     names = ", ".join(source.ids[:3]) + (", ..." if len(source) > 3 else "")
-    facts = [["layout", source.kind], ["captures", f"{len(source)}: {names}"], ["first", repr(first)]]
+    facts = [
+        ["layout", " of ".join(kinds_of(source)) or type(source).__name__],
+        ["captures", f"{len(source)}: {names}"],
+        ["first", repr(first)],
+    ]
     facts += _frame_facts(first) if isinstance(first, DepthFrame) else _cloud_facts(first)
-    facts += [["not read" * (not number), line] for number, line in enumerate(source.unread())]
+    facts += [["not read" * (not number), line] for number, line in enumerate(unread_of(source))]
     return text_table(["capture", str(source.name)], facts)
 
 

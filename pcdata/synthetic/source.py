@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.errors import ConfigError
+from pcdata.files.sample_names import check_known
 from pcdata.structures import DepthFrame
 from pcdata.synthetic.noise import SensorNoise, noise_named
 from pcdata.synthetic.tabletop import Tabletop, tabletop
@@ -58,10 +59,7 @@ class SyntheticSource:
             CaptureError: no scene has this id.
         """
         ids = self.ids
-        if sample_id not in ids:
-            raise CaptureError(
-                f"SyntheticSource {self.name!r}: no scene {sample_id!r} among {len(ids)}{near_matches(sample_id, ids)}"
-            )
+        check_known(f"SyntheticSource {self.name!r}", sample_id, ids)
         return tabletop(
             self.seed + ids.index(sample_id),
             self.num_objects,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from typing import Protocol
 
 from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
-from pcdata.io.sources.source import Source, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.source import stored_captures
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.validation.checks.cameras import intrinsics_checks, pose_checks
@@ -34,15 +34,6 @@ _CHECK_OF_ERROR: dict[type[PcdataError], str] = {
 }
 
 
-class Captures(Protocol):
-    """What has ids and loads one capture for each: every Source, and SyntheticSource."""
-
-    @property
-    def ids(self) -> list[str]: ...  # noqa: D102
-
-    def load(self, sample_id: str) -> DepthFrame | PointCloud: ...  # noqa: D102
-
-
 @torch_on_one_thread()
 def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) -> list[Finding]:
     """Check every view of one capture on its own, then the views against each other.
@@ -62,7 +53,7 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
     return _frame_checks(frame, frame_votes(frame), limits or CaptureLimits())
 
 
-def validate_source(source: Captures, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
+def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
     """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
@@ -71,7 +62,7 @@ def validate_source(source: Captures, *, limits: CaptureLimits | None = None) ->
     depth, and the direction of the poses.
 
     Args:
-        source: anything with ``ids`` and ``load``; a :class:`Source` also has its files looked at.
+        source: anything with ``ids`` and ``load``; captures on disk also have their files looked at.
         limits: thresholds; None = the defaults, for a camera above a table.
 
     Raises:
@@ -81,7 +72,7 @@ def validate_source(source: Captures, *, limits: CaptureLimits | None = None) ->
     return _reports(source, checked_ids("validate_source", source), limits or CaptureLimits())
 
 
-def _reports(source: Captures, ids: list[str], limits: CaptureLimits) -> Iterator[SampleReport]:
+def _reports(source: CaptureSource, ids: list[str], limits: CaptureLimits) -> Iterator[SampleReport]:
     series = _Series(limits)
     for sample_id in ids:
         yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
@@ -113,12 +104,13 @@ class _Series:
         self._voted = 0
 
     @torch_on_one_thread()
-    def check(self, source: Captures, sample_id: str) -> list[Finding]:
+    def check(self, source: CaptureSource, sample_id: str) -> list[Finding]:
         checks: list[Finding] = []
         try:
-            if isinstance(source, Source):
-                source.check_links(sample_id)
-                checks += raw_value_checks(source.depth_files(sample_id))
+            stored = stored_captures(source, sample_id)
+            for layout, own in stored:
+                layout.check_links(own)
+            checks += raw_value_checks([file for layout, own in stored for file in layout.depth_files(own)])
             capture = source.load(sample_id)
         except PcdataError as error:
             return [*checks, check_of_error(error)]

@@ -20,8 +20,9 @@ from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import export_dataset
 from pcdata.exports.registry import TARGETS
-from pcdata.io import CaptureCamera, open_selected, write_capture_camera, write_color, write_depth, write_pose
-from pcdata.io.sources.detect import LAYOUTS, open_source
+from pcdata.io import CaptureCamera, write_capture_camera, write_color, write_depth, write_pose
+from pcdata.io.sources.opening import open_source
+from pcdata.io.sources.registry import LAYOUTS
 from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
 from pcdata.io.store.stores import STORES
 from pcdata.models import CONTRACTS, check, check_files, contract, preset
@@ -195,7 +196,7 @@ def test_no_choice_and_no_option_is_called_as_a_parameter_beside_it():
     options = {field.name for target in TARGETS.values() for field in fields(target)}
     assert not set(inspect.signature(export_dataset).parameters) & options
     layouts = {name for one in LAYOUTS.values() for name in inspect.signature(one).parameters} - {"path"}
-    assert not set(inspect.signature(open_selected).parameters) & layouts
+    assert not set(inspect.signature(open_source).parameters) & layouts
 
 
 def test_channels_are_a_choice_of_check_as_of_preset(captures, tmp_path, capsys):
@@ -225,7 +226,7 @@ def test_a_parameter_of_python_is_no_choice(capsys, captures, tmp_path, name):
         assert f"has no option '{name}'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", sorted(set(inspect.signature(open_selected).parameters) - {"options"}))
+@pytest.mark.parametrize("name", sorted(set(inspect.signature(open_source).parameters) - {"options"}))
 def test_a_parameter_of_opening_is_no_option(capsys, captures, name):
     assert main(["inspect", str(captures), "--option", f"{name}=1"]) == 2
     assert f"--option {name}: is no option of a layout" in capsys.readouterr().err

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import torch
 
-from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note, near_matches
+from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note
+from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.average import DepthAverage, average_depth
-from pcdata.io.sources.source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.still_camera import check_still_camera
 from pcdata.structures import Confidence, DepthFrame, confidence_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class AveragedSource:
+class AveragedSource(CombinedSource):
     """Averages every ``num_frames`` consecutive captures of a source into one with less noise and fewer holes.
 
     A sample bears the id, colours, labels, pose and mask of the first capture of its group. Its provenance tells what
@@ -28,12 +31,17 @@ class AveragedSource:
     are told by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
 
     Args:
+        source: the captures, in the order of time.
+        num_frames: captures that become one.
         mad_factor: as in average_depth.
         resolution: as in average_depth.
         max_jump: as in average_depth.
         min_count: as in average_depth.
         max_moving: the part of all readings that may jump before something must have moved.
     """
+
+    kind: ClassVar[str] = "averaged"
+    over_time: ClassVar[bool] = True
 
     source: CaptureSource
     num_frames: int = 10
@@ -42,32 +50,40 @@ class AveragedSource:
     max_jump: float = 0.03
     min_count: int = 3
     max_moving: float = 0.01
+    _groups: Mapping[str, list[str]] = field(init=False, repr=False, compare=False)  # id -> ids of the captures
 
     def __post_init__(self) -> None:
+        where = "AveragedSource"
+        reals = ("mad_factor", "resolution", "max_jump", "max_moving")
+        check_numbers(where, self, whole=("num_frames", "min_count"), real=reals)
         if self.num_frames < 2 or not 1 <= self.min_count <= self.num_frames or not 0 <= self.max_moving <= 1:
             raise ConfigError(
-                "AveragedSource: needs num_frames >= 2, 1 <= min_count <= num_frames and 0 <= max_moving <= 1, got "
+                f"{where}: needs num_frames >= 2, 1 <= min_count <= num_frames and 0 <= max_moving <= 1, got "
                 f"{self.num_frames}, {self.min_count}, {self.max_moving}"
             )
-        count = len(checked_ids("AveragedSource", self.source))
-        if count % self.num_frames:
-            raise CaptureError(
-                f"AveragedSource: {count} captures are no whole number of groups of {self.num_frames}; take a subset "
-                "or another num_frames"
+        if not (self.mad_factor > 0 and self.resolution >= 0 and self.max_jump > 0):
+            raise ConfigError(
+                f"{where}: needs mad_factor > 0, resolution >= 0 and max_jump > 0, got {self.mad_factor}, "
+                f"{self.resolution}, {self.max_jump}"
             )
+        ids = checked_ids(where, self.source)
+        if len(ids) % self.num_frames:
+            raise CaptureError(
+                f"{where}: {len(ids)} captures are no whole number of groups of {self.num_frames}; take a subset or "
+                "another num_frames"
+            )
+        groups = {ids[start]: ids[start : start + self.num_frames] for start in range(0, len(ids), self.num_frames)}
+        object.__setattr__(self, "_groups", groups)
 
     @property
-    def name(self) -> str:
-        """The name of the source."""
-        return str(getattr(self.source, "name", type(self.source).__name__))
+    def sources(self) -> tuple[CaptureSource]:
+        """The source whose captures are averaged."""
+        return (self.source,)
 
     @property
     def ids(self) -> list[str]:
         """The id of the first capture of every group, in order."""
-        return self.source.ids[:: self.num_frames]
-
-    def __len__(self) -> int:
-        return len(self.source.ids) // self.num_frames
+        return list(self._groups)
 
     def group(self, sample_id: str) -> list[str]:
         """Return the ids of the captures that make a sample.
@@ -75,13 +91,16 @@ class AveragedSource:
         Raises:
             CaptureError: no sample has this id.
         """
-        if sample_id not in self.ids:
-            raise CaptureError(
-                f"AveragedSource: no sample {sample_id!r}; a group is called after its first capture"
-                f"{near_matches(sample_id, self.ids)}"
-            )
-        start = self.source.ids.index(sample_id)
-        return self.source.ids[start : start + self.num_frames]
+        check_known("AveragedSource", sample_id, self._groups, "; a group is called after its first capture")
+        return list(self._groups[sample_id])
+
+    def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
+        """Return the captures of a group.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+        return [(self.source, own) for own in self.group(sample_id)]
 
     def load(self, sample_id: str) -> DepthFrame:
         """Load and average one group.

@@ -89,7 +89,12 @@ def _scanned(folder: Path) -> list[os.DirEntry[str]]:
             listed = sorted(found, key=lambda entry: entry.name)
     except OSError as error:
         raise CaptureError(f"{folder}: cannot be listed: {error.strerror or error}") from error
-    return [entry for entry in listed if not entry.name.startswith(".") and entry.name.lower() not in _LITTER]
+    return [entry for entry in listed if not is_litter(entry.name)]
+
+
+def is_litter(name: str) -> bool:
+    """Say whether an entry is hidden, or what desktops, servers and archivers leave behind."""
+    return name.startswith(".") or name.lower() in _LITTER
 
 
 def _is_file_entry(entry: os.DirEntry[str]) -> bool:

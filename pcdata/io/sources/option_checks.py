@@ -56,6 +56,21 @@ def check_seconds(where: str, option: str, seconds: float) -> float:
     return float(seconds)
 
 
+def check_numbers(where: str, options: Any, *, whole: Collection[str], real: Collection[str]) -> None:
+    """Require that attributes of an object are whole numbers, others numbers; infinity is one, NaN is none.
+
+    Raises:
+        ConfigError: names the first that is not.
+    """
+    for option in whole:
+        if not _is_whole(value := getattr(options, option)):
+            raise ConfigError(f"{where}: {option} must be a whole number, got {value!r:.200}")
+    for option in real:
+        value = getattr(options, option)
+        if not _is_number(value) and value not in (math.inf, -math.inf):
+            raise ConfigError(f"{where}: {option} must be a number, got {value!r:.200}")
+
+
 def check_switch(where: str, option: str, value: bool) -> bool:
     """Return a switch.
 

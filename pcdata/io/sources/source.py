@@ -4,64 +4,19 @@ from __future__ import annotations
 
 import copy
 import inspect
-from abc import ABC, ABCMeta, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from abc import ABCMeta, abstractmethod
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
-from pcdata.errors import (
-    CaptureError,
-    DTypeError,
-    NonFiniteError,
-    NoPlaneError,
-    PcdataError,
-    PoseError,
-    TooFewPointsError,
-    UnitError,
-    add_note,
-    near_matches,
-)  # fmt: skip
+from pcdata.errors import CaptureError, PcdataError, add_note
 from pcdata.files.inputs import Inputs, recording
 from pcdata.files.opening import check_inside
-from pcdata.files.sample_names import check_names, check_text, in_order, name_some, same_but_for_writing
+from pcdata.files.sample_names import check_known, check_names, in_order, name_some, same_but_for_writing
+from pcdata.io.sources.capture_source import CaptureSource
+from pcdata.io.sources.combine import CombinedSource, Selectable
 from pcdata.io.sources.listing import LinkTargets, absolute, is_folder, link_targets
 from pcdata.structures import DepthFrame, PointCloud
-
-# What is wrong with one capture, not with what is asked of all of them.
-REFUSALS = (CaptureError, PoseError, UnitError, NonFiniteError, TooFewPointsError, NoPlaneError)
-
-
-class CaptureSource(Protocol):
-    """Anything with ids that loads a capture by id: a :class:`Source`, a synthetic one, one around another."""
-
-    @property
-    def ids(self) -> list[str]:
-        """The sample ids, unique and in a fixed order."""
-
-    def load(self, sample_id: str) -> DepthFrame | PointCloud:
-        """Load one sample."""
-
-
-def checked_ids(where: str, source: Any) -> list[str]:
-    """Return the ids of a source that can be read as a whole.
-
-    Raises:
-        DTypeError: it is no source.
-        CaptureError: it has no samples, two with one id, or an id that no file can hold.
-    """
-    if not hasattr(source, "ids") or not hasattr(source, "load"):
-        raise DTypeError(
-            f"{where}: source must have ids and load(id), got {type(source).__name__}; pcdata.open_source(path) makes "
-            "one of a folder or file"
-        )
-    ids = list(source.ids)
-    if not ids:
-        raise CaptureError(f"{where}: {source!r} has no samples")
-    if len(set(ids)) != len(ids):
-        twice = next(name for name in ids if ids.count(name) > 1)
-        raise CaptureError(f"{where}: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
-    check_text(where, ids)
-    return ids
 
 
 class _Recorded(ABCMeta):
@@ -81,19 +36,7 @@ class _Recorded(ABCMeta):
         return inspect.Signature(parameters)
 
 
-def inputs_of(source: Any) -> Inputs:
-    """Return what was read to open a source, and the sources that it is made of."""
-    found = Inputs()
-    if isinstance(own := getattr(source, "inputs", None), Inputs):
-        found.add(own)
-    within = [getattr(source, "source", None), *getattr(source, "sources", ())]
-    for inner in within:
-        if inner is not None and inner is not source:
-            found.add(inputs_of(inner))
-    return found
-
-
-class Source(ABC, metaclass=_Recorded):
+class Source(Selectable["Source"], metaclass=_Recorded):
     """The samples of one capture: unique ids in the order that a person counts in, and a loader.
 
     A source holds paths and numbers only, no open file, so it can be pickled, sent to workers and used by many at once.
@@ -120,7 +63,7 @@ class Source(ABC, metaclass=_Recorded):
         self.links_to = link_targets(links_to)
         self._ids = in_order(ids)
         self._known = frozenset(self._ids)
-        self.skipped: dict[str, str] = {}  # id -> why it was left out; see without
+        self._skipped: dict[str, str] = {}
         if not self._ids:
             raise CaptureError(f"{self}: no sample found; this layout needs {self.needs}")
         check_names(str(self), self._ids)
@@ -167,14 +110,18 @@ class Source(ABC, metaclass=_Recorded):
         """The sample ids, unique, in the order of the numbers in them."""
         return list(self._ids)
 
+    @property
+    def skipped(self) -> dict[str, str]:
+        """What was left out: id -> why; see :meth:`without`."""
+        return dict(self._skipped)
+
     def load(self, sample_id: str) -> DepthFrame | PointCloud:
         """Read one sample.
 
         Raises:
             CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
         """
-        if sample_id not in self._known:
-            raise CaptureError(f"{self}: no sample {sample_id!r}{near_matches(str(sample_id), self._ids)}")
+        check_known(str(self), sample_id, self._known)
         try:
             self.check_links(sample_id)
             return self._load(sample_id)
@@ -182,39 +129,10 @@ class Source(ABC, metaclass=_Recorded):
             add_note(error, f"while loading sample {sample_id!r} of {self}")
             raise
 
-    def subset(self, ids: Sequence[str]) -> Source:
-        """Return the same source with some of its samples only, in the order that they have here."""
-        unknown = set(ids) - self._known
-        if unknown or not ids:
-            raise CaptureError(f"{self}: subset needs ids of this source, got {name_some(unknown) or 'none'}")
+    def _part(self, ids: list[str], skipped: Mapping[str, str]) -> Source:
         smaller = copy.copy(self)
-        smaller._known = frozenset(ids)
-        smaller._ids = [sample_id for sample_id in self._ids if sample_id in smaller._known]
-        return smaller
-
-    def without(self, ids: Iterable[str] | Mapping[str, str]) -> Source:
-        """Return the same source without some of its samples; ``skipped`` tells which, and why.
-
-        Args:
-            ids: the samples to leave out, as from a list of bad frames, or with the reason of each, as
-                :func:`refused_captures` returns them.
-
-        Raises:
-            CaptureError: one is no sample of this source, or none is left.
-        """
-        if isinstance(ids, (str, bytes)):
-            raise DTypeError(f"{self}: without takes a list of ids, got the text {ids!r:.100}; put it into a list")
-        reasons = {**ids} if isinstance(ids, Mapping) else dict.fromkeys(ids, "listed")
-        unknown = [str(sample_id) for sample_id in reasons if sample_id not in self._known]
-        if unknown:
-            hint = near_matches(unknown[0], self._ids)
-            raise CaptureError(f"{self}: cannot leave out {name_some(unknown)}, which it does not have{hint}")
-        left = [sample_id for sample_id in self._ids if sample_id not in reasons]
-        if not left:
-            reason = next(iter(reasons.values()))
-            raise CaptureError(f"{self}: nothing is left when {len(reasons)} samples are left out ({reason})")
-        smaller = self.subset(left)
-        smaller.skipped = {**self.skipped, **reasons}
+        smaller._ids, smaller._known = ids, frozenset(ids)
+        smaller._skipped = {**self._skipped, **skipped}
         return smaller
 
     def provenance(self, sample_id: str) -> dict[str, Any]:
@@ -233,32 +151,16 @@ class Source(ABC, metaclass=_Recorded):
         return f"{self.kind} source {self.path}"
 
 
-def refused_captures(source: CaptureSource) -> dict[str, str]:
-    """Load every capture once and return those that are refused, with the reason of each.
+def stored_captures(source: CaptureSource, sample_id: str) -> list[tuple[Source, str]]:
+    """Return the captures on disk that a sample is made of, by their layouts and ids; none of a synthetic one.
 
-    ``source.without(refused_captures(source))`` is the source that loads throughout.
+    Raises:
+        CaptureError: no sample has this id.
     """
-    refused = {}
-    for sample_id in checked_ids("refused_captures", source):
-        try:
-            source.load(sample_id)
-        except REFUSALS as error:
-            refused[sample_id] = reason_of(error)
-    return refused
-
-
-def skipped_of(source: Any) -> dict[str, str]:
-    """Return what was left out of a source, or of the one that it is made around: id -> why."""
-    skipped: dict[str, str] = {}
-    while source is not None:
-        skipped |= getattr(source, "skipped", {})
-        source = getattr(source, "source", None)
-    return skipped
-
-
-def reason_of(error: PcdataError) -> str:
-    """Return why a capture was refused, in one line."""
-    return f"{type(error).__name__}: {str(error).splitlines()[0]}"
+    if isinstance(source, Source):
+        return [(source, sample_id)]
+    made_of = source.made_of(sample_id) if isinstance(source, CombinedSource) else []
+    return [stored for inner, own in made_of for stored in stored_captures(inner, own)]
 
 
 def check_partners(where: str, ids: Iterable[str], partners: Mapping[str, Iterable[str]]) -> None:

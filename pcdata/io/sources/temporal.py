@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import islice
+from typing import ClassVar
 
-from pcdata.errors import CaptureError, ConfigError, DTypeError, near_matches
+from pcdata.errors import ConfigError, DTypeError
+from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth
 from pcdata.functional.depth.temporal import PERSISTENCE_RULES, TemporalState, temporal_filter
-from pcdata.io.sources.source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.still_camera import check_still_camera
 from pcdata.structures import DepthFrame, with_filled_depth
 
@@ -33,6 +38,7 @@ class TemporalFilterDepth:
     baseline: float = 0.05
 
     def __post_init__(self) -> None:
+        check_numbers("TemporalFilterDepth", self, whole=("persistence",), real=("alpha", "delta", "baseline"))
         in_range = 0 < self.alpha <= 1 and self.delta > 0 and self.baseline > 0
         if not in_range or self.persistence not in range(len(PERSISTENCE_RULES)):
             raise ConfigError(
@@ -73,7 +79,7 @@ class TemporalFilterDepth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TemporallyFilteredSource:
+class TemporallyFilteredSource(CombinedSource):
     """A stream whose captures come filtered with the ``num_frames - 1`` before each of them.
 
     A window instead of all the past: every sample can be loaded alone, in any order and by any worker, with the same
@@ -81,30 +87,54 @@ class TemporallyFilteredSource:
 
     Args:
         source: the captures, in the order of time.
-        filter: the settings of the filter.
+        num_frames: that the filter looks at.
+        alpha: as in TemporalFilterDepth.
+        delta: as in TemporalFilterDepth.
+        persistence: as in TemporalFilterDepth.
+        baseline: as in TemporalFilterDepth.
     """
 
+    kind: ClassVar[str] = "temporal"
+    over_time: ClassVar[bool] = True
+
     source: CaptureSource
-    filter: TemporalFilterDepth = field(default_factory=TemporalFilterDepth)
     num_frames: int = 12
+    alpha: float = TemporalFilterDepth.alpha
+    delta: float = TemporalFilterDepth.delta
+    persistence: int = TemporalFilterDepth.persistence
+    baseline: float = TemporalFilterDepth.baseline
+    filter: TemporalFilterDepth = field(init=False, repr=False)
+    _places: Mapping[str, int] = field(init=False, repr=False, compare=False)  # id -> place in the order
 
     def __post_init__(self) -> None:
+        check_numbers("TemporallyFilteredSource", self, whole=("num_frames",), real=())
         if self.num_frames < 1:
             raise ConfigError(f"TemporallyFilteredSource: num_frames must be at least 1, got {self.num_frames}")
-        checked_ids("TemporallyFilteredSource", self.source)
+        settings = {setting.name: getattr(self, setting.name) for setting in fields(TemporalFilterDepth)}
+        object.__setattr__(self, "filter", TemporalFilterDepth(**settings))
+        ids = checked_ids("TemporallyFilteredSource", self.source)
+        object.__setattr__(self, "_places", {sample_id: place for place, sample_id in enumerate(ids)})
 
     @property
-    def name(self) -> str:
-        """The name of the source."""
-        return str(getattr(self.source, "name", type(self.source).__name__))
+    def sources(self) -> tuple[CaptureSource]:
+        """The source whose captures are filtered."""
+        return (self.source,)
 
     @property
     def ids(self) -> list[str]:
         """The sample ids of the source."""
-        return self.source.ids
+        return list(self._places)
 
-    def __len__(self) -> int:
-        return len(self.source.ids)
+    def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
+        """Return the captures that the filter looks at, the sample itself last.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+        check_known("TemporallyFilteredSource", sample_id, self._places)
+        place = self._places[sample_id]
+        first = max(0, place + 1 - self.num_frames)
+        return [(self.source, own) for own in islice(self._places, first, place + 1)]
 
     def load(self, sample_id: str) -> DepthFrame:
         """Load a capture and those before it, and return it filtered.
@@ -112,14 +142,10 @@ class TemporallyFilteredSource:
         Raises:
             CaptureError: no sample has this id, or the camera moved within the window.
         """
-        ids = self.source.ids
-        if sample_id not in ids:
-            raise CaptureError(f"TemporallyFilteredSource: no sample {sample_id!r}{near_matches(sample_id, ids)}")
-        place = ids.index(sample_id)
-        window = ids[max(0, place + 1 - self.num_frames) : place + 1]
+        window = [own for _, own in self.made_of(sample_id)]
         *_, last = self.filter.frames(self._load(name) for name in window)
-        settings = {name: getattr(self.filter, name) for name in ("alpha", "delta", "persistence", "baseline")}
-        return replace(last, provenance={**last.provenance, "temporal_filter": {"frames": window, **settings}})
+        facts = {"frames": window, **asdict(self.filter)}
+        return replace(last, provenance={**last.provenance, "temporal_filter": facts})
 
     def _load(self, sample_id: str) -> DepthFrame:
         capture = self.source.load(sample_id)

@@ -15,7 +15,7 @@ from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
 from pcdata.io.sources.averaged import AveragedSource
-from pcdata.io.sources.selection import open_selected, read_skip_file
+from pcdata.io.sources.opening import read_skip_file
 from pcdata.io.store.manifest import Manifest
 from pcdata.report.inspection import skipped_text
 
@@ -73,8 +73,8 @@ def test_a_list_of_captures_is_left_out_and_remembered(capture: Path) -> None:
 
 
 def test_the_limit_counts_what_is_left(capture: Path) -> None:
-    assert open_selected(capture, limit=2, skip=["0"]).ids == ["1", "2"]
-    assert open_selected(capture, limit=3, skip=["0"], skip_refused=True).ids == ["1", "3"]
+    assert open_source(capture, limit=2, skip=["0"]).ids == ["1", "2"]
+    assert open_source(capture, limit=3, skip=["0"], skip_refused=True).ids == ["1", "3"]
 
 
 def test_a_build_is_strict_by_default_and_says_the_way_out(capture: Path, config: Path, tmp_path: Path) -> None:

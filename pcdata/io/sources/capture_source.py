@@ -1,0 +1,121 @@
+"""The one protocol of everything that captures come from, and what may be asked of anything that keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+from pcdata.errors import (
+    CaptureError,
+    DTypeError,
+    NonFiniteError,
+    NoPlaneError,
+    PcdataError,
+    PoseError,
+    TooFewPointsError,
+    UnitError,
+)
+from pcdata.files.inputs import Inputs
+from pcdata.files.sample_names import check_text
+from pcdata.structures import DepthFrame, PointCloud
+
+# What is wrong with one capture, not with what is asked of all of them.
+REFUSALS = (CaptureError, PoseError, UnitError, NonFiniteError, TooFewPointsError, NoPlaneError)
+
+
+class CaptureSource(Protocol):
+    """Named captures, each loaded on demand: a capture on disk, a synthetic one, one made of others, a built dataset.
+
+    Loading an id twice gives the same capture, in any order and in any process: a source can be pickled.
+    """
+
+    @property
+    def name(self) -> str:
+        """What the captures are called together, such as the name of their folder."""
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids, unique and in a fixed order."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one capture.
+
+        Raises:
+            CaptureError: no capture has this id, or it cannot be trusted.
+        """
+
+
+def checked_ids(where: str, source: Any) -> list[str]:
+    """Return the ids of a source that can be read as a whole.
+
+    Raises:
+        DTypeError: it is no source.
+        CaptureError: it has no samples, two with one id, or an id that no file can hold.
+    """
+    if not hasattr(source, "ids") or not hasattr(source, "load"):
+        raise DTypeError(
+            f"{where}: source must have ids and load(id), got {type(source).__name__}; pcdata.open_source(path) makes "
+            "one of a folder or file"
+        )
+    ids = list(source.ids)
+    if not ids:
+        raise CaptureError(f"{where}: {source!r} has no samples")
+    if len(set(ids)) != len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise CaptureError(f"{where}: {source!r}: sample ids must be unique, but {twice!r} comes more than once")
+    check_text(where, ids)
+    return ids
+
+
+def all_within(source: Any) -> Iterator[Any]:
+    """Yield a source, and every source that it is made of."""
+    yield source
+    for inner in getattr(source, "sources", ()):
+        yield from all_within(inner)
+
+
+def inputs_of(source: Any) -> Inputs:
+    """Return what was read to open a source, and the sources that it is made of."""
+    found = Inputs()
+    for one in all_within(source):
+        if isinstance(own := getattr(one, "inputs", None), Inputs):
+            found.add(own)
+    return found
+
+
+def kinds_of(source: Any) -> list[str]:
+    """Return the names of the combinators and layouts that a source is made of, the outermost first, each once."""
+    return [*dict.fromkeys(kind for one in all_within(source) if isinstance(kind := getattr(one, "kind", None), str))]
+
+
+def skipped_of(source: Any) -> dict[str, str]:
+    """Return what was left out of a source, and of those that it is made of: id -> why."""
+    return dict(getattr(source, "skipped", {}))
+
+
+def unread_of(source: Any) -> list[str]:
+    """Say in words what lies in the captures but is not read, one line for each; nothing of it is an error."""
+    unread = getattr(source, "unread", None)
+    return unread() if callable(unread) else []
+
+
+def refused_captures(source: CaptureSource) -> dict[str, str]:
+    """Load every capture once and return those that are refused, with the reason of each.
+
+    ``source.without(refused_captures(source))`` is the source that loads throughout.
+    """
+    refused = {}
+    for sample_id in checked_ids("refused_captures", source):
+        try:
+            source.load(sample_id)
+        except REFUSALS as error:
+            refused[sample_id] = reason_of(error)
+    return refused
+
+
+def reason_of(error: PcdataError) -> str:
+    """Return why a capture was refused, in one line."""
+    return f"{type(error).__name__}: {str(error).splitlines()[0]}"

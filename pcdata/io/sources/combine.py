@@ -1,0 +1,293 @@
+"""Sources that are made of other sources: a part of one, or several in a row; the base of those that average."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, Generic, TypeVar
+
+from pcdata.errors import CaptureError, DTypeError, PcdataError, add_note, near_matches
+from pcdata.files.sample_names import check_known, check_text, name_some
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, skipped_of, unread_of
+from pcdata.structures import DepthFrame, PointCloud
+
+Part = TypeVar("Part")
+
+
+class Selectable(ABC, Generic[Part]):
+    """A source of which a part can be taken, as :func:`open_source` returns it."""
+
+    kind: ClassVar[str]  # of which layout or combinator it is
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What the captures are called together."""
+
+    @property
+    @abstractmethod
+    def ids(self) -> list[str]:
+        """The sample ids, unique and in a fixed order."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    @abstractmethod
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one sample.
+
+        Raises:
+            CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
+        """
+
+    @property
+    @abstractmethod
+    def skipped(self) -> dict[str, str]:
+        """What was left out: id -> why."""
+
+    @abstractmethod
+    def unread(self) -> list[str]:
+        """Say in words what lies in the captures but is not read, one line for each; nothing of it is an error."""
+
+    @abstractmethod
+    def _part(self, ids: list[str], skipped: Mapping[str, str]) -> Part:
+        """Return the same source with these of its samples only, and what was left out besides what was before."""
+
+    def subset(self, ids: Iterable[str]) -> Part:
+        """Return the same source with some of its samples only, in the order that they have here.
+
+        Raises:
+            CaptureError: one is no sample of this source, or there is none.
+        """
+        own, wanted = self.ids, self._listed("subset", ids)
+        unknown = wanted.keys() - set(own)
+        if unknown or not wanted:
+            raise CaptureError(f"{self}: subset needs ids of this source, got {name_some(map(str, unknown)) or 'none'}")
+        return self._part([sample_id for sample_id in own if sample_id in wanted], {})
+
+    def without(self, ids: Iterable[str] | Mapping[str, str]) -> Part:
+        """Return the same source without some of its samples; ``skipped`` tells which, and why.
+
+        Args:
+            ids: the samples to leave out, as from a list of bad frames, or with the reason of each, as
+                :func:`refused_captures` returns them.
+
+        Raises:
+            CaptureError: one is no sample of this source, or none is left.
+        """
+        own, reasons = self.ids, self._listed("without", ids)
+        known = set(own)
+        unknown = [str(sample_id) for sample_id in reasons if sample_id not in known]
+        if unknown:
+            hint = near_matches(unknown[0], own)
+            raise CaptureError(f"{self}: cannot leave out {name_some(unknown)}, which it does not have{hint}")
+        left = [sample_id for sample_id in own if sample_id not in reasons]
+        if not left:
+            reason = next(iter(reasons.values()))
+            raise CaptureError(f"{self}: nothing is left when {len(reasons)} samples are left out ({reason})")
+        return self._part(left, reasons)
+
+    def _listed(self, method: str, ids: Iterable[str] | Mapping[str, str]) -> dict[str, str]:
+        """Return ids, each with the reason to leave it out."""
+        if isinstance(ids, (str, bytes)):
+            raise DTypeError(f"{self}: {method} takes a list of ids, got the text {ids!r:.100}; put it into a list")
+        return {**ids} if isinstance(ids, Mapping) else dict.fromkeys(ids, "listed")
+
+
+class CombinedSource(Selectable["SubsetSource"]):
+    """Captures that are made of those of other sources; holds no capture, so it pickles as they do.
+
+    A subclass says of which (:meth:`made_of`) and how (:meth:`load`). One that is a dataclass with the field ``source``
+    and plain fields can be registered, see :func:`register_combinator`.
+    """
+
+    over_time: ClassVar[bool] = False  # smooths over time, which two in a row would do twice
+
+    @property
+    @abstractmethod
+    def sources(self) -> Sequence[CaptureSource]:
+        """The sources that this one is made of."""
+
+    @abstractmethod
+    def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
+        """Return the captures that a sample is made of: source and id of each.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+
+    @property
+    def name(self) -> str:
+        """The names of the sources."""
+        return "+".join(str(getattr(source, "name", type(source).__name__)) for source in self.sources)
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """What was left out of the sources: id -> why."""
+        return {sample_id: why for source in self.sources for sample_id, why in skipped_of(source).items()}
+
+    def unread(self) -> list[str]:
+        """Say in words what lies in the captures but is not read."""
+        return [line for source in self.sources for line in unread_of(source)]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def _part(self, ids: list[str], skipped: Mapping[str, str]) -> SubsetSource:
+        return SubsetSource(self, ids, skipped=skipped)
+
+
+class SubsetSource(CombinedSource):
+    """Some of the captures of a source, in its order."""
+
+    kind = "subset"
+
+    def __init__(self, source: CaptureSource, ids: Iterable[str], *, skipped: Mapping[str, str] | None = None) -> None:
+        """Take the ids.
+
+        Args:
+            source: any source.
+            ids: of the samples that remain.
+            skipped: ids that were left out, with the reason of each.
+
+        Raises:
+            CaptureError: there is none, or one is no sample of the source.
+        """
+        self.source = source
+        wanted = set(ids)
+        self._ids = {sample_id: None for sample_id in checked_ids("SubsetSource", source) if sample_id in wanted}
+        if not wanted or len(self._ids) < len(wanted):
+            lost = name_some(map(str, wanted - self._ids.keys())) or "none"
+            raise CaptureError(f"SubsetSource: needs ids of {source!r}, got {lost}")
+        self._skipped = dict(skipped or {})
+
+    @property
+    def sources(self) -> tuple[CaptureSource]:
+        """The source that this is a part of."""
+        return (self.source,)
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids that remain."""
+        return list(self._ids)
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """What was left out, here and before: id -> why."""
+        return {**super().skipped, **self._skipped}
+
+    def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
+        """Return the capture that a sample is.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+        check_known(str(self), sample_id, self._ids)
+        return [(self.source, sample_id)]
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one sample, as its source has it.
+
+        Raises:
+            CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
+        """
+        ((source, own),) = self.made_of(sample_id)
+        return source.load(own)
+
+    def __repr__(self) -> str:
+        return f"SubsetSource({self.source!r}, {len(self)} samples)"
+
+    def __str__(self) -> str:
+        return f"a part of {self.source}"
+
+
+class JoinedSource(CombinedSource):
+    """The captures of several sources in a row; the sample ``NAME/ID`` is the capture ``ID`` of the source ``NAME``."""
+
+    kind = "joined"
+
+    def __init__(self, sources: Mapping[str, CaptureSource]) -> None:
+        """Take the sources.
+
+        Args:
+            sources: by the name that goes before the ids, in the order that they shall have.
+
+        Raises:
+            CaptureError: there is none, one has no samples, or two samples would have one id.
+        """
+        if not isinstance(sources, Mapping):
+            raise DTypeError(f"JoinedSource: sources must map names to sources, got {type(sources).__name__}")
+        check_text("JoinedSource", sources)
+        self._sources = dict(sources)
+        self._place: dict[str, tuple[str, str]] = {}  # id -> name and id of the capture
+        for name, source in self._sources.items():
+            for sample_id in checked_ids(f"JoinedSource: {name}", source):
+                joined = f"{name}/{sample_id}"
+                if joined in self._place:
+                    raise CaptureError(
+                        f"JoinedSource: {joined!r} would be a sample of {self._place[joined][0]!r} and of {name!r}; "
+                        "join them under other names"
+                    )
+                self._place[joined] = name, sample_id
+        if not self._place:
+            raise CaptureError("JoinedSource: there is no source to join")
+
+    @property
+    def sources(self) -> tuple[CaptureSource, ...]:
+        """The sources in their order."""
+        return tuple(self._sources.values())
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids, those of the first source first."""
+        return list(self._place)
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """What was left out of each source: ``NAME/ID`` -> why."""
+        return {
+            f"{name}/{sample_id}": why
+            for name, source in self._sources.items()
+            for sample_id, why in skipped_of(source).items()
+        }
+
+    def unread(self) -> list[str]:
+        """Say in words what lies in each of the captures but is not read."""
+        return [f"{name}/{line}" for name, source in self._sources.items() for line in unread_of(source)]
+
+    def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
+        """Return the capture that a sample is.
+
+        Raises:
+            CaptureError: no sample has this id.
+        """
+        check_known(str(self), sample_id, self._place)
+        name, own = self._place[sample_id]
+        return [(self._sources[name], own)]
+
+    def load(self, sample_id: str) -> DepthFrame | PointCloud:
+        """Load one sample, as its source has it.
+
+        Raises:
+            CaptureError, UnitError, PoseError, ShapeError: the sample is unknown or cannot be trusted, and why.
+        """
+        ((source, own),) = self.made_of(sample_id)
+        try:
+            return _called(source.load(own), sample_id)
+        except PcdataError as error:
+            add_note(error, f"while loading sample {sample_id!r} of {self}")
+            raise
+
+    def __repr__(self) -> str:
+        return f"JoinedSource({name_some(self._sources)}: {len(self)} samples)"
+
+    def __str__(self) -> str:
+        return f"joined source {name_some(self._sources)}"
+
+
+def _called(capture: DepthFrame | PointCloud, sample_id: str) -> DepthFrame | PointCloud:
+    if isinstance(capture, DepthFrame):
+        return replace(capture, sample_id=sample_id)
+    return capture.with_meta([{"sample_id": sample_id}] * capture.num_clouds)
