@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import inspect
 import multiprocessing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -24,8 +23,9 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from pcdata.contracts.tensors import check_tensors, parse_spec
-from pcdata.errors import BackendError, DTypeError, SlowBackendWarning, near_matches
+from pcdata.contracts.arguments import Contract
+from pcdata.contracts.numbers import Spec
+from pcdata.errors import BackendError, SlowBackendWarning, near_matches
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -44,9 +44,9 @@ class Operation:
     """A registered operation: its contract, its reference and its kernels."""
 
     name: str
-    specs: dict[str, str]
     reference: Callable[..., Any]
     public: Callable[..., Any]
+    contract: Contract | None = None  # None for an inner function
     gradient: bool = True  # whether results carry one to the inputs
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
 
@@ -55,53 +55,38 @@ OPERATIONS: dict[str, Operation] = {}
 INNER: dict[str, Operation] = {}
 
 
-def op(*, gradient: bool = True, **specs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Register the decorated reference as a public operation with a tensor contract per argument.
+def op(*, gradient: bool = True, **specs: str | Spec) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Register the decorated reference as a public operation with a contract per argument.
 
     Row pointers given as None mean "one cloud" and reach the body as ``[0, N]``; float inputs must be finite. Kernels
     get contiguous tensors without a gradient, whatever the caller's look like.
 
     Args:
         gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
-        specs: argument name -> contract, see :mod:`pcdata.contracts.tensors`.
+        specs: argument name -> contract: of tensors a string, see :mod:`pcdata.contracts.tensors`; of others an object,
+            see :mod:`pcdata.contracts.numbers`.
     """
 
     def decorate(reference: Callable[P, R]) -> Callable[P, R]:
-        signature = inspect.signature(reference)
-        name = reference.__name__
-        # Row pointers come last, when the number of rows is known.
-        ordered = dict(sorted(specs.items(), key=lambda item: parse_spec(item[1]).is_ptr))
-        # Row pointers may be None wherever they stand: that means one cloud.
-        required = [
-            key
-            for key, text in ordered.items()
-            if signature.parameters[key].default is inspect.Parameter.empty and not parse_spec(text).is_ptr
-        ]
+        contract = Contract.of(reference, specs)
+        name = contract.name
 
         @functools.wraps(reference)
         def public(*args: P.args, **kwargs: P.kwargs) -> R:
-            bound = signature.bind(*args, **kwargs)
-            bound.apply_defaults()
-            arguments = bound.arguments
-            for key in required:
-                if arguments[key] is None:
-                    raise DTypeError(f"{name}: {key} must be a torch.Tensor, not None")
-            _fill_row_pointers(arguments, ordered)
-            check_tensors(name, arguments, ordered)
+            arguments = contract.bind(args, kwargs)
+            contract.check(arguments)
             backend = arguments.pop("backend", "auto")
-            device = next(arguments[key].device for key in ordered if isinstance(arguments.get(key), Tensor))
-            wants_gradient = gradient and _wants_gradient(arguments.values())
-            if backend == "auto" and wants_gradient:
+            wants_gradient = _wants_gradient(arguments.values())
+            if backend == "auto" and wants_gradient and gradient:
                 backend = REFERENCE  # kernels know no derivative
+            device = next(arguments[key].device for key in contract.tensors if arguments[key] is not None)
             body: Callable[..., R] = _choose(operation, backend, device)
             is_kernel = body is not operation.reference
-            if gradient and not is_kernel:
-                return body(**arguments)
-            tidy = _plain if is_kernel else _detached
-            with torch.no_grad():
-                return body(**{key: tidy(value) for key, value in arguments.items()})
+            if is_kernel or not gradient:
+                _detach(arguments, contiguous=is_kernel)
+            return body(**arguments)
 
-        operation = OPERATIONS[name] = Operation(name, ordered, reference, public, gradient)
+        operation = OPERATIONS[name] = Operation(name, reference, public, contract, gradient)
         return public
 
     return decorate
@@ -122,7 +107,7 @@ def inner(reference: Callable[P, R]) -> Callable[P, R]:
         body: Callable[P, R] = _choose(operation, "auto", tensors[0].device)
         return body(*args, **kwargs)
 
-    operation = INNER[name] = Operation(name, {}, reference, function)
+    operation = INNER[name] = Operation(name, reference, function)
     return function
 
 
@@ -155,21 +140,19 @@ def backends() -> list[str]:
     return [REFERENCE, *BACKEND_MODULES]
 
 
-def _fill_row_pointers(arguments: dict[str, Any], specs: dict[str, str]) -> None:
-    rows_of = {
-        spec.dims[0]: arguments[key]
-        for key, text in specs.items()
-        if not (spec := parse_spec(text)).is_ptr and isinstance(arguments.get(key), Tensor) and arguments[key].ndim
-    }
-    for key, text in specs.items():
-        spec = parse_spec(text)
-        if spec.is_ptr and arguments.get(key) is None and spec.dims[0] in rows_of:
-            rows = rows_of[spec.dims[0]]
-            arguments[key] = torch.tensor([0, rows.shape[0]], dtype=torch.int64, device=rows.device)
+def _wants_gradient(tensors: Iterable[Any]) -> bool:
+    wanted = False
+    for value in tensors:  # not any(): a generator is resumed once per value
+        wanted |= isinstance(value, Tensor) and value.requires_grad
+    return wanted and torch.is_grad_enabled()
 
 
-def _wants_gradient(arguments: Iterable[Any]) -> bool:
-    return torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in arguments)
+def _detach(arguments: dict[str, Any], *, contiguous: bool) -> None:
+    """Take tensors out of every graph, and lay them out as kernels read memory: row after row, without gaps."""
+    for key, value in arguments.items():
+        if isinstance(value, Tensor):
+            value = value.detach() if value.requires_grad else value
+            arguments[key] = value.contiguous() if contiguous else value
 
 
 def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
@@ -180,15 +163,6 @@ def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
             yield from _tensors_in(one.values())
         elif isinstance(one, (list, tuple)):
             yield from _tensors_in(one)
-
-
-def _detached(value: Any) -> Any:
-    return value.detach() if isinstance(value, Tensor) and value.requires_grad else value
-
-
-def _plain(value: Any) -> Any:
-    """Return a tensor as kernels read memory: row after row, without gaps, and no part of a graph."""
-    return _detached(value).contiguous() if isinstance(value, Tensor) else value
 
 
 def first_live(device: torch.device, has_kernel: Callable[[str], bool]) -> str:

@@ -14,14 +14,15 @@ from torch import Tensor
 def all_finite(values: Tensor) -> bool:
     """Say whether no value is NaN or infinite."""
     if values.device.type == "cpu":
-        return bool(np.isfinite(values.detach().numpy()).all())
+        # Not .all(), which is Python that calls this.
+        return bool(np.logical_and.reduce(np.isfinite(values.detach().numpy()), axis=None))
     return bool(torch.isfinite(values).all())
 
 
 def any_negative(values: Tensor) -> bool:
     """Say whether a value is below 0; NaN is not."""
     if values.device.type == "cpu":
-        return bool((values.detach().numpy() < 0).any())
+        return bool(np.logical_or.reduce(values.detach().numpy() < 0, axis=None))
     return bool((values < 0).any())
 
 

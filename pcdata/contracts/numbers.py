@@ -1,18 +1,184 @@
-"""Checks on the plain numbers that operations take beside tensors."""
+"""Specs of the plain values that operations take beside tensors: checked once, for every backend.
+
+``@op`` takes one per argument, beside the tensor contracts: ``k=Count()``. A spec raises where a value breaks it, and
+returns what the bodies get: mostly the value itself. None is fine where it is the default. A spec that belongs to one
+operation alone stands beside that operation.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
-from pcdata.errors import ConfigError, DTypeError
+import torch
+from torch import Tensor
+
+from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, near_matches
 
 
-def require_count(where: str, name: str, value: int, *, minimum: int = 1) -> None:
-    """Require a whole number of at least ``minimum``."""
+class Spec(Protocol):
+    """What one argument must hold."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> Any:
+        """Return ``arguments[name]`` as bodies get it; tensors, row pointers among them, are checked already."""
+        ...
+
+
+@dataclass(frozen=True)
+class Count:
+    """A whole number from ``minimum`` to ``maximum``."""
+
+    minimum: int = 1
+    maximum: int | None = None
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> int:
+        """See :class:`Spec`."""
+        value: int = arguments[name]
+        require_count(where, name, value, minimum=self.minimum, maximum=self.maximum)
+        return value
+
+
+@dataclass(frozen=True)
+class Length:
+    """A positive, finite length in the unit of the points."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> float:
+        """See :class:`Spec`."""
+        require_length(where, name, arguments[name])
+        return float(arguments[name])
+
+
+@dataclass(frozen=True)
+class Positive:
+    """A number above 0, finite unless said otherwise."""
+
+    finite: bool = True
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> float:
+        """See :class:`Spec`."""
+        require_positive(where, name, arguments[name], finite=self.finite)
+        return float(arguments[name])
+
+
+@dataclass(frozen=True)
+class Fraction:
+    """A number above 0 and at most 1."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> float:
+        """See :class:`Spec`."""
+        require_positive(where, name, arguments[name])
+        if arguments[name] > 1:
+            raise ConfigError(f"{where}: {name} must be more than 0 and at most 1, got {arguments[name]}")
+        return float(arguments[name])
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """One of a few words."""
+
+    words: tuple[str, ...]
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> str:
+        """See :class:`Spec`."""
+        value = arguments[name]
+        if value not in self.words:
+            raise ConfigError(
+                f"{where}: {name} must be one of {', '.join(map(repr, self.words))}, got {value!r}"
+                f"{near_matches(str(value), self.words)}"
+            )
+        return str(value)
+
+
+@dataclass(frozen=True)
+class ImageSize:
+    """The (height, width) of an image of at least one pixel."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> tuple[int, int]:
+        """See :class:`Spec`."""
+        size = tuple(arguments[name])
+        if len(size) != 2 or min(size) < 1:
+            raise ConfigError(f"{where}: {name} must be (height, width) of at least one pixel, got {arguments[name]}")
+        return size
+
+
+@dataclass(frozen=True)
+class CountPerCloud:
+    """One count for every cloud, or one per cloud (B,), of rows that the cloud has; bodies get a list of B."""
+
+    ptr: str = "ptr"
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
+        """See :class:`Spec`."""
+        wanted = counts_per_cloud(where, arguments[name], arguments[self.ptr])
+        require_rows(where, wanted, arguments[self.ptr])
+        return wanted
+
+
+@dataclass(frozen=True)
+class LengthPerCloud:
+    """One positive length for every cloud, or one per cloud (B,); bodies get (B,) float64."""
+
+    ptr: str = "ptr"
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+        """See :class:`Spec`."""
+        ptr: Tensor = arguments[self.ptr]
+        lengths = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+        num_clouds = len(ptr) - 1
+        if lengths.ndim == 0:
+            lengths = lengths.expand(num_clouds)
+        if lengths.shape != (num_clouds,):
+            raise ShapeError(f"{where}: {name} must be one number or ({num_clouds},), got {tuple(lengths.shape)}")
+        if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
+            raise ConfigError(f"{where}: {name} must be positive, got {lengths.tolist()}")
+        return lengths
+
+
+def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr: Tensor) -> list[int]:
+    """Return one count per cloud from one number or (B,) numbers.
+
+    Raises:
+        DTypeError: a count that is not an int.
+        ShapeError: the number of counts is not the number of clouds.
+        ConfigError: a negative count.
+    """
+    num_clouds = len(ptr) - 1
+    given = num_samples.tolist() if isinstance(num_samples, Tensor) else num_samples
+    counts = list(given) if isinstance(given, Sequence) else [given] * num_clouds
+    for count in counts:
+        if not isinstance(count, int):
+            raise DTypeError(
+                f"{where}: the number of samples must be an int, or a sequence or tensor of ints, got {given}"
+            )
+    if len(counts) != num_clouds:
+        raise ShapeError(f"{where}: {len(counts)} counts were given for {num_clouds} clouds")
+    if min(counts) < 0:
+        raise ConfigError(f"{where}: the number of samples must not be negative, got {min(counts)}")
+    return counts
+
+
+def require_rows(where: str, wanted: Sequence[int], ptr: Tensor) -> None:
+    """Require that every cloud has the rows wanted from it.
+
+    Raises:
+        TooFewPointsError: the first cloud that has not.
+    """
+    bounds = ptr.tolist()
+    for cloud, count in enumerate(wanted):
+        available = bounds[cloud + 1] - bounds[cloud]
+        if count > available:
+            raise TooFewPointsError(f"{where}: {count} points were asked of cloud {cloud}, which has {available}")
+
+
+def require_count(where: str, name: str, value: int, *, minimum: int = 1, maximum: int | None = None) -> None:
+    """Require a whole number from ``minimum`` to ``maximum``."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise DTypeError(f"{where}: {name} must be an int, not {type(value).__name__}")
-    if value < minimum:
-        raise ConfigError(f"{where}: {name} must be at least {minimum}, got {value}")
+    if value < minimum or (maximum is not None and value > maximum):
+        allowed = f"at least {minimum}" if maximum is None else f"{minimum} to {maximum}"
+        raise ConfigError(f"{where}: {name} must be {allowed}, got {value}")
 
 
 def require_length(where: str, name: str, value: float) -> None:
@@ -23,9 +189,9 @@ def require_length(where: str, name: str, value: float) -> None:
         raise ConfigError(f"{where}: {name} must be a length in the unit of the points, 1e-22 to 1e19, got {value}")
 
 
-def require_positive(where: str, name: str, value: float) -> None:
-    """Require a finite number above 0."""
+def require_positive(where: str, name: str, value: float, *, finite: bool = True) -> None:
+    """Require a number above 0, finite unless said otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DTypeError(f"{where}: {name} must be a number, not {type(value).__name__}")
-    if not math.isfinite(value) or value <= 0:
-        raise ConfigError(f"{where}: {name} must be finite and more than 0, got {value}")
+    if not value > 0 or (finite and not math.isfinite(value)):
+        raise ConfigError(f"{where}: {name} must be {'finite and ' if finite else ''}more than 0, got {value}")

@@ -4,7 +4,9 @@ A contract is a short string read by :func:`check_tensors`:
 
 * ``"N 3"``: a float32 tensor of that shape; equal letters must agree across the call.
 * ``"V H W : uint8"``: the same with a dtype; ``float`` means float32 or float64.
+* ``"V H W : depth"``: float32 lengths, none below 0.
 * ``"ptr N B"``: int64 row pointers of shape (B+1,) that cut N rows into B clouds.
+* ``"ptr N B >= 3"``: the same, with at least 3 rows in every cloud.
 """
 
 from __future__ import annotations
@@ -17,15 +19,17 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from pcdata.contracts.host import all_finite
-from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
+from pcdata.contracts.host import all_finite, any_negative
+from pcdata.errors import CaptureError, DeviceError, DTypeError, NonFiniteError, ShapeError, TooFewPointsError
 
 _DTYPES: dict[str, tuple[torch.dtype, ...]] = {
     "float32": (torch.float32,),
     "float64": (torch.float64,),
     "float": (torch.float32, torch.float64),
+    "depth": (torch.float32,),
     "int64": (torch.int64,),
     "uint8": (torch.uint8,),
+    "int32": (torch.int32,),
     "bool": (torch.bool,),
 }
 
@@ -37,6 +41,8 @@ class TensorSpec:
     dims: tuple[str, ...]
     dtypes: tuple[torch.dtype, ...]
     is_ptr: bool = False
+    is_depth: bool = False  # no value is negative
+    least: int = 0  # rows of every cloud that row pointers cut
 
     def describe(self) -> str:
         """Say the contract in words for an error message."""
@@ -50,10 +56,11 @@ class TensorSpec:
 def parse_spec(text: str) -> TensorSpec:
     """Parse a contract string; see the module docstring for the grammar."""
     if text.startswith("ptr "):
-        _, rows, clouds = text.split()
-        return TensorSpec((rows, clouds), (torch.int64,), is_ptr=True)
-    shape, _, dtype = text.partition(":")
-    return TensorSpec(tuple(shape.split()), _DTYPES[dtype.strip() or "float32"])
+        pointers, _, least = text.partition(">=")
+        _, rows, clouds = pointers.split()
+        return TensorSpec((rows, clouds), (torch.int64,), is_ptr=True, least=int(least or 0))
+    shape, _, dtype = (part.strip() for part in text.partition(":"))
+    return TensorSpec(tuple(shape.split()), _DTYPES[dtype or "float32"], is_depth=dtype == "depth")
 
 
 def check_tensors(
@@ -104,40 +111,70 @@ def check_tensors(
             continue
         if spec.is_ptr:
             check_ptr_values(where, name, value, sizes.get(spec.dims[0]))
+            if spec.least:
+                _require_rows(where, value, spec, bound_by.get(spec.dims[0], name))
         elif finite and value.dtype.is_floating_point and not all_finite(value):
             bad = int((~torch.isfinite(value)).sum())
             raise NonFiniteError(
                 f"{where}: {name} has {bad} NaN or infinite values of {value.numel()}; "
                 "drop those points (or set those depths to 0) first"
             )
+        elif spec.is_depth:
+            check_depths(where, name, value)
     return sizes
 
 
 def check_ptr_values(where: str, name: str, ptr: Tensor, num_rows: int | None) -> None:
     """Require row pointers that start at 0, never decrease, and end at ``num_rows`` (None: any end)."""
     bounds = ptr.tolist()
-    if bounds[0] != 0 or any(later < earlier for earlier, later in pairwise(bounds)):
+    if bounds[0] != 0 or bounds != sorted(bounds):
         raise ShapeError(f"{where}: {name} must start at 0 and never decrease, got {_short(bounds)}")
     if num_rows is not None and bounds[-1] != num_rows:
         raise ShapeError(f"{where}: {name} must end at the number of rows, {num_rows}, but ends at {bounds[-1]}")
+
+
+def check_depths(where: str, name: str, depths: Tensor) -> None:
+    """Require a depth or range image without negative values.
+
+    Raises:
+        CaptureError: with how many are negative, and the lowest.
+    """
+    if any_negative(depths):
+        negative = depths < 0
+        raise CaptureError(
+            f"{where}: {name} must be metres with 0 for no reading, but {int(negative.sum())} values are negative "
+            f"(lowest {float(depths.detach().min()):g}); set them to 0 where the image is read"
+        )
+
+
+def _require_rows(where: str, ptr: Tensor, spec: TensorSpec, rows: str) -> None:
+    bounds = ptr.tolist()
+    counts = [stop - start for start, stop in pairwise(bounds)]
+    if min(counts) < spec.least:
+        short = [cloud for cloud, count in enumerate(counts) if count < spec.least]
+        found = f"has {counts[short[0]]} rows" if counts[short[0]] else "is empty"
+        raise TooFewPointsError(
+            f"{where}: cloud {short[0]} of {rows} {found}, but at least {spec.least} are needed; {len(short)} of "
+            f"{len(counts)} clouds have too few, leave them out"
+        )
 
 
 def _bind_shape(
     where: str, name: str, value: Tensor, spec: TensorSpec, sizes: dict[str, int], bound_by: dict[str, str]
 ) -> None:
     given = tuple(value.shape)
+    dims: tuple[str, ...] = spec.dims
+    found: tuple[int, ...] = given
     if spec.is_ptr:
-        if value.ndim != 1 or value.numel() < 2:
+        if len(given) != 1 or given[0] < 2:
             raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}; one cloud is [0, N]")
-        actual = {spec.dims[1]: value.numel() - 1}
-    else:
-        if value.ndim != len(spec.dims):
+        dims, found = dims[1:], (given[0] - 1,)
+    elif len(given) != len(dims):
+        raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
+    for dim, size in zip(dims, found):
+        if dim.isdigit() and int(dim) != size:
             raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-        actual = dict(zip(spec.dims, given))
-        for dim, size in zip(spec.dims, given):
-            if dim.isdigit() and int(dim) != size:
-                raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-    for dim, size in actual.items():
+    for dim, size in zip(dims, found):
         if dim.isdigit():
             continue
         if sizes.setdefault(dim, size) != size:

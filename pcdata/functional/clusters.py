@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count, require_length
+from pcdata.contracts.numbers import Count, Length
 from pcdata.functional.boxtree import box_gap, expand_ranges, sum_of_squares
 from pcdata.functional.cells import Cells
-from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import largest_squared, nearest_chunks
 from pcdata.functional.rows import cloud_of_rows, ptr_after_mask, ptr_from_counts
 
@@ -24,7 +24,7 @@ _PAIRS_PER_CHUNK = 1 << 15
 _ROWS_PER_CHUNK = 1 << 18
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", eps=Length(), min_points=Count(), grid=GridOfPoints(), gradient=False)
 def dbscan(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -54,18 +54,15 @@ def dbscan(
             cloud (see :class:`pcdata.functional.cells.Cells`).
     """
     assert ptr is not None  # @op fills it
-    require_count("dbscan", "min_points", min_points)
-    require_length("dbscan", "eps", eps)
-    check_grid("dbscan", grid, points, ptr)
-    core = _core_mask(points, ptr, float(eps), min_points)
+    core = _core_mask(points, ptr, eps, min_points)
     label = torch.full_like(core, -1, dtype=torch.int64)
     core_rows, core_ptr = core.nonzero().squeeze(1), ptr_after_mask(core, ptr)
     if len(core_rows) == 0:
         return label
     cells = Cells.within("dbscan", points[core_rows], core_ptr, eps)
-    component = _join(cells, points[core_rows], float(eps))[cells.cell]
+    component = _join(cells, points[core_rows], eps)[cells.cell]
     label[core_rows] = _number(component, core_rows, ptr)
-    return _label_borders(label, points, ptr, core, float(eps), min_points)
+    return _label_borders(label, points, ptr, core, eps, min_points)
 
 
 def _core_mask(points: Tensor, ptr: Tensor, eps: float, min_points: int) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,8 +34,19 @@ class ImageGrid:
     camera_from_points: Tensor | None = None  # (B, 4, 4) float, rigid; None = points are in their cameras' frames
 
 
-def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) -> None:
-    """Require that an image grid, when given, describes exactly these points: a kernel will trust it.
+@dataclass(frozen=True)
+class GridOfPoints:
+    """The spec of an image grid: it describes exactly the points of the call."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> ImageGrid:
+        """See :class:`pcdata.contracts.numbers.Spec`; raises what :func:`check_grid` raises."""
+        grid: ImageGrid = arguments[name]
+        check_grid(where, grid, arguments["points"], arguments["ptr"])
+        return grid
+
+
+def check_grid(where: str, grid: ImageGrid, points: Tensor, ptr: Tensor) -> None:
+    """Require that an image grid describes exactly these points: a kernel will trust it.
 
     Raises:
         ShapeError: its pixels are not one per point, increasing within each cloud and inside the image, or its
@@ -42,8 +55,6 @@ def check_grid(where: str, grid: ImageGrid | None, points: Tensor, ptr: Tensor) 
         ConfigError: ``camera_from_points`` is not rigid.
         DeviceError: it is on another device.
     """
-    if grid is None:
-        return
     pixel, (height, width) = grid.pixel_index, grid.size
     if pixel.dtype is not torch.int64:
         raise DTypeError(f"{where}: grid.pixel_index must be int64, not {pixel.dtype}; convert it with .long()")

@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import TooFewPointsError
 from pcdata.functional.boxtree import sum_of_squares
 from pcdata.functional.nearest import nearest_chunks
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
 
-@op(points_a="N 3", ptr_a="ptr N B", points_b="M 3", ptr_b="ptr M B")
+@op(points_a="N 3", ptr_a="ptr N B >= 1", points_b="M 3", ptr_b="ptr M B >= 1")
 def chamfer_distance(
     points_a: Tensor,  # (N, 3) float32
     ptr_a: Tensor | None,  # (B+1,); None = one cloud
@@ -36,20 +35,8 @@ def chamfer_distance(
     """
     assert ptr_a is not None  # @op fills both
     assert ptr_b is not None
-    require_points(ptr_a, ptr_b)
     forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
     return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
-
-
-def require_points(ptr_a: Tensor, ptr_b: Tensor) -> None:
-    """Require that no cloud of either side of a chamfer distance is empty."""
-    for name, ptr in (("points_a", ptr_a), ("points_b", ptr_b)):
-        empty = (counts_from_ptr(ptr) == 0).nonzero().squeeze(1).tolist()
-        if empty:
-            raise TooFewPointsError(
-                f"chamfer_distance: cloud {empty[0]} of {name} is empty ({len(empty)} of {len(ptr) - 1} are); "
-                "the distance to nothing is undefined, so drop that pair"
-            )
 
 
 def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool) -> Tensor:

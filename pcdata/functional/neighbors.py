@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count, require_length
-from pcdata.errors import ShapeError
-from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.contracts.numbers import Count, Length
+from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 
 
-@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", gradient=False)
+@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", k=Count(), grid=GridOfPoints(), gradient=False)
 def knn(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -46,8 +45,7 @@ def knn(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: k is less than 1.
     """
-    ptr = check_neighbors("knn", points, ptr, queries, queries_ptr, grid)
-    require_count("knn", "k", k)
+    assert ptr is not None  # @op fills it
     num_queries = len(points if queries is None else queries)
     index = torch.empty((num_queries, k), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, k), dtype=torch.float32, device=points.device)
@@ -57,7 +55,16 @@ def knn(
     return index, distance
 
 
-@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", gradient=False)
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    queries="Q 3",
+    queries_ptr="ptr Q B",
+    radius=Length(),
+    max_neighbors=Count(),
+    grid=GridOfPoints(),
+    gradient=False,
+)
 def ball_query(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -88,46 +95,13 @@ def ball_query(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
     """
-    ptr = check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
+    assert ptr is not None  # @op fills it
     num_queries = len(points if queries is None else queries)
     index = torch.empty((num_queries, max_neighbors), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, max_neighbors), dtype=torch.float32, device=points.device)
     count = torch.empty(num_queries, dtype=torch.int64, device=points.device)
-    for near in nearest_chunks(
-        points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=float(radius)
-    ):
+    for near in nearest_chunks(points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=radius):
         index[near.query] = near.index
         distance[near.query] = near.distance
         count[near.query] = near.found.sum(1)
     return index, distance, count
-
-
-def check_neighbors(
-    where: str,
-    points: Tensor,
-    ptr: Tensor | None,
-    queries: Tensor | None,
-    queries_ptr: Tensor | None,
-    grid: ImageGrid | None,
-) -> Tensor:
-    """Require what the specs of knn and ball_query cannot say; return the row pointers."""
-    assert ptr is not None  # @op fills it
-    if queries is None and queries_ptr is not None:
-        raise ShapeError(f"{where}: queries_ptr was given without queries; pass both, or neither to query the points")
-    check_grid(where, grid, points, ptr)
-    return ptr
-
-
-def check_ball_query(
-    points: Tensor,
-    ptr: Tensor | None,
-    radius: float,
-    max_neighbors: int,
-    queries: Tensor | None,
-    queries_ptr: Tensor | None,
-    grid: ImageGrid | None,
-) -> Tensor:
-    """Require what the spec of ball_query cannot say; return the row pointers."""
-    require_count("ball_query", "max_neighbors", max_neighbors)
-    require_length("ball_query", "radius", radius)
-    return check_neighbors("ball_query", points, ptr, queries, queries_ptr, grid)

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count, require_length
+from pcdata.contracts.numbers import Count, Length
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
-from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", radius=Length(), max_neighbors=Count(), grid=GridOfPoints(), gradient=False)
 def estimate_normals(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -50,12 +50,9 @@ def estimate_normals(
         ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
     """
     assert ptr is not None  # @op fills it
-    require_length("estimate_normals", "radius", radius)
-    require_count("estimate_normals", "max_neighbors", max_neighbors)
-    check_grid("estimate_normals", grid, points, ptr)
     normals = torch.empty_like(points)
     wide = points.double()
-    for near in nearest_chunks(points, ptr, max_neighbors, radius=float(radius)):
+    for near in nearest_chunks(points, ptr, max_neighbors, radius=radius):
         count = near.found.sum(1)
         # A missing neighbour points at the query itself: offset 0 adds nothing to the sums below.
         index = torch.where(near.found, near.index, near.query[:, None])

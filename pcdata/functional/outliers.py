@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count, require_length, require_positive
+from pcdata.contracts.numbers import Count, Length, Positive
 from pcdata.functional.cells import Cells
-from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", num_neighbors=Count(), std_ratio=Positive(), grid=GridOfPoints(), gradient=False)
 def statistical_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -41,11 +41,7 @@ def statistical_outlier_mask(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: num_neighbors is less than 1, or std_ratio is not positive.
     """
-    where = "statistical_outlier_mask"
     assert ptr is not None  # @op fills it
-    require_count(where, "num_neighbors", num_neighbors)
-    require_positive(where, "std_ratio", std_ratio)
-    check_grid(where, grid, points, ptr)
     mean = torch.zeros(len(points), dtype=torch.float64, device=points.device)
     for near in nearest_chunks(points, ptr, num_neighbors):
         distance = torch.where(near.found, near.squared.double().sqrt(), 0.0)
@@ -73,7 +69,7 @@ def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
     return total
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", min_neighbors=Count(), radius=Length(), grid=GridOfPoints(), gradient=False)
 def radius_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -101,13 +97,9 @@ def radius_outlier_mask(
         ConfigError: min_neighbors is less than 1, the radius is not a positive length, or it is too small for the
             extent of the cloud (see :class:`pcdata.functional.cells.Cells`).
     """
-    where = "radius_outlier_mask"
     assert ptr is not None  # @op fills it
-    require_count(where, "min_neighbors", min_neighbors)
-    require_length(where, "radius", radius)
-    check_grid(where, grid, points, ptr)
     # All points of a cell are within the radius of each other: a full cell needs no distances.
-    outlier = Cells.within(where, points, ptr, radius).crowd() <= min_neighbors
+    outlier = Cells.within("radius_outlier_mask", points, ptr, radius).crowd() <= min_neighbors
     undecided = outlier.nonzero().squeeze(1)
     if len(undecided) == 0:
         return outlier
@@ -117,7 +109,7 @@ def radius_outlier_mask(
         min_neighbors + 1,
         queries=points[undecided],
         queries_ptr=ptr_after_mask(outlier, ptr),
-        radius=float(radius),
+        radius=radius,
     )
     for near in searches:
         outlier[undecided[near.query]] = ~near.found.all(1)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count, require_length
-from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.contracts.numbers import Count, Length
+from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
 from pcdata.geometry.rigid import angle_between
@@ -26,7 +27,63 @@ _BLOCK = {"cpu": (64, 4096), "cuda": (64, 262144)}
 _MOST_HYPOTHESES = 1 << 20
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@dataclass(frozen=True)
+class _SeedPerCloud:
+    """One seed for every cloud, or one per cloud (B,); bodies get a list of B."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
+        seed, num_clouds = arguments[name], len(arguments["ptr"]) - 1
+        given = seed.tolist() if isinstance(seed, Tensor) else seed
+        seeds = list(given) if isinstance(given, Sequence) else [given] * num_clouds
+        if not all(isinstance(one, int) for one in seeds):
+            raise DTypeError(f"{where}: seed must be an int, or a sequence or tensor of ints, got {given}")
+        if len(seeds) != num_clouds:
+            raise ShapeError(f"{where}: {len(seeds)} seeds were given for {num_clouds} clouds")
+        return seeds
+
+
+@dataclass(frozen=True)
+class _UpPerCloud:
+    """One direction for every cloud, or one per cloud; bodies get (B, 3) float64 unit vectors on the CPU."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+        num_clouds = len(arguments["ptr"]) - 1
+        directions = torch.as_tensor(arguments[name], dtype=torch.float64, device="cpu").detach()
+        if directions.shape == (3,):
+            directions = directions.expand(num_clouds, 3)
+        if directions.shape != (num_clouds, 3):
+            raise ShapeError(f"{where}: up must be (3,) or ({num_clouds}, 3), got {tuple(directions.shape)}")
+        lengths = directions.norm(dim=1)
+        if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
+            raise ConfigError(f"{where}: up must be finite and not zero")
+        return directions / lengths[:, None]
+
+
+@dataclass(frozen=True)
+class _TiltFromUp:
+    """An angle from up."""
+
+    def checked(self, where: str, name: str, arguments: Mapping[str, Any]) -> float:
+        tilt: float = arguments[name]
+        if arguments["up"] is None:
+            raise ConfigError(
+                f"{where}: max_tilt is an angle from up, but up was not given; pass up=(0, 0, 1) or the like"
+            )
+        if not 0 <= tilt <= math.pi:
+            raise ConfigError(f"{where}: max_tilt is in radians, between 0 and pi, got {tilt}")
+        return tilt
+
+
+@op(
+    points="N 3",
+    ptr="ptr N B >= 3",
+    distance=Length(),
+    num_hypotheses=Count(),
+    seed=_SeedPerCloud(),
+    up=_UpPerCloud(),
+    max_tilt=_TiltFromUp(),
+    gradient=False,
+)
 def ransac_plane(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -66,7 +123,9 @@ def ransac_plane(
 
     Source: Fischler & Bolles, CACM 24(6), 1981.
     """
-    assert ptr is not None
+    assert ptr is not None  # @op fills it
+    assert isinstance(seed, list)  # and makes it one per cloud,
+    assert up is None or isinstance(up, Tensor)  # and unit vectors
     return search_planes(points, ptr, _TORCH_WORK, distance, num_hypotheses, seed, up, max_tilt)
 
 
@@ -91,19 +150,13 @@ def search_planes(
     work: PlaneWork,
     distance: float,
     num_hypotheses: int,
-    seed: int | Sequence[int] | Tensor,
-    up: Tensor | Sequence[float] | None,
+    seeds: list[int],
+    ups: Tensor | None,
     max_tilt: float | None,
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Run :func:`ransac_plane` with the given work: draws, decisions and refinement are the same for all kernels."""
     num_clouds = len(ptr) - 1
-    _check_parameters(distance, num_hypotheses, max_tilt, up)
-    seeds = _seed_per_cloud(seed, num_clouds)
-    ups = _up_per_cloud(up, num_clouds)
     counts = counts_from_ptr(ptr).tolist()
-    for cloud, count in enumerate(counts):
-        if count < 3:
-            raise TooFewPointsError(f"ransac_plane: a plane needs 3 points, cloud {cloud} has {count}")
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
     winners = []
@@ -270,44 +323,6 @@ def _within_tilt(planes: Tensor, ups: Tensor | None, max_tilt: float | None) -> 
         return torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")
     angle = angle_between(planes[..., :3], ups)
     return torch.minimum(angle, math.pi - angle) <= max_tilt
-
-
-def _check_parameters(
-    distance: float, num_hypotheses: int, max_tilt: float | None, up: Tensor | Sequence[float] | None
-) -> None:
-    require_length("ransac_plane", "distance", distance)
-    require_count("ransac_plane", "num_hypotheses", num_hypotheses)
-    if max_tilt is not None and up is None:
-        raise ConfigError(
-            "ransac_plane: max_tilt is an angle from up, but up was not given; pass up=(0, 0, 1) or the like"
-        )
-    if max_tilt is not None and not 0 <= max_tilt <= math.pi:
-        raise ConfigError(f"ransac_plane: max_tilt is in radians, between 0 and pi, got {max_tilt}")
-
-
-def _seed_per_cloud(seed: int | Sequence[int] | Tensor, num_clouds: int) -> list[int]:
-    given = seed.tolist() if isinstance(seed, Tensor) else seed
-    seeds = list(given) if isinstance(given, Sequence) else [given] * num_clouds
-    if not all(isinstance(one, int) for one in seeds):
-        raise DTypeError(f"ransac_plane: seed must be an int, or a sequence or tensor of ints, got {given}")
-    if len(seeds) != num_clouds:
-        raise ShapeError(f"ransac_plane: {len(seeds)} seeds were given for {num_clouds} clouds")
-    return seeds
-
-
-def _up_per_cloud(up: Tensor | Sequence[float] | None, num_clouds: int) -> Tensor | None:
-    """Return the (B, 3) float64 unit vectors that are up, on the CPU."""
-    if up is None:
-        return None
-    directions = torch.as_tensor(up, dtype=torch.float64, device="cpu")
-    if directions.shape == (3,):
-        directions = directions.expand(num_clouds, 3)
-    if directions.shape != (num_clouds, 3):
-        raise ShapeError(f"ransac_plane: up must be (3,) or ({num_clouds}, 3), got {tuple(directions.shape)}")
-    lengths = directions.norm(dim=1)
-    if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
-        raise ConfigError("ransac_plane: up must be finite and not zero")
-    return directions / lengths[:, None]
 
 
 _TORCH_WORK = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)

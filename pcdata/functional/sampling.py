@@ -8,15 +8,16 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
-from pcdata.functional.rows import counts_from_ptr, ptr_from_counts
+from pcdata.contracts.numbers import CountPerCloud, counts_per_cloud, require_rows
+from pcdata.errors import ShapeError
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import seeded
 
 # Points per tile in the search for the farthest one; near the square root of a large cloud.
 _TILE = 1024
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", num_samples=CountPerCloud(), gradient=False)
 def farthest_point_sample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -40,12 +41,11 @@ def farthest_point_sample(
 
     Source: Eldar et al., The Farthest Point Strategy for Progressive Image Sampling, IEEE TIP 6(9), 1997.
     """
-    assert ptr is not None
-    wanted = counts_per_cloud("farthest_point_sample", num_samples, ptr)
-    check_available("farthest_point_sample", wanted, ptr)
+    assert ptr is not None  # @op fills it
+    assert isinstance(num_samples, list)  # and makes it one count per cloud
     starts = ptr.tolist()
-    picked = [start + _farthest(points[start:stop], k) for start, stop, k in zip(starts, starts[1:], wanted)]
-    return torch.cat(picked), ptr_from_counts(wanted, device=points.device)
+    picked = [start + _farthest(points[start:stop], k) for start, stop, k in zip(starts, starts[1:], num_samples)]
+    return torch.cat(picked), ptr_from_counts(num_samples, device=points.device)
 
 
 def random_sample_index(
@@ -65,7 +65,7 @@ def random_sample_index(
         ShapeError: the number of seeds or counts is not the number of clouds.
     """
     wanted = counts_per_cloud("random_sample_index", num_samples, ptr)
-    check_available("random_sample_index", [min(k, 1) for k in wanted] if replace else wanted, ptr)
+    require_rows("random_sample_index", [min(k, 1) for k in wanted] if replace else wanted, ptr)
     if len(seeds) != len(wanted):
         raise ShapeError(f"random_sample_index: {len(seeds)} seeds were given for {len(wanted)} clouds")
     starts = ptr.tolist()
@@ -74,37 +74,6 @@ def random_sample_index(
         for start, stop, k, seed in zip(starts, starts[1:], wanted, seeds.tolist())
     ]
     return torch.cat(drawn).to(ptr.device), ptr_from_counts(wanted, device=ptr.device)
-
-
-def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr: Tensor) -> list[int]:
-    """Return one count per cloud from one number or (B,) numbers.
-
-    Raises:
-        DTypeError: a count that is not an int.
-        ShapeError: the number of counts is not the number of clouds.
-        ConfigError: a negative count.
-    """
-    num_clouds = len(ptr) - 1
-    given = num_samples.tolist() if isinstance(num_samples, Tensor) else num_samples
-    counts = list(given) if isinstance(given, Sequence) else [given] * num_clouds
-    if not all(isinstance(count, int) for count in counts):
-        raise DTypeError(f"{where}: the number of samples must be an int, or a sequence or tensor of ints, got {given}")
-    if len(counts) != num_clouds:
-        raise ShapeError(f"{where}: {len(counts)} counts were given for {num_clouds} clouds")
-    if min(counts) < 0:
-        raise ConfigError(f"{where}: the number of samples must not be negative, got {min(counts)}")
-    return counts
-
-
-def check_available(where: str, wanted: list[int], ptr: Tensor) -> None:
-    """Require that every cloud has the rows wanted from it.
-
-    Raises:
-        TooFewPointsError: the first cloud that has not.
-    """
-    for cloud, (count, available) in enumerate(zip(wanted, counts_from_ptr(ptr).tolist())):
-        if count > available:
-            raise TooFewPointsError(f"{where}: {count} points were asked of cloud {cloud}, which has {available}")
 
 
 def _farthest(points: Tensor, count: int) -> Tensor:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import require_count
-from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
+from pcdata.contracts.numbers import Count, LengthPerCloud
+from pcdata.errors import DTypeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import (
     cloud_of_rows,
     counts_from_ptr,
@@ -36,7 +36,7 @@ _MAX_VOXELS_PER_AXIS = 2.0**53
 SIZE_TOLERANCE = 1e-6
 
 
-@op(points="N 3", ptr="ptr N B")
+@op(points="N 3", ptr="ptr N B", voxel_size=LengthPerCloud())
 def voxel_downsample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -60,24 +60,24 @@ def voxel_downsample(
         ConfigError: a voxel size that is not positive.
         UnitError: an extent of 2^53 voxels or more.
     """
-    assert ptr is not None
-    sizes = sizes_per_cloud("voxel_downsample", voxel_size, ptr)
+    assert ptr is not None  # @op fills it
+    assert isinstance(voxel_size, Tensor)  # and makes it one size per cloud
     with torch.no_grad():
-        cloud, origin, scaled = _scale_to_grid(points, ptr, sizes)
+        cloud, origin, scaled = _scale_to_grid(points, ptr, voxel_size)
         voxel = scaled.floor()
         inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
         offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
         count = group_count(inverse, len(first))
         mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
         owner = cloud[first]
-        means = (origin[owner] + (voxel[first] + mean_offset) * sizes[owner, None]).float()
+        means = (origin[owner] + (voxel[first] + mean_offset) * voxel_size[owner, None]).float()
     if torch.is_grad_enabled() and points.requires_grad:
         plain = voxel_mean(points, inverse, len(first))
         means = means + (plain - plain.detach())  # the value keeps every bit
     return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
 
 
-@op(points="N 3", ptr="ptr N B", gradient=False)
+@op(points="N 3", ptr="ptr N B", num_points=Count(), gradient=False)
 def find_voxel_size(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -94,8 +94,7 @@ def find_voxel_size(
         TooFewPointsError: a cloud has fewer than ``num_points`` distinct points.
         ConfigError: ``num_points`` is less than 1.
     """
-    assert ptr is not None
-    require_count("find_voxel_size", "num_points", num_points)
+    assert ptr is not None  # @op fills it
     _require_distinct(points, ptr, num_points)
     extent = (segment_max(points, ptr).double() - segment_min(points, ptr)).amax(1)
     too_large = torch.where(extent > 0, 3.0 * extent, 1.0)  # everything lies in one voxel
@@ -212,24 +211,6 @@ def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor
     """Count the different rows of voxel (N, 3, not negative) in each cloud, (B,) int64."""
     rank, distinct = _rank(_voxel_keys(cloud, voxel, num_clouds))
     return group_count(cloud[group_first(rank, distinct)], num_clouds)
-
-
-def sizes_per_cloud(where: str, voxel_size: float | Sequence[float] | Tensor, ptr: Tensor) -> Tensor:
-    """Return the (B,) float64 voxel sizes of the clouds from one number or one per cloud.
-
-    Raises:
-        ShapeError: the number of sizes is not the number of clouds.
-        ConfigError: a size that is not positive.
-    """
-    sizes = torch.as_tensor(voxel_size, dtype=torch.float64, device=ptr.device)
-    num_clouds = len(ptr) - 1
-    if sizes.ndim == 0:
-        sizes = sizes.expand(num_clouds)
-    if sizes.shape != (num_clouds,):
-        raise ShapeError(f"{where}: voxel_size must be one number or ({num_clouds},), got {tuple(sizes.shape)}")
-    if not bool((torch.isfinite(sizes) & (sizes > 0)).all()):
-        raise ConfigError(f"{where}: voxel_size must be positive, got {sizes.tolist()}")
-    return sizes
 
 
 def _scale_to_grid(points: Tensor, ptr: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:

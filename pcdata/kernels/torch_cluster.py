@@ -14,9 +14,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import kernel
 from pcdata.errors import BackendError
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.neighbors import check_ball_query
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
-from pcdata.functional.sampling import check_available, counts_per_cloud
 
 INSTALL = "pip install ninja && pip install --no-build-isolation torch-cluster"
 
@@ -37,21 +35,19 @@ def unavailable() -> str | None:
 
 
 @kernel("farthest_point_sample", "torch_cluster")
-def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: int | list[int] | Tensor) -> tuple[Tensor, Tensor]:
+def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: list[int]) -> tuple[Tensor, Tensor]:
     """Sample with ``torch_cluster.fps``, cloud by cloud: it takes a ratio, and writes out of bounds for empty samples.
 
     Raises:
         BackendError: on CUDA, or when torch-cluster repeated a point (it does once only duplicates are left).
     """
     _require_cpu("farthest_point_sample", points)
-    wanted = counts_per_cloud("farthest_point_sample", num_samples, ptr)
-    check_available("farthest_point_sample", wanted, ptr)
     starts = ptr.tolist()
     picked = [
         start + _sample_cloud(points[start:stop], count, cloud)
-        for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], wanted, strict=False))
+        for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], num_samples, strict=False))
     ]
-    return torch.cat(picked), ptr_from_counts(wanted)
+    return torch.cat(picked), ptr_from_counts(num_samples)
 
 
 @kernel("ball_query", "torch_cluster")
@@ -72,7 +68,6 @@ def ball_query(
         BackendError: on CUDA.
     """
     _require_cpu("ball_query", points)
-    check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
     if queries is None:
         queries, queries_ptr = points, ptr
     assert queries_ptr is not None  # @op fills it

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from pcdata.contracts import dispatch
-from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, ShapeError
+from pcdata.contracts.numbers import CountPerCloud, Length
+from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, ShapeError, TooFewPointsError
 
 
 @pytest.fixture
@@ -112,9 +113,32 @@ def test_two_devices_are_refused(shift):
         shift(POINTS, queries=torch.zeros(2, 3, device="meta"))
 
 
-def test_a_wrong_keyword_is_a_type_error(shift):
+def test_row_pointers_without_their_rows_are_refused(shift):
+    with pytest.raises(ShapeError, match="shift: queries_ptr was given without queries"):
+        shift(POINTS, queries_ptr=torch.tensor([0, 1]))
+
+
+def test_arguments_that_do_not_fit_are_type_errors(shift):
     with pytest.raises(TypeError, match="buy"):
         shift(POINTS, buy=1.0)
+    with pytest.raises(TypeError, match=r"missing .*points"):
+        shift()
+    with pytest.raises(TypeError, match=r"multiple values .*points"):
+        shift(POINTS, points=POINTS)
+    with pytest.raises(TypeError, match="too many positional"):
+        shift(POINTS, None, 1.0)
+
+
+@pytest.mark.usefixtures("shift")  # the registry of one test
+def test_a_spec_says_what_bodies_get():
+    @dispatch.op(points="N 3", ptr="ptr N B", num_samples=CountPerCloud(), radius=Length())
+    def pick(points, ptr=None, *, num_samples, radius=None, backend="auto"):
+        return num_samples, radius
+
+    assert pick(POINTS, num_samples=2, radius=1) == ([2], 1.0)
+    assert pick(POINTS, torch.tensor([0, 1, 4]), num_samples=torch.tensor([1, 2])) == ([1, 2], None)
+    with pytest.raises(TooFewPointsError, match="pick: 2 points were asked of cloud 0, which has 1"):
+        pick(POINTS, torch.tensor([0, 1, 4]), num_samples=2)
 
 
 def test_the_public_function_keeps_its_name_and_docstring(shift):

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from pcdata.contracts.tensors import check_ptr_values, check_tensors, parse_spec
-from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
+from pcdata.errors import CaptureError, DeviceError, DTypeError, NonFiniteError, ShapeError, TooFewPointsError
 
 SPECS = {"points": "N 3", "labels": "N : int64", "image": "V H W : uint8", "matrix": "B 4 4 : float", "ptr": "ptr N B"}
+SPECS |= {"depth": "H W : depth", "pairs": "ptr N B >= 2"}
 
 
 def check(**values):
@@ -57,6 +58,13 @@ def test_float_means_either_width(dtype):
         ({"ptr": torch.tensor([1, 2])}, ShapeError, "must start at 0 and never decrease"),
         ({"ptr": torch.tensor([0, 2, 1, 4])}, ShapeError, "never decrease, got"),
         ({"points": torch.zeros(3, 3), "ptr": torch.tensor([0, 4])}, ShapeError, "number of rows, 3, but ends at 4"),
+        ({"depth": torch.tensor([[0.0, -1.5]])}, CaptureError, r"1 values are negative \(lowest -1.5\)"),
+        (
+            {"points": torch.zeros(5, 3), "pairs": torch.tensor([0, 2, 3, 5])},
+            TooFewPointsError,
+            "1 of points has 1",
+        ),
+        ({"points": torch.zeros(2, 3), "pairs": torch.tensor([0, 2, 2])}, TooFewPointsError, "1 of points is empty"),
     ],
 )
 def test_a_broken_contract_says_where_what_and_what_was_given(values, error, message):

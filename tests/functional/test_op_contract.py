@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +14,27 @@ from torch import Tensor
 
 import pcdata.functional  # noqa: F401 - registers the operations
 from pcdata.contracts.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailable
+from pcdata.contracts.numbers import (
+    Count,
+    CountPerCloud,
+    Fraction,
+    ImageSize,
+    Length,
+    LengthPerCloud,
+    OneOf,
+    Positive,
+)
 from pcdata.contracts.tensors import parse_spec
-from pcdata.errors import BackendError, DeviceError, DTypeError, NonFiniteError, PcdataError, ShapeError
+from pcdata.errors import (
+    BackendError,
+    ConfigError,
+    DeviceError,
+    DTypeError,
+    NonFiniteError,
+    PcdataError,
+    ShapeError,
+    TooFewPointsError,
+)
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import seeded
 from tests.warm import run_python
@@ -123,7 +143,7 @@ each_example = pytest.mark.parametrize(
 
 def row_pointers(example: Example) -> dict[str, str]:
     """Row pointer argument -> the tensor argument whose rows it cuts."""
-    specs = {key: parse_spec(text) for key, text in OPERATIONS[example.name].specs.items()}
+    specs = {key: parse_spec(text) for key, text in OPERATIONS[example.name].contract.tensors.items()}
     tensors = {spec.dims[0]: key for key, spec in specs.items() if not spec.is_ptr}
     return {key: tensors[spec.dims[0]] for key, spec in specs.items() if spec.is_ptr}
 
@@ -197,7 +217,7 @@ def test_every_argument_of_every_contract_is_in_an_example():
         for example in EXAMPLES:
             if example.name == name:
                 used |= set(packed(example, clouds_of(example)))
-        assert used == set(operation.specs), name
+        assert used == set(operation.contract.tensors), name
 
 
 @each_example
@@ -253,7 +273,7 @@ def test_points_that_are_all_the_same_pass_or_raise_a_typed_error(example):
 def test_wrong_tensors_are_refused_by_name(example):
     good = packed(example, clouds_of(example))
     for key, value in good.items():
-        spec = parse_spec(OPERATIONS[example.name].specs[key])
+        spec = parse_spec(OPERATIONS[example.name].contract.tensors[key])
 
         def refused(bad: Any, error: type[PcdataError], key: str = key) -> None:
             with pytest.raises(error, match=rf"^{example.name}: .*{key}"):
@@ -270,6 +290,44 @@ def test_wrong_tensors_are_refused_by_name(example):
                 refused(spoiled, NonFiniteError)
         if key != next(iter(good)):
             refused(value.to("meta"), DeviceError)
+
+
+# What a value may not be, by its spec; specs of one operation alone are tested with it.
+WRONG = {
+    Count: [(0, ConfigError), (-3, ConfigError), (1.0, DTypeError), (True, DTypeError), ("1", DTypeError)],
+    Length: [
+        (0.0, ConfigError),
+        (-1.0, ConfigError),
+        (math.inf, ConfigError),
+        (math.nan, ConfigError),
+        ("1", DTypeError),
+    ],
+    Positive: [
+        (0.0, ConfigError),
+        (-1.0, ConfigError),
+        (math.nan, ConfigError),
+        (None, DTypeError),
+        (True, DTypeError),
+    ],
+    Fraction: [(0.0, ConfigError), (1.01, ConfigError), (math.nan, ConfigError), ("1", DTypeError)],
+    OneOf: [("other", ConfigError), (None, ConfigError)],
+    ImageSize: [((4,), ConfigError), ((0, 4), ConfigError), ((4, 4, 4), ConfigError)],
+    CountPerCloud: [(-1, ConfigError), (1.5, DTypeError), ([1], ShapeError), (1000, TooFewPointsError)],
+    LengthPerCloud: [(0.0, ConfigError), (math.inf, ConfigError), ([0.1], ShapeError), ([0.1, 0.1, -1.0], ConfigError)],
+}
+
+
+@each_example
+def test_wrong_values_are_refused_by_name_before_any_backend(example):
+    arguments = packed(example, clouds_of(example))
+    contract = OPERATIONS[example.name].contract
+    for key, spec in contract.others.items():
+        for value, error in WRONG.get(type(spec), []):
+            if value is None and contract.signature.parameters[key].default is None:
+                continue
+            words = {CountPerCloud: "counts|number of samples|points were asked"}.get(type(spec), key)
+            with pytest.raises(error, match=rf"^{example.name}: .*({words})"):
+                call(example, arguments, **{key: value, "backend": "none"})
 
 
 @each_example
@@ -325,7 +383,7 @@ def test_it_runs_in_inference_mode_and_on_slices(example):
 
 
 def is_rows(example: Example, key: str) -> bool:
-    return not parse_spec(OPERATIONS[example.name].specs[key]).is_ptr
+    return not parse_spec(OPERATIONS[example.name].contract.tensors[key]).is_ptr
 
 
 @each_example

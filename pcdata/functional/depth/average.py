@@ -9,7 +9,6 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional.depth.deproject import check_lengths
 from pcdata.functional.depth.pixel_sort import pick_image, sort_images
 
 # The median absolute deviation of a normal distribution is 0.6745 of its standard deviation.
@@ -57,10 +56,9 @@ def average_depth(
         ConfigError: a limit out of range.
     """
     where = "average_depth"
-    check_tensors(where, {"depths": depths}, {"depths": "T V H W"})
+    check_tensors(where, {"depths": depths}, {"depths": "T V H W : depth"})
     if len(depths) == 0:
         raise ShapeError(f"{where}: depths must hold at least one image, got shape {tuple(depths.shape)}")
-    check_lengths(where, "depths", depths)
     if not (mad_factor > 0 and resolution >= 0 and max_jump > 0 and min_count >= 1):
         raise ConfigError(
             f"{where}: needs mad_factor > 0, resolution >= 0, max_jump > 0 and min_count >= 1, got {mad_factor}, "

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
-from pcdata.contracts.host import any_negative
-from pcdata.contracts.tensors import check_tensors
+from pcdata.contracts.tensors import check_depths, check_tensors
 from pcdata.errors import CaptureError
 from pcdata.functional.rows import (
     cloud_of_rows,
@@ -49,7 +48,7 @@ def deproject_depth(
     Source: Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 6.1.
     """
     check_intrinsics("deproject_depth", intrinsics)
-    check_lengths("deproject_depth", "depth", depth)
+    check_depths("deproject_depth", "depth", depth)
     height, width = depth.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion).float()
     valid = depth > 0
@@ -200,9 +199,8 @@ def range_to_depth(
     Raises:
         CaptureError: as :func:`deproject_depth`.
     """
-    check_tensors("range_to_depth", {"ray_length": ray_length}, {"ray_length": "V H W"})
+    check_tensors("range_to_depth", {"ray_length": ray_length}, {"ray_length": "V H W : depth"})
     _check_camera("range_to_depth", intrinsics, distortion, views=len(ray_length))
-    check_lengths("range_to_depth", "ray_length", ray_length)
     height, width = ray_length.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion)
     check_rays("range_to_depth", rays, ray_length > 0)
@@ -230,20 +228,6 @@ def check_intrinsics(where: str, intrinsics: Tensor) -> None:
                 "RLBench write negative ones: negate both and turn the camera by 180 degrees about its z axis "
                 "(world_from_camera @ diag(-1, -1, 1, 1))"
             )
-
-
-def check_lengths(where: str, name: str, lengths: Tensor) -> None:
-    """Require a depth or range image without negative values.
-
-    Raises:
-        CaptureError: with how many are negative, and the lowest.
-    """
-    if any_negative(lengths):
-        negative = lengths < 0
-        raise CaptureError(
-            f"{where}: {name} must be metres with 0 for no reading, but {int(negative.sum())} values are negative "
-            f"(lowest {float(lengths.detach().min()):g}); set them to 0 where the image is read"
-        )
 
 
 def check_rays(where: str, rays: Tensor, needed: Tensor) -> None:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth.deproject import check_intrinsics, check_lengths, check_rays, pixel_rays
+from pcdata.contracts.numbers import ImageSize, Positive
+from pcdata.errors import CaptureError
+from pcdata.functional.depth.deproject import check_intrinsics, check_rays, pixel_rays
 from pcdata.functional.depth.splatting import MAX_PIXELS, ZBuffer, cell_of_pixels, on_one_surface
 from pcdata.geometry import rigid
 from pcdata.geometry.lens import check_distortion, distort_normalized, fold_radius
@@ -48,12 +49,14 @@ class _Projection(NamedTuple):
 
 
 @op(
-    depth="V H W",
+    depth="V H W : depth",
     intrinsics="V 3 3 : float",
     color_intrinsics="V 3 3 : float",
     color_from_depth="V 4 4 : float64",
     distortion="V D : float",
     color_distortion="V E : float",
+    color_size=ImageSize(),
+    max_jump=Positive(finite=False),
 )
 def register_depth(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
@@ -85,9 +88,7 @@ def register_depth(
     Source: the z-buffer is as old as Catmull, 1974; librealsense's align draws the same boxes, but per pixel, so
     slanted surfaces crack.
     """
-    check_registration(
-        depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth, color_size, max_jump
-    )
+    check_cameras(depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth)
     rays = pixel_rays(intrinsics, (depth.shape[1], depth.shape[2]), distortion)
     check_rays("register_depth", rays, depth > 0)
     halves = half_pixels(intrinsics, color_intrinsics, color_from_depth)
@@ -101,24 +102,16 @@ def register_depth(
     return RegisteredDepth(*(torch.stack(images) for images in zip(*results, strict=True)))
 
 
-def check_registration(
+def check_cameras(
     depth: Tensor,
     intrinsics: Tensor,
     distortion: Tensor | None,
     color_intrinsics: Tensor,
     color_distortion: Tensor | None,
     color_from_depth: Tensor,
-    color_size: tuple[int, int],
-    max_jump: float,
 ) -> None:
     """Refuse what :func:`register_depth` says it refuses, but for rays that a lens does not have."""
     where = "register_depth"
-    if len(color_size) != 2 or min(color_size) < 1 or not max_jump > 0:
-        raise ConfigError(
-            f"{where}: color_size must be (height, width) of at least one pixel and max_jump more than 0, got "
-            f"{color_size} and {max_jump}"
-        )
-    check_lengths(where, "depth", depth)
     for matrix, lens in ((intrinsics, distortion), (color_intrinsics, color_distortion)):
         check_intrinsics(where, matrix)
         if lens is not None:

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import Count, Fraction, Positive
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError
-from pcdata.functional.depth.deproject import check_lengths
 
 # librealsense counts disparity in 1/32 pixel, the step of its matcher; its thresholds are in this unit.
 STEPS_PER_PIXEL = 32
@@ -38,7 +38,7 @@ def disparity_to_depth(disparity: Tensor, focal: Tensor, baseline: float) -> Ten
     return _reciprocal("disparity_to_depth", "disparity", disparity, focal, baseline)
 
 
-@op(disparity="V H W")
+@op(disparity="V H W : depth", alpha=Fraction(), delta=Positive(finite=False), iterations=Count())
 def spatial_filter(
     disparity: Tensor,  # (V, H, W) float32, 0 = no reading
     *,
@@ -67,12 +67,6 @@ def spatial_filter(
     Source: Gastal & Oliveira, Domain transform for edge-aware image and video processing, 2011, recursive filtering;
     the binary edge is that of librealsense's spatial filter.
     """
-    where = "spatial_filter"
-    if not 0 < alpha <= 1 or not delta > 0 or iterations < 1:
-        raise ConfigError(
-            f"{where}: needs 0 < alpha <= 1, delta > 0 and iterations >= 1, got {alpha}, {delta}, {iterations}"
-        )
-    check_lengths(where, "disparity", disparity)
     values = disparity.detach()
     # The axis gone along comes first, so that every step reads and writes contiguous memory.
     rows = torch.where(values > 0, values, _HOLE).permute(1, 0, 2).contiguous()  # (H, V, W)
@@ -98,8 +92,7 @@ def _smooth_forth_and_back(values: Tensor, alpha: float, delta: float) -> None:
 
 
 def _reciprocal(where: str, name: str, values: Tensor, focal: Tensor, baseline: float) -> Tensor:
-    check_tensors(where, {name: values, "focal": focal}, {name: "V H W", "focal": "V : float"})
-    check_lengths(where, name, values)
+    check_tensors(where, {name: values, "focal": focal}, {name: "V H W : depth", "focal": "V : float"})
     if not (baseline > 0 and bool((focal > 0).all())):
         raise ConfigError(f"{where}: baseline and focal length must be positive, got {baseline} and {focal.tolist()}")
     scale = (STEPS_PER_PIXEL * baseline * focal.double())[:, None, None].float()

@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import ConfigError
-from pcdata.functional.depth.deproject import check_lengths
+from pcdata.contracts.numbers import Count, Positive
 
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbours is compared once
 
 
-@op(depth="V H W")
+@op(depth="V H W : depth", tolerance=Positive(finite=False), min_neighbors=Count(1, 8))
 def flying_pixel_mask(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
     *,
@@ -37,13 +36,6 @@ def flying_pixel_mask(
         ConfigError: a parameter out of range.
         CaptureError: a negative depth.
     """
-    where = "flying_pixel_mask"
-    if not tolerance > 0 or not 1 <= min_neighbors <= 8:
-        raise ConfigError(
-            f"{where}: needs tolerance > 0 and min_neighbors 1..8, got {tolerance}, {min_neighbors}; to keep every "
-            "pixel leave the step out"
-        )
-    check_lengths(where, "depth", depth)
     height, width = depth.shape[1:]
     on_surface = torch.zeros_like(depth, dtype=torch.uint8)
     at_edge = torch.zeros_like(depth, dtype=torch.bool)

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import ConfigError
-from pcdata.functional.depth.deproject import check_lengths
+from pcdata.contracts.numbers import Count, OneOf
 
 RULES = ("left", "farthest", "nearest")
 
 
-@op(depth="V H W")
+@op(depth="V H W : depth", rule=OneOf(RULES), max_size=Count())
 def fill_holes(
     depth: Tensor,  # (V, H, W) float32, 0 = no reading
     *,
@@ -39,10 +38,6 @@ def fill_holes(
     Source: librealsense, hole filling filter; it goes through the image line by line, in place, so there values run
     further downwards and to the right than upwards.
     """
-    where = "fill_holes"
-    if rule not in RULES or (max_size is not None and max_size < 1):
-        raise ConfigError(f"{where}: needs a rule of {RULES} and max_size None or >= 1, got {rule!r} and {max_size}")
-    check_lengths(where, "depth", depth)
     hole = depth == 0
     wanted = hole if max_size is None else hole & ~_wide(hole, max_size + 1)
     if rule == "left":

@@ -8,14 +8,19 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional.depth.deproject import check_lengths
+from pcdata.contracts.numbers import Count, ImageSize, OneOf, Positive
+from pcdata.errors import ShapeError
 from pcdata.functional.depth.pixel_sort import pick_image, sort_images
 
 MAX_FACTOR = 8  # as in librealsense; also what fits the six bits that number the pixels of a block
 
 
-@op(depth="V H W")
+@op(
+    depth="V H W : depth",
+    factor=Count(1, MAX_FACTOR),
+    rule=OneOf(("median", "mean")),
+    max_jump=Positive(finite=False),
+)
 def decimate_depth(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
     *,
@@ -41,16 +46,11 @@ def decimate_depth(
 
     Source: librealsense, decimation filter (the lower median for 2 and 3, the mean above).
     """
-    where = "decimate_depth"
-    if not 1 <= factor <= MAX_FACTOR or rule not in ("median", "mean") or not max_jump > 0:
-        raise ConfigError(
-            f"{where}: factor must be 1..{MAX_FACTOR}, rule 'median' or 'mean' and max_jump more than 0, got "
-            f"{factor!r}, {rule!r} and {max_jump}"
-        )
-    check_lengths(where, "depth", depth)
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
     if height == 0 or width == 0:
-        raise ShapeError(f"{where}: an image of {tuple(depth.shape[1:])} has no block of {factor} x {factor} pixels")
+        raise ShapeError(
+            f"decimate_depth: an image of {tuple(depth.shape[1:])} has no block of {factor} x {factor} pixels"
+        )
     blocks = [
         depth[:, row : height * factor : factor, column : width * factor : factor]
         for row in range(factor)
@@ -85,7 +85,7 @@ def decimate_depth(
     return torch.where(count > 0, reduced, 0.0), rows * depth.shape[2] + columns
 
 
-@op(depth="V H W")
+@op(depth="V H W : depth", size=ImageSize(), max_jump=Positive(finite=False))
 def resize_depth(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
     *,
@@ -108,15 +108,8 @@ def resize_depth(
         ShapeError: the image has no pixels.
         CaptureError: a negative depth.
     """
-    where = "resize_depth"
-    if len(size) != 2 or min(size) < 1 or (max_jump is not None and not max_jump > 0):
-        raise ConfigError(
-            f"{where}: size must be (height, width) of at least one pixel and max_jump None or more than 0, got "
-            f"{size} and {max_jump}"
-        )
-    check_lengths(where, "depth", depth)
     if 0 in depth.shape[1:]:
-        raise ShapeError(f"{where}: an image of {tuple(depth.shape[1:])} has no pixels")
+        raise ShapeError(f"resize_depth: an image of {tuple(depth.shape[1:])} has no pixels")
     row = _centres(depth.shape[1], size[0], depth.device)
     column = _centres(depth.shape[2], size[1], depth.device)
     index = _nearest(row, depth.shape[1])[:, None] * depth.shape[2] + _nearest(column, depth.shape[2])

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, DTypeError
-from pcdata.functional.depth.deproject import check_lengths
 
 # librealsense's persistence rules: a pixel without a reading repeats its last value if it had at least `needed`
 # readings in the last `frames` frames before this one.
@@ -77,8 +76,7 @@ def temporal_filter(
     if state is not None and not isinstance(state, TemporalState):
         raise DTypeError(f"{where}: state must be what the call before returned, or None, not {type(state).__name__}")
     known = {"values": values} if state is None else {"values": values, "last": state.last, "history": state.history}
-    check_tensors(where, known, {"values": "V H W", "last": "V H W", "history": "V H W : uint8"})
-    check_lengths(where, "values", values)
+    check_tensors(where, known, {"values": "V H W : depth", "last": "V H W", "history": "V H W : uint8"})
     if state is None:
         history = torch.zeros_like(values, dtype=torch.uint8)
         state = TemporalState(last=torch.zeros_like(values), history=history)

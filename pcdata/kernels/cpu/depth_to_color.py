@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
-from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_registration, half_pixels
+from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_cameras, half_pixels
 from pcdata.geometry.lens import fold_radius
 from pcdata.kernels.cpu.native import call, room, room_for
 from pcdata.kernels.cpu.rays import rays_of_cameras
@@ -28,9 +28,7 @@ def register_depth(
     max_jump: float,
 ) -> RegisteredDepth:
     """Project and paint a few rows at a time; what floats cannot hold is left to the reference."""
-    check_registration(
-        depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth, color_size, max_jump
-    )
+    check_cameras(depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth)
     views, height, width = depth.shape
     color_shape = (views, *color_size)
     if 0 < height * width <= _MOST_PIXELS and views > 0:

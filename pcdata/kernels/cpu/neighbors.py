@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
-from pcdata.contracts.numbers import require_count, require_length, require_positive
-from pcdata.functional.image_grid import ImageGrid, check_grid
-from pcdata.functional.metrics import mean_per_cloud, require_points
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.metrics import mean_per_cloud
 from pcdata.functional.nearest import largest_squared
-from pcdata.functional.neighbors import check_ball_query, check_neighbors
 from pcdata.kernels.cpu.image_grid import grid_arguments
 from pcdata.kernels.cpu.native import call, room
 
@@ -35,8 +33,6 @@ def knn(
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor]:
     """Run the reference's contract in the core."""
-    check_neighbors("knn", points, ptr, queries, queries_ptr, grid)
-    require_count("knn", "k", k)
     if k > _MAX_ROWS:
         return _reference("knn", points, ptr, k=k, queries=queries, queries_ptr=queries_ptr, grid=grid)
     index, distance, _ = _neighbors(points, ptr, k, None, queries, queries_ptr, grid, counted=False)
@@ -55,13 +51,10 @@ def ball_query(
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run the reference's contract in the core."""
-    check_ball_query(points, ptr, radius, max_neighbors, queries, queries_ptr, grid)
     if max_neighbors > _MAX_ROWS:
         limits = {"radius": radius, "max_neighbors": max_neighbors}
         return _reference("ball_query", points, ptr, **limits, queries=queries, queries_ptr=queries_ptr, grid=grid)
-    index, distance, count = _neighbors(
-        points, ptr, max_neighbors, float(radius), queries, queries_ptr, grid, counted=True
-    )
+    index, distance, count = _neighbors(points, ptr, max_neighbors, radius, queries, queries_ptr, grid, counted=True)
     assert count is not None
     return index, distance, count
 
@@ -69,7 +62,6 @@ def ball_query(
 @kernel("chamfer_distance", "cpu")
 def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
     """Run the reference's contract in the core, without gradients."""
-    require_points(ptr_a, ptr_b)
     forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
     return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
 
@@ -79,16 +71,12 @@ def statistical_outlier_mask(
     *, points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None
 ) -> Tensor:
     """Run the reference's contract in the core."""
-    where = "statistical_outlier_mask"
-    require_count(where, "num_neighbors", num_neighbors)
-    require_positive(where, "std_ratio", std_ratio)
-    check_grid(where, grid, points, ptr)
     points, ptr = _rows(points, ptr)
     mean = room(len(points), torch.float64)
     outlier = room(len(points), torch.bool)
     call(
         "pc_statistical_outliers",
-        *(points, ptr, len(ptr) - 1, _reachable(num_neighbors, points), float(std_ratio)),
+        *(points, ptr, len(ptr) - 1, _reachable(num_neighbors, points), std_ratio),
         *(*grid_arguments(grid), mean, outlier),
     )
     return outlier
@@ -99,13 +87,10 @@ def estimate_normals(
     *, points: Tensor, ptr: Tensor, radius: float, max_neighbors: int, grid: ImageGrid | None
 ) -> Tensor:
     """Run the reference's contract in the core."""
-    require_length("estimate_normals", "radius", radius)
-    require_count("estimate_normals", "max_neighbors", max_neighbors)
-    check_grid("estimate_normals", grid, points, ptr)
     points, ptr = _rows(points, ptr)
     normals = room(points.shape, points.dtype)
     most = _reachable(max_neighbors, points)
-    call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(float(radius)), *grid_arguments(grid), normals)
+    call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(radius), *grid_arguments(grid), normals)
     return normals
 
 

@@ -9,9 +9,8 @@ from torch import Tensor
 import pcdata.functional.clusters
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import kernel
-from pcdata.contracts.numbers import require_count, require_length
 from pcdata.functional.cells import require_cells
-from pcdata.functional.image_grid import ImageGrid, check_grid
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.kernels.cpu.image_grid import grid_arguments
 from pcdata.kernels.cpu.native import call, room
 
@@ -21,37 +20,30 @@ def radius_outlier_mask(
     points: Tensor, ptr: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
 ) -> Tensor:
     """Search the points stored before and after each one, then the cells around those that are left."""
-    where = "radius_outlier_mask"
-    require_count(where, "min_neighbors", min_neighbors)
-    require_length(where, "radius", radius)
-    check_grid(where, grid, points, ptr)
     outlier = room(len(points), torch.bool)
     largest = room(1, torch.float64)
     enough = min(min_neighbors, len(points))  # as unreachable as any larger number, and fits an int64
     call(
         "pc_radius_outlier_mask",
-        points.contiguous(),
-        ptr.contiguous(),
+        points,
+        ptr,
         len(ptr) - 1,
-        float(radius),
+        radius,
         enough,
         *grid_arguments(grid)[:2],
         outlier,
         largest,
     )
-    require_cells(where, radius, largest.item())
+    require_cells("radius_outlier_mask", radius, largest.item())
     return outlier
 
 
 @kernel("dbscan", "cpu")
 def dbscan(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
     """Join cells that hold core points, then number the clusters and label their borders."""
-    require_count("dbscan", "min_points", min_points)
-    require_length("dbscan", "eps", eps)
-    check_grid("dbscan", grid, points, ptr)
     label = room(len(points), torch.int64)
     largest = room(1, torch.float64)
     enough = min(min_points, len(points) + 1)
-    call("pc_dbscan", points.contiguous(), ptr.contiguous(), len(ptr) - 1, float(eps), enough, label, largest)
+    call("pc_dbscan", points, ptr, len(ptr) - 1, eps, enough, label, largest)
     require_cells("dbscan", eps, largest.item())
     return label

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
-from pcdata.contracts.numbers import require_count
 from pcdata.functional.planes import PlaneWork, search_planes
 from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
-from pcdata.functional.sampling import check_available, counts_per_cloud
-from pcdata.functional.voxels import SIZE_TOLERANCE, sizes_per_cloud
+from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
 from pcdata.kernels.cpu.native import call, numbers, room
 
@@ -22,31 +19,24 @@ _MAX_ROWS = 2**31 - 1
 
 
 @kernel("farthest_point_sample", "cpu")
-def farthest_point_sample(
-    points: Tensor, ptr: Tensor, *, num_samples: int | Sequence[int] | Tensor
-) -> tuple[Tensor, Tensor]:
+def farthest_point_sample(points: Tensor, ptr: Tensor, *, num_samples: list[int]) -> tuple[Tensor, Tensor]:
     """Visit only the points that a pick can change."""
-    wanted = counts_per_cloud("farthest_point_sample", num_samples, ptr)
-    check_available("farthest_point_sample", wanted, ptr)
     if _too_long(ptr):
         return _reference("farthest_point_sample", points, ptr, num_samples=num_samples)
-    picks, counts = room(sum(wanted), torch.int64), numbers(wanted)
-    call("pc_farthest_points", points.contiguous(), ptr.contiguous(), len(wanted), counts, picks)
+    picks, counts = room(sum(num_samples), torch.int64), numbers(num_samples)
+    call("pc_farthest_points", points, ptr, len(num_samples), counts, picks)
     return picks.add_(torch.repeat_interleave(ptr[:-1], counts)), ptr_from_counts(counts)
 
 
 @kernel("voxel_downsample", "cpu")
-def voxel_downsample(
-    points: Tensor, ptr: Tensor, *, voxel_size: float | Sequence[float] | Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def voxel_downsample(points: Tensor, ptr: Tensor, *, voxel_size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Number voxels in a hash table; sums are integers, so threads change nothing."""
-    sizes = sizes_per_cloud("voxel_downsample", voxel_size, ptr).contiguous()
     if _too_long(ptr):
         return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)
     # As many rows as there could be: those not written never become memory.
     means, inverse = room(points.shape, points.dtype), room(len(points), torch.int64)
     counts, spans_too_many = room(len(ptr) - 1, torch.int64), room(1, torch.int64)
-    arrays = points.contiguous(), ptr.contiguous(), len(ptr) - 1, sizes, means, inverse, counts, spans_too_many
+    arrays = points, ptr, len(ptr) - 1, voxel_size, means, inverse, counts, spans_too_many
     call("pc_voxel_downsample", *arrays)
     if spans_too_many:
         return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)  # knows what to say
@@ -58,7 +48,6 @@ def voxel_downsample(
 @kernel("find_voxel_size", "cpu")
 def find_voxel_size(points: Tensor, ptr: Tensor, *, num_points: int) -> Tensor:
     """Bisect like the reference: small clouds side by side, large ones with all threads."""
-    require_count("find_voxel_size", "num_points", num_points)
     sizes, possible = room(len(ptr) - 1, torch.float64), room(1, torch.int64)
     if not _too_long(ptr) and num_points <= _MAX_ROWS:
         call("pc_find_voxel_sizes", points, ptr, len(sizes), num_points, SIZE_TOLERANCE, sizes, possible)
@@ -74,8 +63,8 @@ def ransac_plane(
     *,
     distance: float,
     num_hypotheses: int,
-    seed: int | Sequence[int] | Tensor,
-    up: Tensor | Sequence[float] | None,
+    seed: list[int],
+    up: Tensor | None,
     max_tilt: float | None,
 ) -> tuple[Tensor, Tensor]:
     """Make and score all hypotheses of all clouds in one pass over the points; decisions are the reference's."""

@@ -117,7 +117,7 @@ def test_rows_are_filled_from_the_left_then_from_the_right(radius, expected):
 
 
 def test_bad_requests_are_refused():
-    with pytest.raises(ConfigError, match="fill_holes: needs a rule of"):
+    with pytest.raises(ConfigError, match="fill_holes: rule must be one of 'left', 'farthest', 'nearest'"):
         fill_holes(torch.ones(1, 2, 2), rule="right")
     with pytest.raises(ConfigError, match="max_size"):
         fill_holes(torch.ones(1, 2, 2), max_size=0)

@@ -123,7 +123,7 @@ def test_the_same_size_is_the_same_image():
 def test_bad_requests_are_refused():
     depth = noisy_image(6, 6)
     for factor in (0, 9, -1):
-        with pytest.raises(ConfigError, match=r"decimate_depth: factor must be 1\.\.8"):
+        with pytest.raises(ConfigError, match="decimate_depth: factor must be 1 to 8"):
             decimate_depth(depth, factor=factor)
     with pytest.raises(ConfigError, match="rule"):
         decimate_depth(depth, factor=2, rule="max")
