@@ -5,14 +5,15 @@
     PCDATA_TEST_DATA=... python benchmarks/digests.py --out after.json
     python benchmarks/digests.py --compare before.json after.json        # prints every difference; exit code 1 if any
 
-``--only PREFIX`` makes those digests alone (``--only op/knn``), and ``--leaves`` one digest per array and number, which
-tells where in a result a difference lies. benchmarks/results/digests.json holds the digests of one machine: bits of
-floating-point sums depend on the libraries below (torch, OpenCV, SciPy) and on the processor, so make both files on one
-machine, with one installation.
+All of them take 90 s of one core. ``--only PREFIX`` makes those digests alone (``--only op/knn``), and ``--leaves`` one
+digest per array and number, which tells where in a result a difference lies. benchmarks/results/digests.json holds the
+digests of one machine: bits of floating-point sums depend on the libraries below (torch, OpenCV, SciPy) and on the
+processor, so make both files on one machine, with one installation.
 
 A key is ``what/name/input``; those that end in ``facts`` hash the history and where a result came from, the others its
 numbers. An input that is refused has the value "refused"; what cannot run here (no compiled core, an extra that is
-missing) has no key, and is told.
+missing) has no key, and is told. Where a result is meant to change, the commit that changes it says which keys differ
+and why; ``RENAMED`` in digest_names.py hides a mere change of a field's name.
 """
 
 from __future__ import annotations
