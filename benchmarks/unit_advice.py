@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import PcdataError
+from pcdata.functional.depth.stored_depth import check_plausible
 from pcdata.functional.depth.unit_fit import DepthUnit, decoded, encoded
 from pcdata.io import read_pcd
-from pcdata.io.images.reading import check_plausible
 from pcdata.report import text_table
 from pcdata.synthetic import look_at, tabletop
 from pcdata.validation import CaptureLimits

@@ -87,6 +87,7 @@ _HOMES = {
         "register_combinator",
         "register_layout",
         "write_calibration",
+        "write_capture",
         "write_pcd",
         "write_ply",
         "write_volume",

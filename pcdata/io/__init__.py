@@ -22,6 +22,7 @@ from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, register_combinator
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
 from pcdata.io.store.volumes import read_volume, write_volume
+from pcdata.io.writers.capture import write_capture
 
 __all__ = [
     "COMBINATORS",
@@ -52,6 +53,7 @@ __all__ = [
     "register_combinator",
     "register_layout",
     "write_calibration",
+    "write_capture",
     "write_capture_camera",
     "write_color",
     "write_confidence",

@@ -14,6 +14,9 @@ from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
 from pcdata.structures.structure import Structure
 
+# Of the side of an image: principal points of depth cameras lie nearer to its middle, those of another size do not.
+MOST_OFF_CENTER = 0.075
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera(Structure):
@@ -71,6 +74,14 @@ class Camera(Structure):
     def num_views(self) -> int:
         """The number of cameras V."""
         return self.intrinsics.shape[0]
+
+    def off_center(self) -> list[float]:
+        """Return, per view, how far its principal point is from the middle, as a part of the image's side."""
+        height, width = self.size
+        return [
+            max(abs(k[0][2] + 0.5 - width / 2) / width, abs(k[1][2] + 0.5 - height / 2) / height)
+            for k in self.intrinsics.tolist()
+        ]
 
     def view(self, index: int) -> Camera:
         """Return one camera of the V as a camera of its own.

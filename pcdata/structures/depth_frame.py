@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pcdata.contracts.host import any_negative
@@ -14,13 +16,16 @@ from pcdata.contracts.lengths import check_depth
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, ShapeError
 from pcdata.functional.depth.deproject import mask_depth
+from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.geometry import rigid
 from pcdata.structures.camera import Camera, check_view
 from pcdata.structures.confidence import Confidence
+from pcdata.structures.image_arrays import camera_of, image_tensor, pose_tensor
 from pcdata.structures.structure import Structure, derived
 
 CAMERA_FRAME = "camera"
 _SAMPLE = 1 << 12  # readings
+_INTEGERS = ("int64", "int32", "int16", "int8", "uint8", "uint16", "uint32")
 _MASKED = {"depth": "V H W", "mask": "V H W : bool"}
 
 
@@ -104,6 +109,64 @@ class DepthFrame(Structure):
             if self.frame_id == CAMERA_FRAME:
                 raise CaptureError(f"{where}: frame_id names where the poses lead to; {CAMERA_FRAME!r} is the start")
             rigid.check_rigid(f"{where}: world_from_camera", self.world_from_camera)
+
+    @classmethod
+    def from_numpy(
+        cls,
+        depth: ArrayLike,  # (H, W) or (V, H, W): whole numbers of 16 bits or more, or floats
+        intrinsics: ArrayLike | Camera,  # (3, 3) or (V, 3, 3) pixels of this very image size; or the cameras
+        *,
+        metres_per_unit: float | None = None,  # of depth, e.g. 0.001 for millimetres; None = floats are metres
+        color: ArrayLike | None = None,  # (H, W, 3) or (V, H, W, 3) uint8 RGB at the depth's pixels
+        world_from_camera: ArrayLike | None = None,  # (4, 4) or (V, 4, 4) rigid
+        frame_id: str | None = None,  # the frame that world_from_camera leads to, e.g. "base"
+        distortion: ArrayLike | None = None,  # (D,) or (V, D), in OpenCV's order
+        labels: ArrayLike | None = None,  # (H, W) or (V, H, W) whole numbers, -1 = none
+        confidence: ArrayLike | None = None,  # (H, W) or (V, H, W) uint8, values of Confidence
+        mask: ArrayLike | None = None,  # (H, W) or (V, H, W) bool, True = inside the region of interest
+        invalid_values: Collection[int] = (),  # stored depths besides 0 that mean "no reading", e.g. (65535,)
+        capture_index: int = 0,
+        sample_id: str = "",
+    ) -> DepthFrame:
+        """Make a capture of arrays in memory, as a camera's driver or a simulator gives them.
+
+        All arrays are copied: the driver may use its buffers again. Depth becomes the metres that reading it from a
+        file would give; NaN and infinite depth means "no reading". What arrays cannot show must be right: depth is z
+        along the optical axis, not the length of the ray; color is RGB (OpenCV's is BGR: ``color[..., ::-1]``); camera
+        axes are OpenCV's, x right, y down, z forward (of OpenGL's poses, ``pose @ np.diag([1, -1, -1, 1])``).
+
+        Raises:
+            UnitError: whole numbers without a unit, or depth where no camera sees.
+            ShapeError: an image of another size than depth, or with its channels first.
+            DTypeError: an array of another dtype.
+            IntrinsicsError: intrinsics of another image size.
+            PoseError: a pose that is not rigid, is a mirror or is transposed.
+            CaptureError: negative depth; a pose without its frame.
+        """
+        where = "DepthFrame.from_numpy"
+        stored = np.asarray(depth)
+        if stored.ndim not in (2, 3) or 0 in stored.shape:
+            raise ShapeError(f"{where}: depth must be (H, W) or (V, H, W), got {stored.shape}")
+        if stored.ndim == 3 and stored.shape[2] <= 4 < min(stored.shape[:2]):
+            raise ShapeError(
+                f"{where}: depth must be (H, W) or (V, H, W), got {stored.shape}, which ends in channels: give "
+                "depth[..., 0] if that is the depth; a picture of the depth in colors holds no lengths"
+            )
+        stored = stored[None] if stored.ndim == 2 else stored
+        views, *size = stored.shape
+        return cls(
+            depth=torch.from_numpy(depth_in_metres(where, stored, metres_per_unit, invalid_values)),
+            camera=camera_of(where, intrinsics, distortion, views, (size[0], size[1])),
+            colors=image_tensor(where, "color", color, stored.shape, dtypes=("uint8",), channels=(3,)),
+            labels=image_tensor(where, "labels", labels, stored.shape, dtypes=_INTEGERS),
+            confidence=image_tensor(where, "confidence", confidence, stored.shape, dtypes=("uint8",)),
+            mask=image_tensor(where, "mask", mask, stored.shape, dtypes=("bool",)),
+            world_from_camera=pose_tensor(where, world_from_camera, views),
+            frame_id=frame_id,
+            capture_index=capture_index,
+            sample_id=sample_id,
+            provenance={} if metres_per_unit is None else {"metres_per_unit": float(metres_per_unit)},
+        )
 
     @property
     def num_views(self) -> int:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
@@ -20,6 +21,7 @@ from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved
 from pcdata.structures.padded import PaddedClouds, padded_clouds
+from pcdata.structures.point_arrays import attributes_of_arrays
 from pcdata.structures.structure import derived
 
 _SELECTED = {"points": "N 3", "ptr": "ptr N B"}
@@ -75,6 +77,49 @@ class PointCloud(CloudBatch):
         fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
         fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
         fill(self, "kinds", {name: Kind(kind) for name, kind in self.kinds.items()})
+
+    @classmethod
+    def from_numpy(
+        cls,
+        points: ArrayLike,  # (N, 3)
+        *,
+        frame_id: str,  # the frame of the coordinates, e.g. "base"
+        metres_per_unit: float | None = None,  # of all lengths, e.g. 0.001; None = floats that look like metres
+        unit: str = METRE,  # "normalized" for coordinates that are no lengths
+        ptr: ArrayLike | None = None,  # (B+1,) row pointers; None = one cloud
+        viewpoint: ArrayLike | None = None,  # (3,) or (B, 3) where the sensor stood, or (N, 3) for every point
+        kinds: Mapping[str, Kind | str] | None = None,  # of the fields of your own
+        **fields: ArrayLike | None,  # colors, normals, labels, source_index and fields of your own, N rows each
+    ) -> PointCloud:
+        """Make a cloud, or a batch, of arrays in memory; all are copied.
+
+        Colors are whole numbers up to 255 or floats in 0..1, RGB; labels whole numbers, -1 = none; normals get unit
+        length, NaN ones the zero vector. ``PointCloud.from_numpy(**cloud.numpy(), frame_id=..., kinds=..., unit=...)``
+        with what the cloud says of itself gives its points back as they were.
+
+        Raises:
+            UnitError: whole numbers without a unit, or coordinates that do not look like metres.
+            NonFiniteError: points that are NaN or infinite.
+            DTypeError: an array of something else than numbers, or a field whose kind nobody states.
+            ShapeError: arrays of different numbers of rows.
+            CaptureError: colors, labels or coordinates that cannot be meant.
+        """
+        given = {"points": points, "ptr": ptr, "viewpoint": viewpoint, **fields}
+        return cls(
+            frame_id=frame_id,
+            unit=unit,
+            **attributes_of_arrays("PointCloud.from_numpy", given, kinds or {}, metres_per_unit, unit),
+        )
+
+    def numpy(self) -> dict[str, NDArray[Any]]:
+        """Return ``ptr``, ``viewpoint`` and every per-point field that is there as arrays by name.
+
+        In host memory they share the memory of the cloud: copy what is to be changed.
+        """
+        fields = {**self.fields(), "ptr": self.ptr}
+        if self.viewpoint is not None and "viewpoint" not in fields:
+            fields["viewpoint"] = self.viewpoint
+        return {name: value.detach().cpu().numpy() for name, value in fields.items()}
 
     # -- reading ---------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
+from pcdata.structures.camera import MOST_OFF_CENTER
 from pcdata.verdicts import Limits
 
 _TABLE = (0.2, 2.0)  # metres, of a camera above a table
@@ -30,7 +31,7 @@ class CaptureLimits(Limits):
     saturation: tuple[float, float] = (0.002, 0.01)
     # Of the image's width or height. Lenses are mounted within 5 %; K of an image resized by 0.8, the smallest usual
     # change of size, is off by 10 %: halfway.
-    principal_point: tuple[float, float] = (0.05, 0.075)
+    principal_point: tuple[float, float] = (0.05, MOST_OFF_CENTER)
     # Degrees across the image: depth cameras lie between 40 (long-range stereo) and 110 (wide time of flight).
     field_of_view: tuple[float, float] = (30.0, 120.0)
     # Pixels are square to 1 % in every depth camera; an image resized unevenly differs on purpose, so this warns only.

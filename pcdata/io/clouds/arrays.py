@@ -16,12 +16,7 @@ from pcdata.errors import CaptureError, DTypeError, ShapeError
 from pcdata.io.clouds.statement import CloudStatement
 from pcdata.structures import METRE, Kind, PointCloud
 from pcdata.structures.kinds import FIELDS, KINDS
-
-_ROUNDED = 1e-5  # that a float colour may lie above 1
-_FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
-
-# What torch can hold and compute with; unsigned integers go to the next wider signed type.
-_HOLDABLE = {"u1": "u1", "i1": "i1", "u2": "i4", "i2": "i2", "u4": "i8", "i4": "i4", "u8": "i8", "i8": "i8"}
+from pcdata.structures.point_arrays import held_tensor, metres, unit_colors, unit_normals, whole_labels
 
 
 @dataclass(kw_only=True)
@@ -30,7 +25,7 @@ class CloudArrays:
 
     xyz: NDArray[np.floating[Any]]  # (N, 3)
     normals: NDArray[np.floating[Any]] | None = None  # (N, 3)
-    rgb: NDArray[Any] | None = None  # (N, 3): see _unit_colors
+    rgb: NDArray[Any] | None = None  # (N, 3): see unit_colors
     labels: NDArray[Any] | None = None  # (N,) whole numbers
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # name -> (N, ...)
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # of extra fields, where known
@@ -61,12 +56,12 @@ def to_cloud(
     rows = slice(None) if keep.all() else keep
     xyz = arrays.xyz[rows]
     unit = check_metres(where, xyz, stated, viewpoint=viewpoint or (0.0, 0.0, 0.0))
-    points = _metres(where, xyz, unit)
+    points = metres(where, xyz, unit)
     extra: dict[str, torch.Tensor] = {}
     kinds: dict[str, Kind] = {}
     for given, values in arrays.extra.items():
         name = _free_name(given, extra)
-        extra[name] = _tensor(f"{where}: field {given!r}", values[rows])
+        extra[name] = held_tensor(f"{where}: field {given!r}", values[rows])
         kinds[name] = arrays.kinds.get(given) or _kind(name, extra[name])
         if KINDS[kinds[name]].is_length:
             extra[name] = extra[name] * unit
@@ -74,9 +69,9 @@ def to_cloud(
     return PointCloud(
         points=torch.from_numpy(points),
         frame_id=frame,
-        colors=None if arrays.rgb is None else torch.from_numpy(_unit_colors(where, arrays.rgb[rows])),
-        normals=None if arrays.normals is None else torch.from_numpy(_unit_normals(arrays.normals[rows])),
-        labels=None if arrays.labels is None else torch.from_numpy(_whole(where, arrays.labels[rows])),
+        colors=None if arrays.rgb is None else torch.from_numpy(unit_colors(where, arrays.rgb[rows])),
+        normals=None if arrays.normals is None else torch.from_numpy(unit_normals(arrays.normals[rows])),
+        labels=None if arrays.labels is None else torch.from_numpy(whole_labels(where, arrays.labels[rows])),
         source_index=torch.from_numpy(np.flatnonzero(keep)),
         extra=extra,
         kinds=kinds,
@@ -125,68 +120,6 @@ def narrowest_int(where: str, values: NDArray[np.int64], choices: Sequence[str])
         if not len(values) or (limits.min <= values.min() and values.max() <= limits.max):
             return values.astype(dtype)
     raise DTypeError(f"{where}: values {values.min()} .. {values.max()} do not fit any integer type of this format")
-
-
-def _metres(where: str, xyz: NDArray[Any], unit: float) -> NDArray[np.float32]:
-    wide = xyz.astype(np.float64) * unit
-    with np.errstate(over="ignore"):
-        points = wide.astype(np.float32)
-    if xyz.dtype != np.float32 and len(wide) and not float(np.abs(points - wide).max()) <= _FINEST:
-        raise CaptureError(
-            f"{where}: coordinates reach {np.abs(wide).max():.6g} m, where float32 moves points by more than "
-            f"{_FINEST:g} m; subtract a common offset (a map origin) before saving"
-        )
-    return points
-
-
-def _unit_colors(where: str, rgb: NDArray[Any]) -> NDArray[np.float32]:
-    """Return colours in 0..1: bytes, 16 bits, whole numbers up to 255 of any type, or floats that are in 0..1 already.
-
-    Whole numbers that reach beyond 1 and not beyond 255 are bytes in a wider type: no other scale has them.
-    """
-    if not len(rgb) or rgb.dtype == np.uint8:
-        return (rgb / np.float32(255)).astype(np.float32)
-    low, high = float(rgb.min()), float(rgb.max())
-    is_float = rgb.dtype.kind == "f"
-    if is_float and low >= 0 and high <= 1 + _ROUNDED:
-        return np.minimum(rgb.astype(np.float32), np.float32(1))
-    if low >= 0 and high <= 255 and (not is_float or bool((rgb == np.rint(rgb)).all())):
-        return (rgb / np.float32(255)).astype(np.float32)
-    if rgb.dtype.kind == "u" and rgb.dtype.itemsize == 2:
-        return (rgb / np.float32(65535)).astype(np.float32)
-    raise CaptureError(
-        f"{where}: colours must be whole numbers in 0..255 or unsigned 16 bits, or floats in 0..1, got {rgb.dtype} "
-        f"{low:g} .. {high:g}; rescale them when exporting"
-    )
-
-
-def _unit_normals(normals: NDArray[Any]) -> NDArray[np.float32]:
-    with np.errstate(over="ignore", invalid="ignore"):
-        unit = normals.astype(np.float32)
-        unit[~np.isfinite(unit).all(axis=1)] = 0.0
-        length = np.linalg.norm(unit.astype(np.float64), axis=1)
-    off = (np.abs(length - 1.0) > 1e-3) & (length > 0)
-    unit[off] = unit[off] / length[off, None]
-    return unit
-
-
-def _whole(where: str, labels: NDArray[Any]) -> NDArray[np.int64]:
-    if labels.ndim != 1:
-        raise CaptureError(f"{where}: a label must be one number per point, got {labels.shape[1]}")
-    if labels.dtype.kind == "f" and not (np.isfinite(labels).all() and (labels == np.rint(labels)).all()):
-        raise CaptureError(f"{where}: labels must be whole numbers, but some are not; rename the field if a score")
-    if labels.dtype.kind != "i" and len(labels) and not labels.max() < 2**63:
-        raise CaptureError(f"{where}: labels reach {labels.max()}, above what int64 holds")
-    return labels.astype(np.int64)
-
-
-def _tensor(where: str, values: NDArray[Any]) -> torch.Tensor:
-    native = values.dtype.newbyteorder("=")
-    if native.kind in "iu":
-        if native == np.uint64 and len(values) and values.max() >= 2**63:
-            raise CaptureError(f"{where}: values reach {values.max()}, above what int64 holds")
-        native = np.dtype(_HOLDABLE[native.str[1:]])
-    return torch.from_numpy(np.array(values, dtype=native))
 
 
 def _array(where: str, value: torch.Tensor) -> NDArray[Any]:

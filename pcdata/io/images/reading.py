@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import os
 import struct
-import warnings
 import zlib
 from collections.abc import Collection
 from pathlib import Path
@@ -21,16 +20,10 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, NoReadingError, PcdataWarning, UnitError
+from pcdata.errors import CaptureError, UnitError
 from pcdata.files.opening import map_npy, read_bytes
-from pcdata.functional.depth.unit_fit import (
-    DepthEncoding,
-    DepthUnit,
-    check_depth_encoding,
-    decoded,
-    unit_fits,
-    units_in_words,
-)
+from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
+from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
 from pcdata.io.images.structure import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
@@ -39,11 +32,6 @@ _PNG, _TIFF, _JPEG = "PNG", "TIFF", "JPEG"
 _FORMATS = {".png": _PNG, ".tif": _TIFF, ".tiff": _TIFF, ".jpg": _JPEG, ".jpeg": _JPEG}
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
-_NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame lies outside
-MARKS = {65535: "the highest 16-bit number", 32767: "the highest 15-bit number", 4095: "the highest 12-bit number"}
-_FEW = 1000  # fewer readings may hold any number by chance
-_MARKED = 0.002  # of the readings: a single depth holds less of any real scene
-_NAMED = 0.001  # probability above which a unit is named: without the camera even the right one may look unlikely
 
 
 def read_depth(
@@ -80,7 +68,7 @@ def read_depth(
         table[[0, *invalid_values]] = 0.0
         depth = table[raw]
     elif encoding == "plain":
-        depth = _clean_float_depth(where, raw, unit, invalid_values)
+        depth = clean_float_depth(where, raw, unit, invalid_values)
     else:
         raise UnitError(f"{where}: holds {raw.dtype} numbers, whose bits have no order; drop depth_encoding={encoding}")
     check_plausible(where, depth, DepthUnit(unit, encoding), raw)
@@ -121,66 +109,6 @@ def _read_npy(where: str, path: Path) -> NDArray[Any]:
     if array.dtype.newbyteorder("=") not in (np.uint16, np.float32, np.float64):
         raise CaptureError(f"{where}: depth must be uint16, float32 or float64, got {array.dtype}; convert it")
     return np.array(array, dtype=array.dtype.newbyteorder("="))
-
-
-def metres_of_value(metres_per_unit: float, encoding: DepthEncoding = "plain") -> NDArray[np.float32]:
-    """Return the nearest float32 metres of each of the 65536 stored values."""
-    units = decoded(np.arange(1 << 16, dtype=np.uint32).astype(np.uint16), encoding)
-    return (units.astype(np.float64) * metres_per_unit).astype(np.float32)
-
-
-def _clean_float_depth(where: str, raw: NDArray[Any], unit: float, invalid: Collection[int]) -> NDArray[np.float32]:
-    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, so no reading either
-        depth = (raw.astype(np.float64) * unit).astype(np.float32)
-    depth[~np.isfinite(depth) | np.isin(raw, list(invalid))] = 0.0
-    depth += 0.0  # turns -0.0 into 0.0
-    if (depth < 0).any():
-        raise CaptureError(
-            f"{where}: {int((depth < 0).sum())} pixels have negative depth, down to {depth.min():g} m; "
-            f"{_of_negative(raw)}"
-        )
-    return depth
-
-
-def _of_negative(raw: NDArray[Any]) -> str:
-    marks = np.unique(raw[raw < 0])
-    if len(marks) == 1:
-        return f"all are {marks[0]:g}: if that marks 'no reading', write 0 or NaN for it when exporting"
-    return "is z pointing backwards (OpenGL axes)? Flip the sign when exporting, and write 0 for 'no reading'"
-
-
-def check_plausible(where: str, depth: NDArray[np.float32], unit: DepthUnit, stored: NDArray[Any]) -> None:
-    """Require readings, and half of them at distances that depth cameras see; else name the units that would fit."""
-    valid = depth[depth > 0]
-    if not len(valid):
-        raise NoReadingError(f"{where}: no pixel of {depth.size} has a reading; drop this frame")
-    _warn_of_marks(stored[depth > 0], unit)
-    median = float(np.median(valid[:: max(1, len(valid) >> 16)]))  # 65,536 pixels tell as much as all
-    if not _NEAREST <= median <= _FARTHEST:
-        fits = unit_fits(np.where(depth > 0, stored, 0), declared=unit)
-        likely = [fit for fit in fits if fit.probability >= _NAMED and _NEAREST <= fit.median <= _FARTHEST]
-        named = f"the numbers fit {units_in_words(likely)}" if likely else "give the length of one unit in metres"
-        raise UnitError(
-            f"{where}: half of the valid depth is {'beyond' if median > 1 else 'within'} {median:g} m with {unit}; is "
-            f"metres_per_unit right? {named}"
-        )
-
-
-def _warn_of_marks(stored: NDArray[Any], unit: DepthUnit) -> None:
-    """Say once that a number which usually marks "no reading" becomes points; the text is the same for every file."""
-    if stored.dtype != np.uint16 or len(stored) < _FEW:
-        return
-    for mark in MARKS:
-        # At the end of the range and more than just below it: a wall that happens to be there has noise.
-        share, beside = (stored == mark).mean(), ((stored >= 0.98 * mark) & (stored < mark)).mean()
-        if share > max(_MARKED, beside) and stored.max() == mark:
-            metres = float(metres_of_value(unit.metres, unit.encoding)[mark])
-            warnings.warn(
-                f"depth images hold {mark}, {MARKS[mark]}, at more than {_MARKED:.1%} of their readings: it becomes "
-                f"points at {metres:.5g} m. If it marks 'no reading', say invalid_values=[{mark}]",
-                PcdataWarning,
-                stacklevel=2,
-            )
 
 
 def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8

@@ -12,7 +12,8 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, DTypeError
 from pcdata.files.opening import replacing
-from pcdata.io.images.reading import check_suffix, metres_of_value
+from pcdata.functional.depth.stored_depth import metres_of_value
+from pcdata.io.images.reading import check_suffix
 
 
 def write_depth(

@@ -20,9 +20,9 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.files.sample_names import name_some
+from pcdata.functional.depth.stored_depth import check_plausible, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.geometry import rigid
-from pcdata.io.images.reading import check_plausible, metres_of_value
 from pcdata.io.sources.bag_index import MAGIC
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_seconds, check_switch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from pcdata.io.images.writing import write_color, write_depth, write_labels, wri
 from pcdata.structures import DepthFrame
 
 
-def write_capture(frame: DepthFrame, folder: Path) -> None:
-    """Write every image, the pose and the calibration of every view to ``folder/view<v>``.
+def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
+    """Write every image, the pose and the calibration of every view to ``folder/view<v>``, for ``open_source`` to read.
 
     Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
 
@@ -25,7 +26,7 @@ def write_capture(frame: DepthFrame, folder: Path) -> None:
     """
     try:
         for v in range(frame.num_views):
-            _write_view(frame, v, folder / f"view{v}")
+            _write_view(frame, v, Path(folder) / f"view{v}")
     except OSError as error:
         raise WriteError(f"{folder}: cannot be written: {write_fault(error)}") from error
 

@@ -17,11 +17,11 @@ _MAX_SKEWED = 1e-3  # of R R^T - I; more is refused where a frame is made
 def intrinsics_checks(camera: Camera, limits: CaptureLimits) -> list[Finding]:
     """Judge each view's principal point, field of view and pixel shape; the first two only of uncropped images."""
     checks = []
-    for view, k in enumerate(camera.intrinsics.tolist()):
+    for view, (k, off) in enumerate(zip(camera.intrinsics.tolist(), camera.off_center())):
         (fx, _, cx), (_, fy, cy), _ = k
         if not camera.is_window:
             checks += [
-                _principal_point(cx, cy, camera.size, limits, view),
+                _principal_point(off, cx, cy, camera.size, limits, view),
                 _field_of_view(fx, cx, camera.size[1], limits, view),
             ]
         checks.append(
@@ -37,9 +37,10 @@ def intrinsics_checks(camera: Camera, limits: CaptureLimits) -> list[Finding]:
     return checks
 
 
-def _principal_point(cx: float, cy: float, size: tuple[int, int], limits: CaptureLimits, view: int) -> Finding:
+def _principal_point(
+    off: float, cx: float, cy: float, size: tuple[int, int], limits: CaptureLimits, view: int
+) -> Finding:
     height, width = size
-    off = max(abs(cx + 0.5 - width / 2) / width, abs(cy + 0.5 - height / 2) / height)
     return graded(
         "principal_point",
         off,

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from pcdata.io.images.reading import MARKS
+from pcdata.functional.depth.stored_depth import MARKS
 from pcdata.validation.checks.depth_unit import depth_unit_check
 from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.extremes import pile_at_extreme
