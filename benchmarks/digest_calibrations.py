@@ -27,6 +27,7 @@ from digest_names import (
     functional,
     overlap_rows,
     parse_board,
+    passed,
     read_board_images,
     refine_extrinsics,
     tabletop,
@@ -90,7 +91,7 @@ CAMERA = Camera.pinhole(
 )
 PLANE_NUMBERS = (
     *("num_readings", "fill", "inlier_share", "plane", "plane_rms", "depth_rms", "axis_distance", "normal_distance"),
-    *("tilt", "warp", "bias", "expected_noise", "passed"),
+    *("tilt", "warp", "bias", "expected_noise"),
 )
 
 
@@ -108,7 +109,9 @@ def _wall(*, noise: float = 0.002, bowl: float = 0.0, clutter: bool = False) -> 
 
 def _plane(frame: Any, **options: Any) -> Many:
     found = check_plane(frame, **options)
-    return Many({"numbers": [getattr(found, name) for name in PLANE_NUMBERS], "verdicts": finding_rows(found)})
+    return Many(
+        {"numbers": [*(getattr(found, name) for name in PLANE_NUMBERS), passed(found)], "verdicts": finding_rows(found)}
+    )
 
 
 def _board_pose(number: int) -> Tensor:
@@ -143,7 +146,7 @@ def _corners(number: int) -> Any:
 
 def _intrinsics(views: dict[str, Any], size: tuple[int, int], count: int) -> Many:
     found = calibrate_intrinsics(views, size=size, board="board", num_coefficients=count)
-    numbers = [found.camera, found.rms, found.view_rms, found.uncertainty, found.poor_views, found.passed]
+    numbers = [found.camera, found.rms, found.view_rms, found.uncertainty, found.poor_views, passed(found)]
     return Many({"numbers": numbers, "verdicts": finding_rows(found)})
 
 
@@ -167,9 +170,11 @@ def _hand_eye(setup: str, noise: float) -> Many:
     found = calibrate_hand_eye(RobotPoses(names=names, base_from_gripper=robot, camera_from_target=seen), setup=setup)
     numbers = (
         *("mount_from_camera", "holder_from_target", "translation_residuals", "rotation_residuals", "outliers"),
-        *("solutions", "translation_spread", "rotation_spread", "translation_sigma", "rotation_sigma", "passed"),
+        *("solutions", "translation_spread", "rotation_spread", "translation_sigma", "rotation_sigma"),
     )
-    return Many({"numbers": [getattr(found, name) for name in numbers], "verdicts": finding_rows(found)})
+    return Many(
+        {"numbers": [*(getattr(found, name) for name in numbers), passed(found)], "verdicts": finding_rows(found)}
+    )
 
 
 def _calibrations() -> Iterator[Case]:

@@ -265,14 +265,25 @@ def export(source: Any, target: str, folder: Path, **options: Any) -> None:
 
 
 def check_row(check: Any) -> tuple[Any, ...]:
-    """One check: its view, verdict, number and limits."""
-    return check.view, check.verdict.value, check.value, check.threshold, check.fails_at, check.unit
+    """One check: its view, verdict, number and limits; what cannot be measured was a warning once."""
+    verdict = "warn" if check.verdict.value == "unknown" else check.verdict.value
+    return check.view, verdict, check.value, check.threshold, check.fails_at, check.unit
+
+
+def overlap_verdict(verdict: Any) -> str:
+    """The word for it when the digests were first made."""
+    return "not measurable" if verdict.value == "unknown" else str(verdict.value)
+
+
+def passed(result: Any) -> bool:
+    """Whether every limit of a calibration step held."""
+    return str(result.verdict.value) != "fail"
 
 
 def reports(source: Any) -> list[tuple[str, list[tuple[str, tuple[Any, ...]]]]]:
     """Sample id -> the rows of its checks by name, over all captures of a source."""
     found = validate_source(source)
-    return [(report.sample_id, [(check.name, check_row(check)) for check in report.checks]) for report in found]
+    return [(report.sample_id, [(check.name, check_row(check)) for check in report.findings]) for report in found]
 
 
 def overlap_rows(result: Any) -> dict[str, Any]:
@@ -283,15 +294,26 @@ def overlap_rows(result: Any) -> dict[str, Any]:
         *("rotation_sigma_degrees", "measured_rotation_sigma_degrees", "center", "correction", "verdict"),
     )
     return {
-        "verdict": result.verdict,
+        "verdict": overlap_verdict(result.verdict),
         "wrong": result.wrong,
         "candidates": result.candidates,
         "reference": result.reference,
-        "pairs": [[getattr(pair, name) for name in pairs] for pair in result.pairs],
-        "cameras": [[getattr(camera, name) for name in cameras] for camera in result.cameras],
+        "pairs": [_row(pair, pairs) for pair in result.pairs],
+        "cameras": [_row(camera, cameras) for camera in result.cameras],
     }
+
+
+def _row(found: Any, names: tuple[str, ...]) -> list[Any]:
+    values = (getattr(found, name) for name in names)
+    return [overlap_verdict(value) if name == "verdict" else value for name, value in zip(names, values)]
 
 
 def finding_rows(result: Any) -> list[tuple[str, bool]]:
     """The verdict of every limit of a calibration step."""
-    return [(finding.name, finding.passed) for finding in result.findings]
+    return [
+        (
+            finding.name.partition(",")[0] if finding.name.startswith("solvers apart") else finding.name,
+            finding.verdict.value != "fail",
+        )
+        for finding in result.findings
+    ]

@@ -1,4 +1,4 @@
-"""Transforms and readers of your own, from a file that you name: ``--import FILE.py``, :func:`import_file`.
+"""Transforms, readers, checks, ... of your own, from a file that you name: ``--import FILE.py``, :func:`import_file`.
 
 The one place where pcdata runs code that is not its own. No configuration, capture or dataset can name such a file:
 they say at most what a file was called, never where it is.
@@ -17,6 +17,7 @@ from typing import Any
 from pcdata.errors import ConfigError, PcdataError
 from pcdata.files.opening import read_bytes
 from pcdata.io.sources.registry import LAYOUTS
+from pcdata.registry import registries
 from pcdata.transforms.base import REGISTRY
 
 _MAX_BYTES = 1 << 20
@@ -90,8 +91,8 @@ def _imported(path: str, content: bytes) -> ImportedFile:
             said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             raise ConfigError(f"import {path}:{_line(error, path)} it cannot be run: {said}") from error
         raise
-    transforms = tuple(name for name, one in REGISTRY.items() if one.__module__ == module.__name__)
-    layouts = tuple(name for name, layout in LAYOUTS.items() if layout.__module__ == module.__name__)
+    transforms = REGISTRY.names_from(module.__name__)
+    layouts = LAYOUTS.names_from(module.__name__)
     _FILES[digest] = ImportedFile(os.path.basename(path), digest, transforms, layouts, path, content)
     return _FILES[digest]
 
@@ -99,8 +100,8 @@ def _imported(path: str, content: bytes) -> ImportedFile:
 def _forget(module: str) -> None:
     """Leave nothing of a file that failed halfway."""
     del sys.modules[module]
-    for registry in (REGISTRY, LAYOUTS):
-        for name in [name for name, one in registry.items() if one.__module__ == module]:
+    for registry in registries():
+        for name in registry.names_from(module):
             del registry[name]
 
 

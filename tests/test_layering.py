@@ -17,7 +17,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"rng", "threads", "extras", "files"},
+    {"rng", "threads", "extras", "files", "registry"},
     {"contracts"},
     {"geometry"},
     {"functional"},
@@ -49,6 +49,7 @@ OUTSIDE = {
     "geometry": {"torch", "numpy"},
     "functional": {"torch", "numpy"},
     "kernels": {"torch", "numpy"},
+    "registry": set(),
     "verdicts": set(),
     "structures": {"torch", "numpy"},
     "alignment": {"torch", "numpy"},

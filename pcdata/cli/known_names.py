@@ -6,6 +6,20 @@ A test holds every table to the registry that it repeats.
 from __future__ import annotations
 
 KINDS = ("folder", "rig", "graspnet", "seven_scenes", "realsense_bag", "clouds")
+CHECKS = (
+    "RawValues",
+    "Coverage",
+    "Readings",
+    "Intrinsics",
+    "Poses",
+    "BehindCamera",
+    "Repeats",
+    "Clock",
+    "PoseDirection",
+    "ViewOverlap",
+    "ColorOnDepth",
+    "PoseDirectionOverTime",
+)
 FORMATS = ("hdf5", "npz", "pt")
 WEIGHTINGS = ("constant", "inverse_square", "angle")
 CARVINGS = ("never", "near", "everywhere")

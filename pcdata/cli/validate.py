@@ -9,14 +9,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
-from pcdata.cli.known_names import SENSORS
+from pcdata.cli.known_names import CHECKS, SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
 from pcdata.cli.progress import Progress
 
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
-    validate = commands.add_parser("validate", help="check raw captures, each camera alone and against others")
+    validate = commands.add_parser(
+        "validate",
+        help="check raw captures, each camera alone and against others",
+        epilog=f"The checks: {', '.join(CHECKS)}; and those of FILE.py (--import) that it registers.",
+    )
     validate.add_argument(
         "path", metavar="PATH", help="folder of captures, or of several cameras' folders, or one cloud file"
     )

@@ -18,6 +18,7 @@ from torch import Generator, Tensor, nn
 from typing_extensions import dataclass_transform
 
 from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note
+from pcdata.registry import Registry
 from pcdata.rng import Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.kinds import FIELDS
@@ -28,7 +29,7 @@ Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
 GeneratorLike = Generator | Sequence[Generator]
 
-REGISTRY: dict[str, type[Transform]] = {}
+REGISTRY: Registry[type[Transform]] = Registry("transform")
 
 
 @dataclass_transform(kw_only_default=True)

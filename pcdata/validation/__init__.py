@@ -1,5 +1,6 @@
 """Judging captures: do they hold what training needs, and do several cameras agree."""
 
+from pcdata.validation.capture_check import CHECKS, Check, Explained, register_check
 from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
@@ -7,15 +8,19 @@ from pcdata.validation.report import WHOLE, SampleReport, Summary
 from pcdata.validation.run import check_of_error, validate_frame, validate_source
 
 __all__ = [
+    "CHECKS",
     "WHOLE",
     "CameraOverlap",
     "CaptureLimits",
+    "Check",
+    "Explained",
     "OverlapLimits",
     "OverlapResult",
     "PairOverlap",
     "SampleReport",
     "Summary",
     "check_of_error",
+    "register_check",
     "validate_frame",
     "validate_source",
     "verify_overlap",

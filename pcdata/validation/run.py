@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids
 from pcdata.io.sources.source import stored_captures
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
-from pcdata.validation.checks.cameras import intrinsics_checks, pose_checks
-from pcdata.validation.checks.clouds import cloud_checks
-from pcdata.validation.checks.color_registration import frame_votes, registration_check
-from pcdata.validation.checks.coverage import coverage_checks
-from pcdata.validation.checks.pose_direction import direction_checks
-from pcdata.validation.checks.pose_direction_over_time import PoseDirectionOverTime
-from pcdata.validation.checks.readings import reading_checks
-from pcdata.validation.checks.sequence import ClockChecks, RepeatChecks
-from pcdata.validation.checks.stored_files import raw_value_checks
-from pcdata.validation.checks.view_overlap import overlap_checks
+from pcdata.validation import checks as _checks  # noqa: F401  # registers them
+from pcdata.validation.capture_check import CHECKS, Check
 from pcdata.validation.limits import CaptureLimits
-from pcdata.validation.measures.edge_offset import EdgeVotes
 from pcdata.validation.report import WHOLE, SampleReport
-from pcdata.verdicts import Finding, Verdict, worst
+from pcdata.verdicts import Finding, Verdict
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
 READABLE = "readable"
@@ -36,7 +28,7 @@ _CHECK_OF_ERROR: dict[type[PcdataError], str] = {
 
 @torch_on_one_thread()
 def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) -> list[Finding]:
-    """Check every view of one capture on its own, then the views against each other.
+    """Run every check in :data:`CHECKS` on one capture, but for those that compare captures.
 
     Args:
         frame: the capture as it was read, before any filter.
@@ -50,7 +42,11 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
             f"validate_frame: frame must be a DepthFrame, got {type(frame).__name__}; source.load(id) makes one, and "
             "validate_source judges a source with all its captures"
         )
-    return _frame_checks(frame, frame_votes(frame), limits or CaptureLimits())
+    limits = limits or CaptureLimits()
+    found: list[Finding] = []
+    for check in (made(limits) for made in CHECKS.values() if not made.compares):
+        found += _asked(check, check.frame, frame, found)
+    return found
 
 
 def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
@@ -93,80 +89,46 @@ def check_of_error(error: PcdataError) -> Finding:
 
 
 class _Series:
-    """Checks captures one after another and remembers what the next ones are compared with."""
+    """Checks captures one after another; the checks remember what the next ones are compared with."""
 
     def __init__(self, limits: CaptureLimits) -> None:
-        self._limits = limits
-        self._repeats = RepeatChecks()
-        self._clock = ClockChecks(limits)
-        self._poses = PoseDirectionOverTime()
-        self._votes: list[EdgeVotes] = []  # by view, summed over the captures
-        self._voted = 0
+        self._checks = [check(limits) for check in CHECKS.values()]
 
     @torch_on_one_thread()
     def check(self, source: CaptureSource, sample_id: str) -> list[Finding]:
-        checks: list[Finding] = []
+        found: list[Finding] = []
         try:
             stored = stored_captures(source, sample_id)
             for layout, own in stored:
                 layout.check_links(own)
-            checks += raw_value_checks([file for layout, own in stored for file in layout.depth_files(own)])
+            if stored:
+                depth = [file for layout, own in stored for file in layout.depth_files(own)]
+                for check in self._checks:  # what a file refuses is told as what a reader refuses
+                    found += check.files(depth)
             capture = source.load(sample_id)
         except PcdataError as error:
-            return [*checks, check_of_error(error)]
-        if isinstance(capture, PointCloud):
-            return [*checks, *cloud_checks(capture, self._limits)]
-        votes = frame_votes(capture)
-        repeats = self._repeats.check(capture)
-        found = _frame_checks(capture, votes, self._limits, _views_failing(repeats, "repeated_depth"))
-        self._add(votes)
-        checks += [*found, *repeats, *self._clock.check(capture)]
-        # Depth of another moment or another unit contradicts right poses: it neither accuses them nor is kept.
-        if not _views_failing(checks, "repeated_depth", "depth_unit"):
-            checks += self._poses.check(capture)
-        return checks
+            return [*found, check_of_error(error)]
+        for check in self._checks:
+            judge = check.cloud if isinstance(capture, PointCloud) else check.frame
+            found += _asked(check, judge, capture, found)
+        return found
 
     @torch_on_one_thread()
     def whole(self) -> list[Finding]:
         """Judge what all captures tell together."""
-        checks = self._poses.whole()
-        if self._voted >= 2:
-            checks += [registration_check(votes, self._limits, view) for view, votes in enumerate(self._votes)]
-        return checks
-
-    def _add(self, votes: list[EdgeVotes]) -> None:
-        """Add up the votes, of captures with equal numbers of views and resolution."""
-        if not votes:
-            return
-        if not self._votes:
-            self._votes = votes
-        elif [one.scale for one in votes] == [one.scale for one in self._votes]:
-            self._votes = [total + one for total, one in zip(self._votes, votes)]
-        else:
-            return
-        self._voted += 1
+        return [finding for check in self._checks for finding in _asked(check, check.whole)]
 
 
-def _frame_checks(
-    frame: DepthFrame, votes: Iterable[EdgeVotes], limits: CaptureLimits, repeated: Collection[int] = ()
-) -> list[Finding]:
-    checks = []
-    for view, depth in enumerate(frame.depth):
-        checks += coverage_checks(depth > 0, limits, view)
-        focal = float(frame.camera.intrinsics[view, 0, 0])
-        checks += reading_checks(depth, limits, facts=frame.provenance, focal=focal, view=view)
-    checks += intrinsics_checks(frame.camera, limits)
-    checks += pose_checks(frame)
-    direction = direction_checks(frame, {*repeated, *_views_failing(checks, "depth_unit")})
-    checks += direction
-    if (
-        worst(one.verdict for one in direction) is not Verdict.FAIL
-    ):  # views carried the wrong way have no gap worth a number
-        checks += overlap_checks(frame)
-    checks += [registration_check(one, limits, view) for view, one in enumerate(votes)]
-    return checks
-
-
-def _views_failing(checks: Iterable[Finding], *names: str) -> set[int]:
-    failed = (check for check in checks if check.name in names and check.verdict is Verdict.FAIL)
-    return {check.view for check in failed if check.view is not None}
+def _asked(check: Check, judge: Callable[..., list[Finding]], *about: Any) -> list[Finding]:
+    """Return what a check found; where it could not measure, that."""
+    try:
+        return judge(*about)
+    except PcdataError as error:
+        return [
+            Finding(
+                name=next(iter(check.findings)),
+                verdict=Verdict.UNKNOWN,
+                found=f"not measurable: {error}",
+                advice="give captures that have what the message asks for, or do without this check",
+            )
+        ]

@@ -30,6 +30,7 @@ from pcdata.models.catalogue import CHOICES, EXAMPLES
 from pcdata.models.check import require
 from pcdata.sensors import sensor_profiles
 from pcdata.synthetic import tabletop
+from pcdata.validation import CHECKS
 
 BOX = "crop=((-0.4,-0.4,-0.02),(0.4,0.4,0.5))"
 
@@ -72,7 +73,7 @@ def test_a_model_is_built_without_a_configuration_and_passes_its_check(capsys, c
     # Another model takes nothing from what was chosen for this one.
     capsys.readouterr()
     assert main(["check", str(out), "--model", "dp3_sim"]) == 0
-    assert "WARN frame (0, 1): the model leaves the frame open" in capsys.readouterr().out
+    assert "UNKNOWN frame (0, 1): the model leaves the frame open" in capsys.readouterr().out
 
 
 def test_what_is_built_equals_what_the_preset_gives(captures, tmp_path):
@@ -237,6 +238,7 @@ def test_a_parameter_of_opening_is_no_option(capsys, captures, name):
 
 def test_help_knows_the_names_of_every_registry():
     assert tuple(LAYOUTS) == known_names.KINDS
+    assert tuple(CHECKS) == known_names.CHECKS
     assert tuple(STORES) == known_names.FORMATS
     assert tuple(CONTRACTS) == known_names.MODELS
     assert tuple(CHOICES) == known_names.CHOICES
@@ -253,7 +255,7 @@ def test_help_knows_the_names_of_every_registry():
         (["build"], [*known_names.MODELS, *known_names.KINDS, *known_names.FORMATS, *known_names.CHOICES]),
         (["check"], [*known_names.MODELS, *known_names.CHOICES]),
         (["export"], [*known_names.TARGETS, *known_names.KINDS, "frames_per_scene", "label_offset"]),
-        (["validate"], [*known_names.SENSORS, *known_names.KINDS]),
+        (["validate"], [*known_names.CHECKS, *known_names.SENSORS, *known_names.KINDS]),
         (["calib", "check"], known_names.SENSORS),
         (["calib", "refine"], known_names.REFINERS),
     ],

@@ -37,7 +37,7 @@ def test_a_good_capture_is_exit_0_with_a_table(capsys, folder: Path) -> None:
     code, out, _ = run(capsys, folder)
     assert code == 0
     assert out.splitlines()[0].split() == ["check", "view", "pass", "unknown", "warn", "fail", "worst", "passes"]
-    assert "PASS: of 2 captures 2 pass, 0 warn, 0 fail" in out
+    assert "PASS: of 2 captures 2 pass, 0 unknown, 0 warn, 0 fail" in out
     assert "->" not in out
 
 

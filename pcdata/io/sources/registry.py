@@ -21,9 +21,10 @@ from pcdata.io.sources.rig import RigSource
 from pcdata.io.sources.seven_scenes import SevenScenesSource
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.temporal import TemporallyFilteredSource
+from pcdata.registry import Registry
 
-LAYOUTS: dict[str, type[Source]] = {}  # in the order that help texts and messages list them
-COMBINATORS: dict[str, type[CombinedSource]] = {}
+LAYOUTS: Registry[type[Source]] = Registry("layout")  # in the order that help texts and messages list them
+COMBINATORS: Registry[type[CombinedSource]] = Registry("combinator")
 
 # Of opening captures, whatever their layout: no option of a layout, no combinator may be called so.
 OPENING = ("path", "kind", "only", "limit", "skip", "skip_file", "skip_refused")

@@ -3,19 +3,67 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 
 from pcdata.contracts.lengths import FARTHEST
 from pcdata.structures import Camera, DepthFrame
+from pcdata.validation.capture_check import Check, Explained
 from pcdata.validation.limits import CaptureLimits
 from pcdata.verdicts import Finding, Verdict, graded
 
 _MAX_SKEWED = 1e-3  # of R R^T - I; more is refused where a frame is made
 
 
-def intrinsics_checks(camera: Camera, limits: CaptureLimits) -> list[Finding]:
-    """Judge each view's principal point, field of view and pixel shape; the first two only of uncropped images."""
+class Intrinsics(Check):
+    """Principal point, field of view and pixel shape; the first two only of uncropped images."""
+
+    question = "Can the intrinsics belong to this image?"
+    findings: ClassVar = {
+        "principal_point": Explained(
+            "distance from the image's centre / image size",
+            "{0.principal_point[0]:.0%}",
+            "above {0.principal_point[1]:.1%}",
+            "lenses are mounted within 5 %; K of an image resized by 0.8 is off by 10 %: halfway. Names the size that "
+            "K fits. Not for windows cut from an image",
+        ),
+        "field_of_view": Explained(
+            "degrees across the image",
+            "{0.field_of_view[0]:g} to {0.field_of_view[1]:g}",
+            "outside",
+            "the range of depth cameras",
+        ),
+        "pixel_aspect": Explained(
+            "abs(fx / fy - 1)", "{0.pixel_aspect:.0%}", "never", "an image resized unevenly differs on purpose"
+        ),
+    }
+
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
+        """Judge every view."""
+        return _intrinsics(frame.camera, self.limits)
+
+
+class Poses(Check):
+    """Poses that are not rigid are refused before a frame exists; what is left is how far they are from it."""
+
+    question = "Can the poses belong to any camera?"
+    findings: ClassVar = {
+        "pose": Explained(
+            "largest entry of R R^T - I",
+            f"{_MAX_SKEWED:g}",
+            "above",
+            "mirrors, scales, transposed matrices and lost tracking fail where the capture is read",
+        )
+    }
+
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
+        """Judge every view."""
+        return _poses(frame)
+
+
+def _intrinsics(camera: Camera, limits: CaptureLimits) -> list[Finding]:
     checks = []
     for view, (k, off) in enumerate(zip(camera.intrinsics.tolist(), camera.off_center())):
         (fx, _, cx), (_, fy, cy), _ = k
@@ -72,8 +120,7 @@ def _field_of_view(fx: float, cx: float, width: int, limits: CaptureLimits, view
     )
 
 
-def pose_checks(frame: DepthFrame) -> list[Finding]:
-    """Judge how far each pose is from rigid; poses that are not are refused before a frame exists."""
+def _poses(frame: DepthFrame) -> list[Finding]:
     if frame.world_from_camera is None:
         return []
     rotation = frame.world_from_camera[:, :3, :3]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import ClassVar, NamedTuple
 
 import torch
 
 from pcdata.alignment.view_agreement import Agreement
 from pcdata.structures import DepthFrame
+from pcdata.validation.capture_check import Check, Explained, views_failing
 from pcdata.validation.measures.pose_conventions import (
     AGREE,
     CONVENTIONS,
@@ -42,24 +43,34 @@ class Explanation(NamedTuple):
     score: float  # mean of the same over all views
 
 
-def direction_checks(frame: DepthFrame, doubtful: Collection[int] = ()) -> list[Finding]:
-    """Judge the poses of a frame with several views, all together and each alone.
+class PoseDirection(Check):
+    """Judges the poses of a frame with several views, all together and each alone."""
 
-    Args:
-        frame: the capture.
-        doubtful: views whose depth is known to be wrong: they say nothing about poses.
-    """
-    views = {number: view for number, view in enumerate(posed_views(frame)) if number not in doubtful}
-    given = {
-        (i, j): agreement(views[i], views[j])
-        for i, j in itertools.combinations(views, 2)
-        if has_moved(views[i].pose, views[j].pose)
+    question = "Do the poses of several views lead where they say?"
+    findings: ClassVar = {
+        NAME: Explained(
+            "readings of one view that another one confirms / readings both can see",
+            f"{AGREE:.0%}",
+            "when another convention agrees better by 10 points and resolves half of what contradicts",
+            "tries the inverse, transposed rotations, OpenGL axes, millimetres and centimetres, for all views together "
+            "and for each alone, and names the one that agrees and the view",
+        )
     }
-    if not given:
-        return []
-    shares = _shares(given)
-    best = _best(_explanations(views, given)) if min(shares.values()) < _SURE else []
-    return [_explained(best, given) if best else _unexplained(views, given)]
+
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
+        """Judge the views, but for those whose depth is known to be wrong: they say nothing about poses."""
+        doubtful = views_failing(before, "repeated_depth", "depth_unit")
+        views = {number: view for number, view in enumerate(posed_views(frame)) if number not in doubtful}
+        given = {
+            (i, j): agreement(views[i], views[j])
+            for i, j in itertools.combinations(views, 2)
+            if has_moved(views[i].pose, views[j].pose)
+        }
+        if not given:
+            return []
+        shares = _shares(given)
+        best = _best(_explanations(views, given)) if min(shares.values()) < _SURE else []
+        return [_explained(best, given) if best else _unexplained(views, given)]
 
 
 def _explained(best: list[Explanation], given: dict[Pair, Agreement]) -> Finding:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from typing import ClassVar
 
 from pcdata.alignment.view_agreement import Agreement
 from pcdata.structures import DepthFrame
-from pcdata.validation.checks.pose_direction import direction_check, judged_as_given
+from pcdata.validation.capture_check import Check, views_failing
+from pcdata.validation.checks.pose_direction import PoseDirection, direction_check, judged_as_given
+from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
     PosedView,
@@ -22,21 +26,29 @@ _PAIRS = 2  # pairs of captures that must speak for a convention: one may be an 
 _OUTNUMBERED = 3  # times as many must speak for it as against it
 
 
-class PoseDirectionOverTime:
+class PoseDirectionOverTime(Check):
     """Compares each capture of a moving camera with an earlier one of the same camera; keeps one depth image."""
 
-    def __init__(self) -> None:
+    question = "Do the poses of a moving camera lead where they say?"
+    findings: ClassVar = PoseDirection.findings
+    compares = True
+
+    def __init__(self, limits: CaptureLimits) -> None:
+        super().__init__(limits)
         self._earlier: PosedView | None = None
         self._compared = 0  # pairs
         self._agreement = Agreement(0, 0)  # of all pairs, as given
         self._for: Counter[str] = Counter()  # pairs that a convention explains clearly better than what is given
         self._against: Counter[str] = Counter()  # pairs that it explains clearly worse
 
-    def check(self, frame: DepthFrame) -> list[Finding]:
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
         """Judge the pose of the next capture; says nothing until the camera has moved.
 
-        A convention is named once two pairs of captures speak for it, and three times as many as against it.
+        A convention is named once two pairs of captures speak for it, and three times as many as against it. Depth of
+        another moment or another unit contradicts right poses: it neither accuses them nor is kept.
         """
+        if views_failing(before, "repeated_depth", "depth_unit"):
+            return []
         views = posed_views(frame)
         if len(views) != 1:
             return []

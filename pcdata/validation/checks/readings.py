@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from pcdata.functional.depth.stored_depth import MARKS
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.validation.capture_check import Check, Explained
 from pcdata.validation.checks.depth_unit import depth_unit_check
 from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.extremes import pile_at_extreme
@@ -15,8 +18,57 @@ from pcdata.verdicts import Finding, graded
 
 _SAMPLES = 1 << 17  # readings looked at: shares are then known to 0.2 %
 
+CAMERA = "camera"  # frames of clouds whose z is depth begin so
 
-def reading_checks(
+
+class Readings(Check):
+    """The unit, the range and the ends of the range."""
+
+    question = "Are the numbers lengths in metres, of the workspace, and not clipped?"
+    findings: ClassVar = {
+        "depth_unit": Explained(
+            "median depth",
+            "one unit alone fits the numbers (probability 0.94) and the median is up to twice beyond the workspace",
+            "the declared unit has a probability below 0.02",
+            "every usual unit (1/1000, 1/4000, 1/5000, 1/10000, 1/256 m, metres, rotated bits, swapped bytes, ...) is "
+            "tried on the numbers as stored: how usual it is, distance, noise and disparity steps for the focal "
+            "length, divisors of the numbers, smoothness. Between the two it warns and names all that fit; "
+            "`--workspace` around a measured distance or `--sensor` tells them apart. No unit is known from depth "
+            "alone: a scene without noise may fit several",
+        ),
+        "workspace_fraction": Explained(
+            "readings inside the workspace / all readings",
+            "{0.workspace_fraction[0]:.0%}",
+            "below {0.workspace_fraction[1]:.1%}",
+            "most of what is seen should be what the task is about",
+        ),
+        "saturation": Explained(
+            "readings exactly at the highest or lowest depth, where they outnumber those within 2 % of it",
+            "{0.saturation[0]:.1%}",
+            "above {0.saturation[1]:.0%}",
+            "a surface that ends there has fewer readings at the very end than before it. 65535, 4095 and 32767 are "
+            "named",
+        ),
+    }
+
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
+        """Judge every view."""
+        found = []
+        for view, depth in enumerate(frame.depth):
+            focal = float(frame.camera.intrinsics[view, 0, 0])
+            found += judged_readings(depth, self.limits, facts=frame.provenance, focal=focal, view=view)
+        return found
+
+    def cloud(self, cloud: PointCloud, before: Sequence[Finding]) -> list[Finding]:
+        """Judge z of a cloud in a camera's frame, elsewhere the distance from the viewpoint."""
+        if cloud.frame_id.startswith(CAMERA):
+            return judged_readings(cloud.points[:, 2].abs(), self.limits)
+        origin = torch.zeros(3, dtype=torch.float32, device=cloud.device)
+        viewpoint = origin if cloud.viewpoint is None else cloud.viewpoint[0]
+        return judged_readings((cloud.points - viewpoint).norm(dim=1), self.limits)
+
+
+def judged_readings(
     depth: Tensor,  # (H, W), or (N,) where there is no image; metres, 0 = no reading
     limits: CaptureLimits,
     *,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from statistics import median
+from typing import ClassVar
 
 from torch import Tensor
 
 from pcdata.structures import DepthFrame
+from pcdata.validation.capture_check import Check, Explained
 from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict, graded
@@ -19,14 +22,27 @@ _GAP = 2.5  # usual intervals without a capture: two frames are lost at least
 _SENSORS_DIFFER = "no sensor gives one image twice: the stream stands still, or captures were stored twice"
 
 
-class RepeatChecks:
+_REPEATS = Explained(
+    "image is bit for bit that of an earlier capture of this camera",
+    "no",
+    "yes",
+    f"no sensor gives one image twice; remembers {_REMEMBERED:,} images",
+)
+
+
+class Repeats(Check):
     """Compares every image of a view with those of earlier captures, bit for bit, by their hashes."""
 
-    def __init__(self) -> None:
+    question = "Is every image a new one?"
+    findings: ClassVar = {"repeated_depth": _REPEATS, "repeated_color": _REPEATS}
+    compares = True
+
+    def __init__(self, limits: CaptureLimits) -> None:
+        super().__init__(limits)
         self._seen: dict[tuple[str, int], OrderedDict[bytes, tuple[int, str]]] = {}
         self._count = 0
 
-    def check(self, frame: DepthFrame) -> list[Finding]:
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
         """Judge the views of the next capture."""
         self._count += 1
         checks = []
@@ -66,15 +82,32 @@ def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Finding:
     )
 
 
-class ClockChecks:
+class Clock(Check):
     """Judges ``provenance["timestamps"]``, the seconds of every view, where a capture has them."""
 
+    question = "Does time run forwards, and at once for all cameras?"
+    findings: ClassVar = {
+        "clock": Explained(
+            "seconds since the capture before",
+            f"up to {_GAP:g} usual intervals (warns beyond)",
+            "0 or less",
+            'where `timestamps.json` (folder layout) or `provenance["timestamps"]` has times',
+        ),
+        "sync": Explained(
+            "seconds between the views of one capture",
+            "{0.sync[0]:.4f}",
+            "above {0.sync[1]:.4f}",
+            "half a frame and a whole one at 30 per second",
+        ),
+    }
+    compares = True
+
     def __init__(self, limits: CaptureLimits) -> None:
-        self._limits = limits
+        super().__init__(limits)
         self._last: list[float] = []
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
 
-    def check(self, frame: DepthFrame) -> list[Finding]:
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
         """Judge the times of the next capture."""
         times = frame.provenance.get("timestamps")
         if times is None:
@@ -91,7 +124,7 @@ class ClockChecks:
         return graded(
             "sync",
             apart,
-            limits=self._limits.sync,
+            limits=self.limits.sync,
             found=f"{names[late]} is {1e3 * apart:.1f} ms later than {names[early]}",
             advice="trigger the cameras together, or pair their images by nearest time; what moves is in two places",
             unit="s",

@@ -5,20 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 from pcdata.io.images.stored_faults import RawFaults, count_raw_faults
+from pcdata.validation.capture_check import Check, Explained
 from pcdata.verdicts import Finding, Verdict
 
 
-def raw_value_checks(paths: Sequence[Path]) -> list[Finding]:
-    """Judge the stored values of every view: NaN and infinity warn, as programs differ on them; negative depth fails.
+class RawValues(Check):
+    """NaN and infinity warn, as programs differ on them; negative depth fails."""
 
-    Raises:
-        CaptureError: a file is missing, damaged, or not a depth image.
-    """
-    if len(paths) == 1:
-        return [_judged_file(paths[0])]
-    return [replace(_judged_file(path), view=view) for view, path in enumerate(paths)]
+    question = "Which stored values are no depth, before a reader cleans them?"
+    findings: ClassVar = {
+        "raw_values": Explained(
+            "share of stored values that are NaN, infinite or negative, before the reader cleans them",
+            "0",
+            "any negative",
+            "NaN and infinity only warn: readers differ on them. 16-bit images cannot hold any",
+        )
+    }
+
+    def files(self, depth: Sequence[Path]) -> list[Finding]:
+        """Judge every file.
+
+        Raises:
+            CaptureError: a file is missing, damaged, or not a depth image.
+        """
+        if len(depth) == 1:
+            return [_judged_file(depth[0])]
+        return [replace(_judged_file(path), view=view) for view, path in enumerate(depth)]
 
 
 def _judged_file(path: Path) -> Finding:

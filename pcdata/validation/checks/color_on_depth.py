@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 from pcdata.structures import DepthFrame
+from pcdata.validation.capture_check import Check, Explained
 from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.edge_offset import (
     SHIFT_LIMIT,
@@ -17,14 +21,48 @@ from pcdata.verdicts import Finding, Verdict
 NAME = "color_registration"
 
 
-def frame_votes(frame: DepthFrame) -> list[EdgeVotes]:
-    """Return every view's votes for the offset between colour and depth; none where there is no colour."""
-    if frame.colors is None:
-        return []
-    return [edge_votes(depth, colors) for depth, colors in zip(frame.depth, frame.colors)]
+class ColorOnDepth(Check):
+    """The shift between colour and depth at the rims of near surfaces, in each capture and in all together."""
+
+    question = "Does the colour image lie on the depth image?"
+    findings: ClassVar = {
+        NAME: Explained(
+            "shift between colour and depth at the rims of near surfaces, in pixels",
+            "{0.color_shift:g}",
+            "above {0.color_shift:g} beyond doubt",
+            "halfway between registered and off by 3 pixels",
+        )
+    }
+
+    def __init__(self, limits: CaptureLimits) -> None:
+        super().__init__(limits)
+        self._votes: list[EdgeVotes] = []  # by view, summed over the captures
+        self._voted = 0
+
+    def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
+        """Judge every view that has colour."""
+        if frame.colors is None:
+            return []
+        votes = [edge_votes(depth, colors) for depth, colors in zip(frame.depth, frame.colors)]
+        self._add(votes)
+        return [_judged(one, self.limits, view) for view, one in enumerate(votes)]
+
+    def whole(self) -> list[Finding]:
+        """Judge the votes of two captures or more."""
+        return [_judged(one, self.limits, view) for view, one in enumerate(self._votes) if self._voted > 1]
+
+    def _add(self, votes: list[EdgeVotes]) -> None:
+        """Add up the votes, of captures with equal numbers of views and resolution."""
+        if not self._votes:
+            self._votes = votes
+        elif [one.scale for one in votes] == [one.scale for one in self._votes]:
+            self._votes = [total + one for total, one in zip(self._votes, votes)]
+        else:
+            return
+        self._voted += 1
 
 
-def registration_check(votes: EdgeVotes, limits: CaptureLimits, view: int) -> Finding:
+def _judged(votes: EdgeVotes, limits: CaptureLimits, view: int) -> Finding:
     """Judge the shift between colour and depth at the rims of near surfaces.
 
     It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it and one of 3

@@ -1,0 +1,137 @@
+"""Laws of every check in the registry: it says what it asks, in words of its own findings, and never ends the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from pcdata import import_file, validate_source
+from pcdata.errors import ConfigError, ShapeError
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms import Deproject
+from pcdata.validation import CHECKS, CaptureLimits, Check, Explained, register_check
+from pcdata.validation.page import checks_table
+from pcdata.verdicts import Finding, Verdict
+from tests.validation.captures import Frames, scene
+
+DOCS = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
+
+
+@cache
+def captures() -> dict[str, DepthFrame | PointCloud]:
+    """Good ones, and others that leave nothing to measure."""
+    two, one = scene(num_views=2).frame, scene(num_views=1).frame
+    cloud = Deproject()(one)
+    none = PointCloud(points=torch.zeros(0, 3), ptr=torch.tensor([0, 0]), frame_id="camera")
+    return {
+        "two views": two,
+        "one view": one,
+        "no reading": replace(two, depth=torch.zeros_like(two.depth)),
+        "bare": replace(one, colors=None, world_from_camera=None, frame_id=None),
+        "cloud": cloud,
+        "cloud without points": none,
+    }
+
+
+def findings(check: Check) -> Iterator[Finding]:
+    """What it says of the captures one after another, twice where it compares, and then of all."""
+    for capture in captures().values():
+        for _ in range(1 + check.compares):
+            yield from check.cloud(capture, []) if isinstance(capture, PointCloud) else check.frame(capture, [])
+    yield from check.whole()
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_a_check_says_what_it_declares_and_gives_advice_for_what_does_not_pass(name):
+    check = CHECKS[name]
+    assert check.question.endswith("?")
+    assert (check.__doc__ or "").strip()
+    for finding in findings(check(CaptureLimits())):
+        assert finding.name in check.findings
+        assert finding.found
+        assert bool(finding.advice) == (finding.verdict is not Verdict.PASS), finding
+        if finding.value is not None and finding.verdict is not Verdict.UNKNOWN:
+            assert finding.threshold is not None, "a number without its limit"
+
+
+def test_every_finding_is_declared_by_one_question():
+    names = [name for check in CHECKS.values() if not check.compares for name in check.findings]
+    assert len(names) == len(set(names))
+
+
+def test_the_page_tells_what_the_checks_say():
+    assert checks_table() in DOCS
+
+
+def test_what_a_check_cannot_measure_is_unknown_and_the_others_go_on():
+    class Refuses(Check):
+        """Cannot measure."""
+
+        question = "Is it?"
+        findings = {"refuses": Explained("", "", "", "")}
+
+        def frame(self, frame, before):
+            raise ShapeError("no such thing here")
+
+    register_check(Refuses)
+    try:
+        (report,) = list(validate_source(Frames([replace(scene(num_views=1).frame, sample_id="a")])))
+    finally:
+        del CHECKS["Refuses"]
+    found = {finding.name: finding for finding in report.findings}
+    assert found["refuses"].verdict is Verdict.UNKNOWN
+    assert "no such thing here" in found["refuses"].found
+    assert found["refuses"].advice
+    assert found["valid_fraction"].verdict is Verdict.PASS
+
+
+OWN = '''
+from pcdata.validation import Check, Explained, register_check
+from pcdata.verdicts import graded
+
+@register_check
+class Farthest(Check):
+    """The farthest reading."""
+    question = "How far is the farthest reading?"
+    findings = {"farthest": Explained("metres", "3", "never", "the room ends there")}
+    def frame(self, frame, before):
+        far = float(frame.depth.max())
+        return [graded("farthest", far, (3.0, None), found=f"{far:.2f} m", advice="close the door", unit="m")]
+'''
+
+
+def test_a_check_of_ones_own_comes_from_a_file_and_a_broken_file_leaves_none(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    import_file(tmp_path / "own.py")
+    try:
+        (report,) = list(validate_source(Frames([replace(scene(num_views=1).frame, sample_id="a")])))
+        assert [finding.verdict for finding in report.findings if finding.name == "farthest"] == [Verdict.WARN]
+        (tmp_path / "other.py").write_text(OWN.replace("the room", "a room"))
+        with pytest.raises(ConfigError, match="a check called Farthest is registered already"):
+            import_file(tmp_path / "other.py")
+    finally:
+        del CHECKS["Farthest"]
+    (tmp_path / "broken.py").write_text(OWN.replace("Farthest", "Broken") + "\nraise RuntimeError('no')\n")
+    with pytest.raises(ConfigError, match="cannot be run"):
+        import_file(tmp_path / "broken.py")
+    assert "Broken" not in CHECKS
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({}, "question must be a text"),
+        ({"question": "?"}, "findings must be a mapping"),
+        ({"question": "?", "findings": {"x": "y"}}, "Explained"),
+        ({"question": "?", "findings": {"x": Explained("", "", "", "")}}, "judges nothing"),
+    ],
+)
+def test_a_check_that_does_not_say_what_it_does_is_refused(fields, words):
+    with pytest.raises(ConfigError, match=words):
+        register_check(type("Bare", (Check,), fields))
+    assert "Bare" not in CHECKS
