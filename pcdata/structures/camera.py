@@ -45,7 +45,7 @@ class Camera(Structure):
         )
         # The class is frozen; a list would never equal the size of an image.
         object.__setattr__(self, "size", tuple(self.size))
-        if len(self.size) != 2 or not all(isinstance(side, int) and side >= 1 for side in self.size):
+        if [type(side) for side in self.size] != [int, int] or min(self.size) < 1:
             raise CaptureError(f"Camera: size must be (height, width) of at least one pixel, got {self.size}")
         if self.num_views < 1:
             raise ShapeError("Camera: intrinsics must describe at least one view, got shape (0, 3, 3)")
@@ -154,7 +154,7 @@ def _check_intrinsics(view: int, k: list[list[float]], size: tuple[int, int], *,
     """Refuse matrices that cannot be the intrinsics of this image."""
     fx, fy, cx, cy = k[0][0], k[1][1], k[0][2], k[1][2]
     where = f"Camera: intrinsics of view {view}"
-    if not all(math.isfinite(value) for row in k for value in row) or k[2] != [0.0, 0.0, 1.0] or k[1][0] != 0.0:
+    if not all(map(math.isfinite, (*k[0], *k[1], *k[2]))) or k[2] != [0.0, 0.0, 1.0] or k[1][0] != 0.0:
         raise IntrinsicsError(f"{where} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k}")
     if fx <= 0 or fy <= 0:
         raise IntrinsicsError(

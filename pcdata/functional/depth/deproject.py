@@ -147,7 +147,7 @@ def pixel_rays(
     """
     _check_camera("pixel_rays", intrinsics, distortion)
     height, width = size
-    fx, skew, cx, fy, cy = (value[:, None, None] for value in _pinhole(intrinsics))
+    fx, skew, cx, fy, cy = _pinhole(intrinsics[:, :, :, None, None])
     u = torch.arange(width, dtype=torch.float64, device=intrinsics.device)
     v = torch.arange(height, dtype=torch.float64, device=intrinsics.device)[:, None]
     y = ((v - cy) / fy).expand(-1, -1, width)

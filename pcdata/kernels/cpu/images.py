@@ -155,7 +155,7 @@ class _Cameras:
         ]
         copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
         points, pixel_index, rgb, *rows = room_for(*core, *copied)
-        pixel_bytes = numbers(image.nbytes // self.depth.numel() for image in sources.values())
+        pixel_bytes = numbers([image.nbytes // self.depth.numel() for image in sources.values()])
         call(
             "pc_deproject",
             *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),

@@ -80,7 +80,7 @@ def call(function: str, *arguments: Any) -> None:
     polls = _polls(raised)
     next(polls)
     context = _Context(core_threads(), _Poll(polls.__next__))
-    status = getattr(library(), function)(ctypes.byref(context), *map(_argument, arguments))
+    status = getattr(library(), function)(ctypes.byref(context), *_arguments(arguments))
     if raised:
         raise raised[0]
     if status == _OUT_OF_MEMORY:
@@ -93,9 +93,12 @@ def call(function: str, *arguments: Any) -> None:
 
 def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
     """Return uninitialised memory for results of these shapes; if large, in huge pages where the system has them."""
-    rooms = [room(shape, dtype) for shape, dtype in results]
-    if sum(one.nbytes for one in rooms) >= _LARGE:
-        call("pc_advise_huge_pages", len(rooms), addresses(rooms), numbers(one.nbytes for one in rooms))
+    rooms, sizes = [], []
+    for shape, dtype in results:
+        rooms.append(torch.empty(tuple(shape), dtype=dtype, device="cpu"))
+        sizes.append(rooms[-1].nbytes)
+    if sum(sizes) >= _LARGE:
+        call("pc_advise_huge_pages", len(rooms), addresses(rooms), numbers(sizes))
     return rooms
 
 
@@ -111,25 +114,34 @@ def numbers(values: Iterable[int]) -> Tensor:
 
 def addresses(tensors: Iterable[Tensor]) -> Tensor:
     """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
-    return numbers(address(one) for one in tensors)
+    return torch.tensor(_pointers(tensors), dtype=torch.int64, device="cpu")
 
 
 # Where an empty tensor "lies": no tensor may look like one that was not given, and nothing is read or written here.
 _EMPTY = ctypes.create_string_buffer(64)
+_NOWHERE = ctypes.addressof(_EMPTY)
 
 
 def address(tensor: Tensor) -> int:
-    """Return where the tensor lies in memory, never 0.
+    """Return where a tensor lies in memory, never 0; keep it alive meanwhile."""
+    return _pointers([tensor])[0]
+
+
+def _pointers(tensors: Iterable[Tensor]) -> list[int]:
+    """Return where tensors lie in memory, never 0.
 
     Raises:
-        ValueError: it is not contiguous or not in the memory of the CPU; the core would read or write astray.
+        ValueError: one is not contiguous or not in the memory of the CPU; the core would read or write astray.
     """
-    if not tensor.is_contiguous() or tensor.device.type != "cpu":
-        raise ValueError(
-            f"the compiled core takes contiguous tensors in the memory of the CPU, not one of shape "
-            f"{tuple(tensor.shape)} with strides {tensor.stride()} on {tensor.device}; please report this"
-        )
-    return tensor.data_ptr() or ctypes.addressof(_EMPTY)
+    found = []
+    for tensor in tensors:
+        if not tensor.is_contiguous() or not tensor.is_cpu:
+            raise ValueError(
+                f"the compiled core takes contiguous tensors in the memory of the CPU, not one of shape "
+                f"{tuple(tensor.shape)} with strides {tensor.stride()} on {tensor.device}; please report this"
+            )
+        found.append(tensor.data_ptr() or _NOWHERE)
+    return found
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:
@@ -149,14 +161,20 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
             stop = 1
 
 
-def _argument(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return ctypes.c_void_p(address(value))
-    if isinstance(value, float):
-        return ctypes.c_double(value)
-    if value is None:
-        return ctypes.c_void_p(None)
-    return ctypes.c_int64(int(value))
+def _arguments(values: Sequence[Any]) -> list[Any]:
+    """Return values as ctypes passes them; in one loop, as a kernel has up to twenty."""
+    pointers = iter(_pointers([value for value in values if isinstance(value, Tensor)]))
+    passed: list[Any] = []
+    for value in values:
+        if isinstance(value, Tensor):
+            passed.append(ctypes.c_void_p(next(pointers)))
+        elif isinstance(value, float):
+            passed.append(ctypes.c_double(value))
+        elif value is None:
+            passed.append(ctypes.c_void_p(None))
+        else:
+            passed.append(ctypes.c_int64(int(value)))
+    return passed
 
 
 def _folder() -> Path:

@@ -28,7 +28,7 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     """Copy the rows of all fields piece by piece."""
     sources = list(fields.values())
     num_rows = len(sources[0]) if sources and sources[0].ndim else 0
-    if num_rows == 0 or rows.ndim != 1 or not all(_is_plain(field) and len(field) == num_rows for field in sources):
+    if num_rows == 0 or rows.ndim != 1 or not _are_plain(sources, num_rows):
         return _reference("pick_rows", fields, rows)
     if rows.dtype is torch.bool and len(rows) == num_rows:
         return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
@@ -59,14 +59,17 @@ def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
 def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
     sources = [field.contiguous() for field in fields]
-    picked = room_for(*(((count, *field.shape[1:]), field.dtype) for field in fields))
-    return sources, picked, numbers(field.nbytes // len(field) for field in sources)
+    picked = room_for(*[((count, *field.shape[1:]), field.dtype) for field in fields])
+    return sources, picked, numbers([field.nbytes // field.shape[0] for field in sources])
 
 
-def _is_plain(field: Tensor) -> bool:
-    """Whether a row is its bytes."""
-    plain = field.layout is torch.strided and field.device.type == "cpu" and field.ndim > 0
-    return plain and not field.is_conj() and not field.is_neg()
+def _are_plain(fields: Sequence[Tensor], num_rows: int) -> bool:
+    """Whether rows are their bytes, and so many in every field."""
+    for field in fields:
+        strided = field.layout is torch.strided and field.is_cpu and field.ndim > 0
+        if not strided or field.shape[0] != num_rows or field.is_conj() or field.is_neg():
+            return False
+    return True
 
 
 @kernel("join_rows", "cpu")
@@ -97,8 +100,11 @@ def _counts_of_equal_parts(parts: Mapping[str, Sequence[Tensor]]) -> list[int] |
     counts = [len(part) if part.ndim else -1 for part in fields[0]]
     for field in fields:
         kind = field[0].dtype, field[0].shape[1:]
-        if [len(part) if _is_plain(part) and (part.dtype, part.shape[1:]) == kind else -1 for part in field] != counts:
+        if len(field) != len(counts):
             return None
+        for part, count in zip(field, counts):
+            if part.ndim == 0 or (part.dtype, part.shape[1:]) != kind or not _are_plain((part,), count):
+                return None
     return counts
 
 
