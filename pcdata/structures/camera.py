@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
-from pcdata.structures.structure import Structure
+from pcdata.structures.structure import Structure, derived
 
 # Of the side of an image: principal points of depth cameras lie nearer to its middle, those of another size do not.
 MOST_OFF_CENTER = 0.075
@@ -92,7 +92,7 @@ class Camera(Structure):
         check_view("Camera", index, self.num_views)
         keep = slice(index, index + 1)
         distortion = None if self.distortion is None else self.distortion[keep]
-        return replace(self, intrinsics=self.intrinsics[keep], distortion=distortion)
+        return derived(self, intrinsics=self.intrinsics[keep], distortion=distortion)
 
     def resized(self, size: tuple[int, int]) -> Camera:
         """Return the camera of the same image sampled at another (height, width).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -192,7 +192,7 @@ class DepthFrame(Structure):
         check_view("DepthFrame", index, self.num_views)
         keep = slice(index, index + 1)
         images = {name: None if image is None else image[keep] for name, image in self._tensors().items()}
-        return replace(self, camera=self.camera.view(index), **images)  # type: ignore[arg-type]
+        return derived(self, camera=self.camera.view(index), **images)
 
     def masked(self, *, near: float | None = None, far: float | None = None, mask: Tensor | None = None) -> DepthFrame:
         """Return the frame with "no reading" wherever depth is not in [near, far] or ``mask`` (V, H, W) is False."""

@@ -160,10 +160,23 @@ def fillers(fields: Mapping[str, Tensor], kinds: Mapping[str, Kind]) -> dict[str
 
 def moved(fields: Mapping[str, Tensor], kinds: Mapping[str, Kind], ptr: Tensor, matrix: Tensor) -> dict[str, Tensor]:
     """Move the rows of all fields by one affine (B, 4, 4) float64 matrix per cloud, each as its kind says."""
-    return {name: KINDS[kind_of(name, kinds)].move(rows, ptr, matrix) for name, rows in fields.items()}
+    result = {}
+    for name, rows in fields.items():
+        row = KINDS[FIELDS[name].kind if name in FIELDS else kinds[name]]
+        result[name] = rows if row.move is _stays else row.move(rows, ptr, matrix)
+    return result
 
 
 def attributes(rows: Mapping[str, Tensor]) -> dict[str, Any]:
     """Return fields by name as a cloud holds them: those of :data:`FIELDS` as attributes, the others in ``extra``."""
-    own = {name: value for name, value in rows.items() if name in FIELDS}
-    return {**own, "extra": {name: value for name, value in rows.items() if name not in FIELDS}}
+    own: dict[str, Any] = {"extra": {}}
+    for name, value in rows.items():
+        (own if name in FIELDS else own["extra"])[name] = value
+    return own
+
+
+def present_fields(clouds: Any) -> dict[str, Tensor]:
+    """Return the per-point fields that clouds have, by name: the inverse of :func:`attributes`."""
+    held = vars(clouds)
+    fields = {name: held[name] for name in FIELDS if held[name] is not None}
+    return {**fields, **held["extra"]}

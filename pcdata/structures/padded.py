@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
-from pcdata.structures.kinds import FIELDS, METRE, attributes, moved
+from pcdata.structures.kinds import METRE, attributes, moved, present_fields
 from pcdata.structures.structure import derived
 
 
@@ -49,8 +49,7 @@ class PaddedClouds(CloudBatch):
 
     def fields(self) -> dict[str, Tensor]:
         """Return every per-point field that is present, (B, M, ...), by name; extra fields included."""
-        core = {name: getattr(self, name) for name in FIELDS}
-        return {name: value for name, value in core.items() if value is not None} | dict(self.extra)
+        return present_fields(self)
 
     def to_frame(self, frame: str) -> PaddedClouds:
         """Return the clouds in another frame that they know, in metres; padding stays as it is.

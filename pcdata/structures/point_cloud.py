@@ -19,7 +19,7 @@ from pcdata.structures.cloud_batch import CloudBatch, Step, joined_facts
 from pcdata.structures.cloud_checks import check_cloud
 from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
-from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved
+from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
 from pcdata.structures.structure import derived
@@ -60,10 +60,10 @@ class PointCloud(CloudBatch):
 
     def _fill_defaults(self) -> None:
         fill = object.__setattr__  # the class is frozen
-        check_tensors("PointCloud", {"points": self.points}, {"points": "N 3"}, check_values=False)
         given: dict[str, Any] = vars(self)  # as the caller left it, whatever the annotations promise
-        if given["points"] is None:
-            raise DTypeError("PointCloud: points must be a float32 (N, 3) tensor, not None")
+        if not isinstance(given["points"], Tensor):
+            found = type(given["points"]).__name__
+            raise DTypeError(f"PointCloud: points must be a torch.Tensor, float32 (N, 3), not {found}")
         if given["ptr"] is None:
             fill(self, "ptr", torch.tensor([0, len(self.points)], dtype=torch.int64, device=self.points.device))
         num_clouds = len(self.ptr) - 1
@@ -74,9 +74,9 @@ class PointCloud(CloudBatch):
                 torch.eye(4, dtype=torch.float64, device="cpu").repeat(num_clouds, 1, 1).to(self.device),
             )
         fill(self, "source_frame", self.source_frame or self.frame_id)
-        fill(self, "meta", tuple(self.meta) or tuple({} for _ in range(num_clouds)))
-        fill(self, "history", tuple(tuple(steps) for steps in self.history) or ((),) * num_clouds)
-        fill(self, "kinds", {name: Kind(kind) for name, kind in self.kinds.items()})
+        fill(self, "meta", tuple(self.meta) or tuple([{} for _ in range(num_clouds)]))
+        fill(self, "history", tuple(map(tuple, self.history)) or ((),) * num_clouds)
+        fill(self, "kinds", dict(zip(self.kinds, map(Kind, self.kinds.values()))))
 
     @classmethod
     def from_numpy(
@@ -140,8 +140,7 @@ class PointCloud(CloudBatch):
 
     def fields(self) -> dict[str, Tensor]:
         """Return every per-point field that is present, by name; extra fields included."""
-        core = {name: getattr(self, name) for name in FIELDS}
-        return {name: value for name, value in core.items() if value is not None} | dict(self.extra)
+        return present_fields(self)
 
     def image_grid(self) -> ImageGrid | None:
         """Where the points sit in their depth images, for the operations' ``grid=``; None once they left them."""
@@ -185,11 +184,11 @@ class PointCloud(CloudBatch):
 
     def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
         """Merge one mapping of JSON-able findings into the meta of each cloud."""
-        return derived(self, meta=tuple({**old, **new} for old, new in zip(self.meta, entries, strict=True)))
+        return derived(self, meta=tuple([{**old, **new} for old, new in zip(self.meta, entries, strict=True)]))
 
     def with_steps(self, steps: Sequence[Step]) -> PointCloud:
         """Add one JSON-able step to the history of each cloud."""
-        return derived(self, history=tuple((*old, new) for old, new in zip(self.history, steps, strict=True)))
+        return derived(self, history=tuple([(*old, new) for old, new in zip(self.history, steps, strict=True)]))
 
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.

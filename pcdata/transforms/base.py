@@ -129,7 +129,7 @@ class Transform(nn.Module):
 
     def config_fields(self) -> dict[str, Any]:
         """Return the fields by name, as they were given."""
-        return {name: getattr(self, name) for name in field_names(type(self))}
+        return {name: getattr(self, name) for name in field_names(type(self))}  # type: ignore[arg-type]
 
     def to_config(self) -> dict[str, dict[str, Any]]:
         """Return ``{name: fields}`` with plain values, the form that YAML holds."""
@@ -250,7 +250,7 @@ def unit_advice(step: Transform) -> str:
     if step.unit_needed() != METRE:
         return "put it after normalising, or leave unit out and give metres"
     own = ", or say unit: normalized if the length is meant in the normalised cloud"
-    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"
+    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"  # type: ignore[arg-type]
 
 
 def num_clouds(data: Data) -> int:

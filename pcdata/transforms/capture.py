@@ -8,13 +8,13 @@ are those of the single steps, bit for bit; and whatever they would refuse is le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
 from pcdata.errors import PcdataError
 from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.structure import derived
 from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
@@ -40,9 +40,11 @@ def find_capture(steps: Sequence[Transform]) -> slice | None:
 
 def run_capture(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
     """Run the steps that :func:`find_capture` found; None where they must be run one by one."""
-    watched = any(step._forward_hooks or step._forward_pre_hooks for step in steps)
-    if watched or not isinstance(frame, DepthFrame):
+    if not isinstance(frame, DepthFrame):
         return None
+    for step in steps:
+        if step._forward_hooks or step._forward_pre_hooks:  # somebody watches it
+            return None
     try:
         return _run(steps, frame)
     except PcdataError:
@@ -51,7 +53,7 @@ def run_capture(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
 
 def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     by_type = {type(step): step for step in steps}
-    mask, deproject, move, crop = (by_type.get(kind) for kind in (MaskDepth, Deproject, ToFrame, CropWorkspace))
+    mask, deproject, move, crop = map(by_type.get, (MaskDepth, Deproject, ToFrame, CropWorkspace))
     assert isinstance(deproject, Deproject)
     assert isinstance(crop, CropWorkspace)
     near = far = region = None
@@ -83,7 +85,7 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     if done is None:
         return None
     made, readings = done
-    cloud = replace(
+    cloud = derived(
         moved,
         points=made.points,
         ptr=made.ptr,

@@ -144,4 +144,4 @@ def _place(
     if not path or str(path[0]) not in entries:
         return fields_node if fields_node is not None and fields_node.value else name_node
     key, value = entries[str(path[0])]
-    return key if path[0] not in field_names(cls) else node_at(value, path[1:])
+    return key if path[0] not in field_names(cls) else node_at(value, path[1:])  # type: ignore[arg-type]

@@ -96,8 +96,8 @@ class Deproject(Transform):
 
     def cameras_of(self, data: DepthFrame) -> tuple[Tensor, Tensor | None]:
         """Return the intrinsics (V, 3, 3) and distortion (V, D) where the depth lies."""
-        camera = data.camera.to(data.device)
-        return camera.intrinsics, camera.distortion
+        lens = data.camera.distortion
+        return data.camera.intrinsics.to(data.device), None if lens is None else lens.to(data.device)
 
     def images_of(self, data: DepthFrame) -> dict[str, Tensor]:
         """Return the images that become per-point fields as they are."""

@@ -14,9 +14,10 @@ from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.fields import LengthIn
 
 
-def field_names(cls: type) -> list[str]:
+@functools.cache
+def field_names(cls: type) -> tuple[str, ...]:
     """Return the names of the declared fields, in order."""
-    return [f.name for f in dataclasses.fields(cls)]
+    return tuple(f.name for f in dataclasses.fields(cls))
 
 
 @functools.cache

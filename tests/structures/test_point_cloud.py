@@ -55,7 +55,7 @@ GOOD = {"points": torch.zeros(N, 3), "ptr": torch.tensor([0, 1, N]), "frame_id":
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ({"points": None}, DTypeError, "points must be a float32"),
+        ({"points": None}, DTypeError, "points must be a torch.Tensor"),
         ({"points": [[0.0, 0.0, 0.0]]}, DTypeError, "points must be a torch.Tensor"),
         ({"points": torch.zeros(N, 3).double()}, DTypeError, "points must be float32"),
         ({"points": torch.zeros(N, 2)}, ShapeError, r"points must be float32 \(N, 3\)"),
