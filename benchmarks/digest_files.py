@@ -25,7 +25,6 @@ from digest_names import (
     Camera,
     CaptureCamera,
     Evidence,
-    TemporalFilterDepth,
     TemporallyFilteredSource,
     TSDFVolume,
     build,
@@ -86,7 +85,7 @@ def _real_readers(root: Path) -> Iterator[Case]:
 
 
 def _filtered(source: Any) -> Any:
-    return TemporallyFilteredSource(source=source, filter=TemporalFilterDepth())
+    return TemporallyFilteredSource(source=source)
 
 
 def _first(count: int) -> Any:

@@ -16,7 +16,7 @@ from typing import Any
 
 from pcdata.errors import ConfigError, PcdataError
 from pcdata.files.opening import read_bytes
-from pcdata.io.sources.registry import LAYOUTS
+from pcdata.io.sources.registry import COMBINATORS, LAYOUTS
 from pcdata.registry import registries
 from pcdata.transforms.base import REGISTRY
 
@@ -31,6 +31,7 @@ class ImportedFile:
     sha256: str
     transforms: tuple[str, ...]  # that it defines
     layouts: tuple[str, ...]
+    combinators: tuple[str, ...] = ()
     path: str = field(repr=False, default="")
     content: bytes = field(repr=False, default=b"")
 
@@ -40,7 +41,7 @@ class ImportedFile:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a dataset remembers: no folder, no content."""
-        named = {"transforms": list(self.transforms), "layouts": list(self.layouts)}
+        named = {name: list(getattr(self, name)) for name in ("transforms", "layouts", "combinators")}
         return {"file": self.name, "sha256": self.sha256, **named}
 
 
@@ -48,7 +49,7 @@ _FILES: dict[str, ImportedFile] = {}  # by the hash of the content, in the order
 
 
 def import_file(path: str | os.PathLike[str]) -> ImportedFile:
-    """Run a Python file once, so that the transforms and layouts that it defines are known by their names.
+    """Run a Python file once, so that the transforms, layouts and combinators that it defines are known by name.
 
     It runs as a private module, with every right that you have; ``sys.path`` stays as it is. The same content is not
     run again. Workers of a ``DataLoader`` run it too, however they are started.
@@ -91,9 +92,10 @@ def _imported(path: str, content: bytes) -> ImportedFile:
             said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             raise ConfigError(f"import {path}:{_line(error, path)} it cannot be run: {said}") from error
         raise
-    transforms = REGISTRY.names_from(module.__name__)
-    layouts = LAYOUTS.names_from(module.__name__)
-    _FILES[digest] = ImportedFile(os.path.basename(path), digest, transforms, layouts, path, content)
+    transforms, layouts, combinators = (
+        registry.names_from(module.__name__) for registry in (REGISTRY, LAYOUTS, COMBINATORS)
+    )
+    _FILES[digest] = ImportedFile(os.path.basename(path), digest, transforms, layouts, combinators, path, content)
     return _FILES[digest]
 
 

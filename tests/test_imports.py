@@ -172,6 +172,7 @@ def test_a_dataset_remembers_name_and_hash_of_the_files_that_it_needs(tmp_path, 
         "sha256": imports.hashlib.sha256(STEP.encode()).hexdigest(),
         "transforms": ["OwnThird"],
         "layouts": [],
+        "combinators": [],
     }
     assert str(tmp_path) not in (dataset / FILE_NAME).read_text() + (dataset / "load.py").read_text()
 

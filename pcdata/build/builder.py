@@ -101,7 +101,11 @@ def build_dataset(
             config.pipeline.to_config()
         )
         kinds = {*kinds_of(source)}
-        imports = [file for file in imported_files() if steps & {*file.transforms} or kinds & {*file.layouts}]
+        imports = [
+            file
+            for file in imported_files()
+            if steps & {*file.transforms} or kinds & {*file.layouts, *file.combinators}
+        ]
         samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -111,6 +115,7 @@ def build_dataset(
             samples=samples,
             skipped=report.skipped,
             model=_model_of(config),
+            source={**getattr(source, "opened", {}), **({"skip_refused": True} if skip_refused else {})},
             imports=[file.to_json() for file in imports],
             versions={
                 "pcdata": pcdata.__version__,

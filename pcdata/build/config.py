@@ -13,12 +13,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pcdata.build.model_section import preset_of_section, with_model
 from pcdata.build.source_section import SourceSettings, source_settings
 from pcdata.errors import ConfigError, near_matches
+from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
 from pcdata.models import Preset
 from pcdata.transforms.config import read_config
 from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
 from pcdata.transforms.sensor_words import SENSOR
-from pcdata.yaml_nodes import YamlDocument, node_at
+from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
 
 Collate = Literal["packed", "padded", "fixed"]
 
@@ -82,6 +83,9 @@ _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 def load_config(path: str | Path) -> BuildConfig:
     """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 
+    The folder of a built dataset stands for the configuration that builds it again: its steps, its storage and how its
+    captures were read, without their place.
+
     ``source`` says where the captures are, how they are read and which are left out; paths in it start from the folder
     of the file.
 
@@ -92,7 +96,10 @@ def load_config(path: str | Path) -> BuildConfig:
 
     Raises:
         ConfigError: every fault, as ``file:line:column: what``.
+        CacheError: the dataset's ``dataset.json`` is damaged.
     """
+    if (Path(path) / FILE_NAME).is_file():
+        return _config_of_dataset(Path(path))
     return config_from_yaml(read_config(path), name=str(path), folder=Path(path).parent)
 
 
@@ -119,6 +126,22 @@ def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = N
     made = preset_of_section(document, entries)
     config = BuildConfig(pipeline_from_document(document, entries), settings["output"], settings["loader"], source)
     return config if made is None else config.for_model(made)
+
+
+def _config_of_dataset(folder: Path) -> BuildConfig:
+    manifest = Manifest.read(folder)
+    model = {"name": manifest.model["name"], **manifest.model["choices"]} if manifest.model else None
+    output = {
+        "format": manifest.format,
+        "compression": manifest.compression,
+        "keep_raw": (folder / "raw").is_dir(),
+    }
+    common = {"source": dict(manifest.source), "output": output}
+    name = str(folder / FILE_NAME)
+    config = config_from_yaml(yaml_text({**common, **({"model": model} if model else manifest.pipeline)}), name=name)
+    if model and config.pipeline.to_config() != manifest.pipeline:  # the steps of the model were changed by hand
+        config = config_from_yaml(yaml_text({**common, **manifest.pipeline}), name=name)
+    return replace(config, source=replace(config.source, path=None, by_name=True))
 
 
 def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | None) -> Any:

@@ -1,8 +1,7 @@
-"""The section ``source`` of a configuration: where the captures are, how they are read, and which are left out."""
+"""The section ``source`` of a configuration: where the captures are, how they are read, and what is made of them."""
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,38 +9,47 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.combine import Selectable
 from pcdata.io.sources.opening import open_source, read_skip_file
-from pcdata.io.sources.registry import LAYOUTS
-from pcdata.io.sources.temporal import TemporallyFilteredSource
+from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, OPENING, checked_fields, options_of
 from pcdata.yaml_nodes import YamlDocument
 
-_OWN = ("path", "kind", "limit", "skip", "skip_file", "skip_refused", "average", "temporal")
 _FILES = ("path", "calibration", "skip_file")  # relative to the folder of the configuration
 
 
 @dataclass(frozen=True)
 class SourceSettings:
-    """What the section says; the command line may add to it, but not contradict it."""
+    """What the section says; the command line may add to it, but not contradict it.
+
+    Args:
+        path: of the captures, or a pattern; None = the command line says it.
+        kind: the layout; None = found by its signs.
+        only: patterns of the ids that are kept.
+        limit: how many samples are kept.
+        skip: ids that are left out.
+        skip_refused: whether captures that are refused are left out.
+        options: those of the layout's class, and combinators with their fields, in their order.
+        by_name: whether files are known by their names alone, as a dataset remembers them: an argument says the place.
+    """
 
     path: str | None = None
-    kind: str | None = None  # the layout
+    kind: str | None = None
+    only: tuple[str, ...] = ()
     limit: int | None = None
     skip: tuple[str, ...] = ()
     skip_refused: bool = False
-    average: int | None = None  # captures of a still scene that become one; see AveragedSource
-    temporal: int | None = None  # captures that the temporal filter looks at; see TemporallyFilteredSource
-    options: Mapping[str, Any] = field(default_factory=dict)  # those of the layout's class
+    options: Mapping[str, Any] = field(default_factory=dict)
+    by_name: bool = False
 
     def open(
         self,
         path: str | os.PathLike[str] | None = None,
         *,
         kind: str | None = None,
+        only: Sequence[str] = (),
         limit: int | None = None,
         skip: Sequence[str] = (),
-        skip_refused: bool = False,
+        skip_refused: bool | None = False,
         **options: Any,
     ) -> Selectable[Any]:
         """Open the captures.
@@ -49,39 +57,53 @@ class SourceSettings:
         Args:
             path: instead of the path of the section.
             kind: the layout, where the section does not say it.
+            only: patterns of ids to keep, where the section does not say them.
             limit: keep the first so many samples; the smaller of this and the section's counts.
             skip: ids to leave out besides those of the section.
-            skip_refused: load every capture once, and leave out those that are refused.
-            **options: those of the layout's class, besides those of the section.
+            skip_refused: leave out those that are refused. Where captures are combined every one is loaded once for
+                that, since an average would be lost for one bad capture; else the build leaves them out as it goes.
+            **options: those of the layout's class and combinators, besides those of the section.
 
         Raises:
             ConfigError: there is no path, or an option has one value here and another in the section.
             CaptureError: the captures cannot be opened.
         """
-        given = {name: value for name, value in {"kind": kind, **options}.items() if value is not None}
-        stated = {name: value for name, value in {"kind": self.kind, **self.options}.items() if value is not None}
-        for name in given.keys() & stated.keys():
-            if given[name] != stated[name]:
-                raise ConfigError(
-                    f"source: the configuration says {name} {stated[name]!r}, the argument {given[name]!r}; drop one"
-                )
         where = path if path is not None else self.path
         if where is None:
             raise ConfigError("source: nothing says where the captures are; give --source PATH, or source: {path: ...}")
         limits = [number for number in (limit, self.limit) if number is not None]
-        source = open_source(
+        merged = self._merged({"kind": kind, "only": list(only) or None, **options})
+        is_combined = any(name in COMBINATORS for name in merged)
+        return open_source(
             where,
             limit=min(limits, default=None),
             skip=[*dict.fromkeys([*self.skip, *skip])],
-            # An average or a filtered frame would be lost for one bad capture of many.
-            skip_refused=skip_refused or (self.skip_refused and bool(self.average or self.temporal)),
-            **{"kind": None, **stated, **given},
+            skip_refused=is_combined and bool(skip_refused or self.skip_refused),
+            **merged,
         )
-        if self.average is not None:
-            return AveragedSource(source=source, num_frames=self.average)
-        if self.temporal is not None:
-            return TemporallyFilteredSource(source=source, num_frames=self.temporal)
-        return source
+
+    def _merged(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the section and the arguments say together."""
+        merged = {"kind": self.kind, "only": list(self.only) or None, **self.options}
+        merged = {name: value for name, value in merged.items() if value is not None}
+        for name, value in given.items():
+            if value is None:
+                continue
+            stated = merged.get(name, value)
+            if name in COMBINATORS and name in merged:
+                stated, value = checked_fields("source", name, stated), checked_fields("source", name, value)
+                for key in stated.keys() & value.keys():
+                    self._check_agree(f"{name}.{key}", stated[key], value[key])
+                value = {**stated, **value}
+            else:
+                self._check_agree(name, stated, value)
+            merged[name] = value
+        return {"only": (), **merged}
+
+    def _check_agree(self, name: str, stated: Any, given: Any) -> None:
+        if stated == given or (self.by_name and name in ("calibration", "links_to")):
+            return
+        raise ConfigError(f"source: the configuration says {name} {stated!r}, the argument {given!r}; drop one")
 
 
 def source_settings(document: YamlDocument, node: Any, folder: Path | None) -> SourceSettings:
@@ -94,16 +116,22 @@ def source_settings(document: YamlDocument, node: Any, folder: Path | None) -> S
     """
     entries = document.mapping(node, "source")
     values = {key: document.plain(value) for key, (_, value) in entries.items()}
-    options = {name for layout in LAYOUTS.values() for name in inspect.signature(layout).parameters} - {"path"}
-    known = [*_OWN, *sorted(options)]
+    layouts = [LAYOUTS[values["kind"]]] if values.get("kind") in [*LAYOUTS] else [*LAYOUTS.values()]
+    known = list(dict.fromkeys([*OPENING, *COMBINATORS, *(name for layout in layouts for name in options_of(layout))]))
     for key in values:
         if key not in known:
             hint = near_matches(key, known) or f"; known: {', '.join(known)}"
             document.fault(entries[key][0], f"source.{key}: no such setting{hint}")
-        elif key in _OWN and (wrong := _wrong(key, values[key])):
+        elif key in OPENING and (wrong := _wrong(key, values[key])):
             document.fault(entries[key][1], f"source.{key}: {wrong}, got {values[key]!r:.100}")
-    if {"average", "temporal"} <= values.keys():
-        document.fault(entries["temporal"][0], "source: average and temporal both smooth over time; choose one")
+        elif key in COMBINATORS and values[key] not in (None, False):
+            try:
+                checked_fields("source", key, values[key])
+            except ConfigError as error:
+                document.fault(entries[key][1], str(error))
+    twice = [key for key in values if key in COMBINATORS and COMBINATORS[key].over_time and values[key]]
+    if len(twice) > 1:
+        document.fault(entries[twice[1]][0], f"source: {' and '.join(twice)} both smooth over time; choose one")
     if document.faults:
         return SourceSettings()
     for key in _FILES:
@@ -112,22 +140,30 @@ def source_settings(document: YamlDocument, node: Any, folder: Path | None) -> S
     skip = list(values.pop("skip", None) or ())
     skip_file = values.pop("skip_file", None)
     skip += read_skip_file(skip_file) if skip_file else []
-    own = {key: value for key in _OWN if (value := values.pop(key, None)) is not None}
-    return SourceSettings(**own, skip=tuple(skip), options=values)
+    only = values.pop("only", None) or ()
+    only = (only,) if isinstance(only, str) else tuple(only)
+    own = {key: value for key in OPENING if (value := values.pop(key, None)) is not None}
+    return SourceSettings(**own, only=only, skip=tuple(skip), options=values)
 
 
 def _wrong(key: str, value: Any) -> str:
     """Say what a setting must be, where it is not."""
     if value is None:
         return ""
-    if key == "kind" and value not in LAYOUTS:
+    if key == "kind" and value not in [*LAYOUTS]:
         return f"must be one of {', '.join(LAYOUTS)}{near_matches(str(value), LAYOUTS)}"
     if key in ("path", "skip_file") and (not isinstance(value, str) or not value):
         return "must be a path"
-    if key in ("limit", "average", "temporal") and (type(value) is not int or value < 1):
+    if key == "limit" and (type(value) is not int or value < 1):
         return "must be a whole number of at least 1"
-    if key == "skip" and (not isinstance(value, list) or not all(isinstance(one, str) for one in value)):
+    if key == "only" and not (isinstance(value, str) and value) and not _is_texts(value):
+        return 'must be a pattern of ids such as "left_*", or a list of them'
+    if key == "skip" and not _is_texts(value):
         return 'must be a list of ids, texts in quotes such as ["0005"]'
     if key == "skip_refused" and not isinstance(value, bool):
         return "must be true or false"
     return ""
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(one, str) for one in value)

@@ -20,7 +20,10 @@ def add_to(commands: Any) -> None:
 
     build = commands.add_parser("build", help="build a dataset from captures")
     build.add_argument(
-        "config", nargs="?", metavar="CONFIG", help="YAML file; see configs/ for examples (default: none, with --model)"
+        "config",
+        nargs="?",
+        metavar="CONFIG",
+        help="YAML file, see configs/; or a dataset, to build it again (default: none, with --model)",
     )
     add_model_options(build, required=False, help="build what a model takes, instead of the steps of CONFIG")
     build.add_argument(
@@ -72,8 +75,10 @@ def _build(arguments: argparse.Namespace) -> None:
     source = config.source.open(
         arguments.source,
         kind=arguments.kind,
+        only=arguments.only or (),
         limit=arguments.limit,
         skip=skip_list(arguments),
+        skip_refused=arguments.skip_refused,
         **given_options(arguments),
     )
     with Progress("build") as progress:

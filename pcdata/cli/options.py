@@ -67,6 +67,10 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
     ),
 }
+_COMBINED = {  # combinator: what its flag makes of N captures; a test holds the table to the registry
+    "averaged": "average every N consecutive captures of a still scene into one",
+    "temporal": "filter each capture with the N - 1 before it",
+}
 _NO_OPTIONS = {  # of opening captures, not of their layout
     "path": "the path itself",
     "kind": "--kind",
@@ -92,8 +96,11 @@ def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: b
         default=[],
         type=name_and_value,
         metavar="NAME=VALUE",
-        help="any option of the layout by its name in Python; repeatable",
+        help="any option of the layout by its name in Python, or a field of a combinator, such as "
+        "averaged.max_jump=0.05; repeatable",
     )
+    for name, told in _COMBINED.items():
+        command.add_argument(f"--{name}", type=positive, metavar="N", help=told)
     add_skip_options(command, can_skip_refused=can_skip_refused)
     add_import_option(command)
 
@@ -106,7 +113,7 @@ def add_import_option(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE.py",
-        help="run this Python file first: transforms and layouts of your own; repeatable",
+        help="run this Python file first: transforms, layouts and combinators of your own; repeatable",
     )
 
 
@@ -134,7 +141,7 @@ def add_skip_options(command: argparse.ArgumentParser, *, can_skip_refused: bool
 
 
 def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a layout that the command line states, by their names in Python.
+    """Return the options of a layout and the combinators that the command line states, by their names in Python.
 
     Raises:
         ConfigError: one is stated twice.
@@ -148,7 +155,16 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
             given[name] = value
     if "folders" in given:
         given["folders"] = {role: folder or None for role, folder in given["folders"]}
+    given |= {name: number for name in _COMBINED if (number := getattr(arguments, name, None)) is not None}
     for name, text in getattr(arguments, "option", []):
+        combinator, dot, inner = name.partition(".")
+        if dot:
+            fields = given.get(combinator, {})
+            fields = dict(fields) if isinstance(fields, dict) else {"num_frames": fields}
+            if inner in fields:
+                raise ConfigError(f"--option {name}: this field is given twice; give it once")
+            given[combinator] = {**fields, inner: value_of(text)}
+            continue
         if name in _NO_OPTIONS:
             raise ConfigError(f"--option {name}: is no option of a layout; say it with {_NO_OPTIONS[name]}")
         if name in given:
@@ -159,15 +175,9 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
     """Return the flags about captures, and those of ``others``, that the command line states."""
-    flags = [
-        "--kind",
-        *(flag for flag, _ in _FLAGS.values()),
-        "--option",
-        "--only",
-        "--skip",
-        "--skip-file",
-        "--skip-refused",
-    ]
+    layout = [flag for flag, _ in _FLAGS.values()]
+    combined = [f"--{name}" for name in _COMBINED]
+    flags = ["--kind", *layout, *combined, "--option", "--only", "--skip", "--skip-file", "--skip-refused"]
     return [flag for flag in (*flags, *others) if getattr(arguments, attribute_of(flag), None)]
 
 

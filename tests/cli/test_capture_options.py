@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ from PIL import Image
 
 from pcdata import open_source
 from pcdata.cli.main import main
-from pcdata.cli.options import _FLAGS, KINDS, add_capture_options, attribute_of, given_options
+from pcdata.cli.options import _COMBINED, _FLAGS, KINDS, add_capture_options, attribute_of, given_options
 from pcdata.errors import CaptureError, ConfigError, PcdataError, UnitError
-from pcdata.io import LAYOUTS, CaptureCamera, read_capture_camera, write_capture_camera
+from pcdata.io import COMBINATORS, LAYOUTS, CaptureCamera, read_capture_camera, write_capture_camera
+from pcdata.io.calibration.capture_camera import _STATED
+from pcdata.io.sources.registry import fields_of, options_of
 
 SIZE = (6, 8)
 
@@ -47,6 +50,7 @@ def test_flags_and_kinds_are_those_of_the_layouts() -> None:
     assert set(_FLAGS) <= options
     assert options - set(_FLAGS) == set(), "give the new option a flag, so that --help tells of it"
     assert tuple(LAYOUTS) == KINDS
+    assert tuple(_COMBINED) == tuple(COMBINATORS), "give the new combinator a flag, so that --help tells of it"
 
 
 def test_every_flag_becomes_the_option_of_python() -> None:
@@ -82,12 +86,48 @@ def test_any_option_can_be_given_by_its_name(capture: Path) -> None:
     assert main(["inspect", str(capture), "--option", "invalid_value=[1]"]) == 2
 
 
+def test_combinators_are_flags_and_their_fields_are_options() -> None:
+    assert given_options(parsed("--averaged", "10", "--option", "averaged.max_jump=0.05")) == {
+        "averaged": {"num_frames": 10, "max_jump": 0.05}
+    }
+    assert given_options(parsed("--temporal", "4")) == {"temporal": 4}
+    assert given_options(parsed("--option", "temporal.alpha=0.2", "--option", "temporal.delta=9")) == {
+        "temporal": {"alpha": 0.2, "delta": 9}
+    }
+    assert given_options(parsed("--option", "temporal=true")) == {"temporal": True}
+    with pytest.raises(ConfigError, match="given twice"):
+        given_options(parsed("--averaged", "10", "--option", "averaged.num_frames=5"))
+
+
+def test_the_page_on_captures_tells_every_layout_option_and_combinator() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
+    rows = {name for line in page.splitlines() if line.startswith("| `") for name in re.findall(r"`([^`]+)`", line)}
+    named = {word for row in rows for word in row.split()}
+    assert {*LAYOUTS, *COMBINATORS, *_FLAGS, *(flag for flag, _ in _FLAGS.values())} <= named
+    for name, combinator in COMBINATORS.items():
+        assert {*fields_of(combinator), f"--{name}"} <= named
+
+
+def test_what_a_capture_may_say_of_itself_is_all_but_where_its_links_lead() -> None:
+    assert set(options_of(LAYOUTS["folder"])) - set(_STATED) == {"links_to"}  # a capture must not open other folders
+    assert set(_STATED) <= set(options_of(LAYOUTS["folder"]))
+
+
 @pytest.mark.parametrize("command", ["inspect", "validate", "build", "export", "calib check"])
 def test_every_command_on_captures_takes_them_and_lists_the_kinds(command: str, capsys) -> None:
     with pytest.raises(SystemExit):
         main([*command.split(), "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    for flag in (*(flag for flag, _ in _FLAGS.values()), "--option", "--skip", "--skip-file", *KINDS):
+    combined = [f"--{name}" for name in _COMBINED]
+    for flag in (
+        *(flag for flag, _ in _FLAGS.values()),
+        *combined,
+        "--option",
+        "--only",
+        "--skip",
+        "--skip-file",
+        *KINDS,
+    ):
         assert flag in text
 
 

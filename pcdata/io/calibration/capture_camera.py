@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,22 @@ from pcdata.files.opening import map_npy, read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.geometry import rigid
+from pcdata.io.sources.folder_roles import check_folders, is_within
 from pcdata.io.sources.option_checks import check_invalid_values
 from pcdata.structures import Camera
 
 _SHOWN = 8  # faults of a file in one message
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("distortion", "metres_per_unit", "depth_encoding", "frame_id", "background_label", "invalid_values")
+_STATED = {  # key: attribute of CaptureCamera; what a capture may say of itself
+    "metres_per_unit": "metres_per_unit",
+    "depth_encoding": "depth_encoding",
+    "frame_id": "frame_id",
+    "background_label": "background_label",
+    "invalid_values": "invalid_values",
+    "calibration": "calibration",
+    "camera": "camera_name",
+    "folders": "folders",
+}
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
 _DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
@@ -47,6 +58,9 @@ class CaptureCamera:
     frame_id: str | None = None  # the frame that the poses beside it lead to; None = the file does not say
     background_label: int | None = None  # what means "no object" in the label images; None = the file does not say
     invalid_values: tuple[int, ...] | None = None  # stored depth besides 0 that is no reading; None = not said
+    calibration: str | None = None  # a calibration file beside it, whose camera counts instead; None = not said
+    camera_name: str | None = None  # which camera of that calibration; None = the only one
+    folders: Mapping[str, str | None] | None = None  # names of the folders by role, where they are not the usual ones
 
 
 def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
@@ -59,8 +73,11 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
 
     The last three are optional, as are ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
     "swapped"), ``background_label``, the id that means "no object", and ``invalid_values``, a list of stored depths
-    besides 0 that mean "no reading"; ``notes``, ``sensor``, ``serial``, ``registered_to`` and ``date`` are free
-    remarks. Any other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
+    besides 0 that mean "no reading"; ``calibration``, a calibration file beside this one whose camera counts instead,
+    ``camera``, its name there, and ``folders``, names of folders by role; ``notes``, ``sensor``, ``serial``,
+    ``registered_to`` and ``date`` are free remarks.
+
+    Any other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
 
     Raises:
         CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.
@@ -73,18 +90,19 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     fx, fy, cx, cy = (_number(where, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
     unit = data.get("metres_per_unit")
     encoding = data.get("depth_encoding")
-    frame_id = data.get("frame_id")
-    if frame_id is not None and (not isinstance(frame_id, str) or not frame_id.strip()):
-        raise CaptureError(f"{where}: 'frame_id' must be a name such as \"base\", got {frame_id!r:.80}")
     background = data.get("background_label")
     if background is not None and not (type(background) is int and 0 <= background <= 65535):
         raise CaptureError(f"{where}: 'background_label' must be an id in 0 .. 65535, got {background!r:.80}")
-    invalid = data.get("invalid_values")
-    if invalid is not None:
-        try:
-            invalid = check_invalid_values(where, invalid)
-        except ConfigError as error:
-            raise CaptureError(str(error)) from error
+    frame_id, camera_name = (_name(where, data, key) for key in ("frame_id", "camera"))
+    calibration = data.get("calibration")
+    if calibration is not None and not is_within(calibration):
+        raise CaptureError(f"{where}: 'calibration' must be the name of a file in this folder, got {calibration!r:.80}")
+    invalid, folders = data.get("invalid_values"), data.get("folders")
+    try:
+        invalid = None if invalid is None else check_invalid_values(where, invalid)
+        folders = None if folders is None else check_folders(where, folders)
+    except ConfigError as error:  # what would be wrong of an argument is wrong in the file
+        raise CaptureError(str(error)) from error
     camera = _camera(
         where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
     )
@@ -95,6 +113,9 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         frame_id=frame_id,
         background_label=background,
         invalid_values=invalid,
+        calibration=calibration,
+        camera_name=camera_name,
+        folders=folders,
     )
 
 
@@ -113,7 +134,7 @@ def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamer
     data |= {"fx": k[0][0], "fy": k[1][1], "cx": k[0][2], "cy": k[1][2]}
     if camera.distortion is not None:
         data["distortion"] = camera.distortion[0].tolist()
-    data |= {name: value for name in _OPTIONAL[1:] if (value := getattr(calibration, name)) is not None}
+    data |= {key: value for key, name in _STATED.items() if (value := getattr(calibration, name)) is not None}
     with replacing(where, path) as temporary:
         temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
@@ -182,7 +203,7 @@ def _camera(where: str, **values: Any) -> Camera:
 
 
 def _check_keys(where: str, data: dict[str, Any]) -> None:
-    known = (*_REQUIRED, *_OPTIONAL, *_REMARKS)
+    known = (*_REQUIRED, "distortion", *_STATED, *_REMARKS)
     faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
     for key in data:
         if key not in known:
@@ -191,6 +212,13 @@ def _check_keys(where: str, data: dict[str, Any]) -> None:
     if faults:
         more = f" and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
         raise CaptureError(f"{where}: {', '.join(faults[:_SHOWN])}{more}")
+
+
+def _name(where: str, data: dict[str, Any], key: str) -> str | None:
+    value = data.get(key)
+    if value is not None and (not isinstance(value, str) or not value.strip()):
+        raise CaptureError(f'{where}: {key!r} must be a name such as "base", got {value!r:.80}')
+    return value
 
 
 def _number(where: str, key: str, value: Any) -> float:

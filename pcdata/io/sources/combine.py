@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Generic, TypeVar
+from types import MappingProxyType
+from typing import Any, ClassVar, Generic, TypeVar
 
 from pcdata.errors import CaptureError, DTypeError, PcdataError, add_note, near_matches
 from pcdata.files.sample_names import check_known, check_text, name_some
@@ -19,6 +20,7 @@ class Selectable(ABC, Generic[Part]):
     """A source of which a part can be taken, as :func:`open_source` returns it."""
 
     kind: ClassVar[str]  # of which layout or combinator it is
+    opened: Mapping[str, Any] = MappingProxyType({})  # what open_source was told, where it returned this very source
 
     @property
     @abstractmethod

@@ -10,12 +10,10 @@ from typing import cast
 
 from torch import Tensor
 
-from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, UnitError
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import positions
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
-from pcdata.io.calibration.calibration_yaml import read_calibration
 from pcdata.io.calibration.capture_camera import read_capture_camera
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.folder_roles import ROLES, role_folders
@@ -32,6 +30,7 @@ from pcdata.io.sources.listing import (
 )
 from pcdata.io.sources.option_checks import check_invalid_values, check_label, check_name
 from pcdata.io.sources.source import Source, check_partners
+from pcdata.io.sources.stated import one_calibration, one_naming, one_unit, one_value, opened_calibration
 from pcdata.io.sources.timestamps import read_timestamps
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame
 from pcdata.structures.calibration import Calibration
@@ -77,7 +76,8 @@ class FolderSource(Source):
             frame_id: where the poses lead to, where ``intrinsics.json`` does not state it; None = "world".
             calibration: a :class:`Calibration` or its file, whose camera replaces that of ``intrinsics.json``. Where it
                 has transforms, the capture has no ``poses`` and a ``frame_id`` is stated, it also gives the pose.
-            camera: its name in the calibration; None = the only one.
+            camera: its name in the calibration; None = the only one. ``intrinsics.json`` may state both, with the
+                calibration as a file beside it, and ``folders`` too.
             folders: the names of folders that are called otherwise, by role, such as ``{"pose": "pose"}``; None leaves
                 a role out. The roles: depth, color, labels, mask, confidence, pose.
             links_to: folders outside that links in the capture may lead to; no other ones are followed out of it.
@@ -97,47 +97,35 @@ class FolderSource(Source):
         allowed = [path, *link_targets(links_to)]
         check_inside(str(path), present[0], allowed)
         stated = read_capture_camera(present[0])
-        self.metres_per_unit = _one_unit(present[0], stated.metres_per_unit, metres_per_unit)
-        self.depth_encoding = _one_encoding(present[0], stated.depth_encoding, depth_encoding)
-        check_name(str(path), "frame_id", frame_id)
-        check_name(str(path), "camera", camera)
-        if frame_id and stated.frame_id not in (None, frame_id):
-            raise CaptureError(f"{present[0]}: says frame_id {stated.frame_id!r}, the argument {frame_id!r}; drop one")
-        roles = role_folders(path, folders)
+        self.metres_per_unit = one_unit(present[0], stated.metres_per_unit, metres_per_unit)
+        encoding = one_value(present[0], "depth_encoding", stated.depth_encoding, depth_encoding, error=UnitError)
+        self.depth_encoding = check_depth_encoding(str(present[0]), encoding or "plain")
+        frame = one_value(present[0], "frame_id", stated.frame_id, check_name(str(path), "frame_id", frame_id))
+        name = one_value(present[0], "camera", stated.camera_name, check_name(str(path), "camera", camera))
+        replacing = one_calibration(present[0], stated.calibration, calibration, allowed)
+        roles = role_folders(path, one_naming(present[0], stated.folders, folders))
         if "depth" not in roles:
             raise CaptureError(f"folder source {path}: has no folder 'depth'; this layout needs {self.needs}")
-        self.frame_id = frame_id or stated.frame_id or "world"
-        self.frame_is_stated = bool(frame_id or stated.frame_id)
+        self.frame_id = frame or "world"
+        self.frame_is_stated = frame is not None
         self.camera = stated.camera
         self.world_from_camera: Tensor | None = None  # of a camera that stands still
         self._calibrated: dict[str, str] = {}
-        if calibration is not None:
-            frame = None if "pose" in roles else frame_id or stated.frame_id
+        if replacing is not None:
             self.camera, self.world_from_camera, self._calibrated = _override(
-                present[0], stated.camera, calibration, camera, frame
+                present[0], stated.camera, replacing, name, None if "pose" in roles else frame
             )
-        elif camera is not None:
-            raise ConfigError(
-                f"folder source {path}: camera={camera!r} names one of a calibration; give calibration too"
-            )
-        self.invalid_values = check_invalid_values(str(path), invalid_values)
-        if stated.invalid_values is not None:
-            if self.invalid_values and set(self.invalid_values) != set(stated.invalid_values):
-                raise CaptureError(
-                    f"{present[0]}: says invalid_values {list(stated.invalid_values)}, the argument "
-                    f"{list(self.invalid_values)}; drop one"
-                )
-            self.invalid_values = stated.invalid_values
+        elif name is not None:
+            raise ConfigError(f"folder source {path}: camera={name!r} names one of a calibration; give calibration too")
+        invalid = check_invalid_values(str(path), invalid_values)
+        if stated.invalid_values is not None and set(invalid) != set(stated.invalid_values):
+            one_value(present[0], "invalid_values", list(stated.invalid_values), list(invalid) or None)
+        self.invalid_values = invalid if stated.invalid_values is None else stated.invalid_values
         background_label = check_label(str(path), background_label)
-        if stated.background_label is not None and background_label not in (None, stated.background_label):
-            raise CaptureError(
-                f"{present[0]}: says background_label {stated.background_label}, the argument {background_label}; drop "
-                "one"
-            )
-        self.background_label = stated.background_label if background_label is None else background_label
+        self.background_label = one_value(present[0], "background_label", stated.background_label, background_label)
         check_links(link for folder in roles.values() for link in links_in(folder))  # all of them in one message
         self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
-        self._used = {present[0], *roles.values()}
+        self._used = {present[0], *roles.values(), *([path / stated.calibration] if stated.calibration else [])}
         super().__init__(path, self._files["depth"], links_to)
         check_partners(str(self), self._ids, {role: found for role, found in self._files.items() if role != "depth"})
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
@@ -199,23 +187,6 @@ class FolderSource(Source):
         return replace(frame, world_from_camera=self.world_from_camera[None], frame_id=self.frame_id)
 
 
-def _one_unit(file: Path, stated: float | None, given: float | None) -> float:
-    if stated is None and given is None:
-        raise UnitError(
-            f'{file}: the unit of depth must be stated: add "metres_per_unit": 0.001 (for millimetres) to the file, or '
-            "pass metres_per_unit"
-        )
-    if stated is not None and given is not None and stated != given:
-        raise UnitError(f"{file}: says metres_per_unit {stated:g}, the argument {given:g}; correct the wrong one")
-    return check_metres_per_unit(str(file), stated if given is None else given)  # type: ignore[arg-type]
-
-
-def _one_encoding(file: Path, stated: DepthEncoding | None, given: DepthEncoding | None) -> DepthEncoding:
-    if stated is not None and given not in (None, stated):
-        raise UnitError(f"{file}: says depth_encoding {stated!r}, the argument {given!r}; correct the wrong one")
-    return check_depth_encoding(str(file), stated or given or "plain")
-
-
 def _override(
     file: Path,
     stated: Camera,
@@ -234,10 +205,3 @@ def _override(
         )
     pose = known.transform(frame, name) if frame and known.transforms else None
     return camera, pose, {"calibration": origin, "camera": name}
-
-
-def opened_calibration(calibration: Calibration | str | os.PathLike[str]) -> tuple[Calibration, str]:
-    """Return a calibration, read where a file is given, and what provenance tells of its origin."""
-    if isinstance(calibration, Calibration):
-        return calibration, "given as an object"
-    return read_calibration(calibration), Path(os.fspath(calibration)).name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePath
+from typing import Any
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES
@@ -42,10 +43,7 @@ def role_folders(path: Path, folders: Mapping[str, str | None] | None) -> dict[s
         CaptureError: a named folder is missing, or one looks like a role that is neither read nor left out.
     """
     where = f"folder source {path}"
-    if not isinstance(folders, Mapping | None):
-        raise ConfigError(f"{where}: folders must map roles to names, such as {{'pose': 'pose'}}, got {folders!r:.200}")
-    named = dict(folders or {})
-    _check_named(where, named)
+    named = {} if folders is None else check_folders(where, folders)
     found = {}
     for role, (usual, _) in ROLES.items():
         name = named.get(role, usual)
@@ -57,7 +55,14 @@ def role_folders(path: Path, folders: Mapping[str, str | None] | None) -> dict[s
     return found
 
 
-def _check_named(where: str, named: Mapping[str, str | None]) -> None:
+def check_folders(where: str, named: Any) -> dict[str, str | None]:
+    """Return names of folders by role; they must be roles, and folders within a capture.
+
+    Raises:
+        ConfigError: no such role, a folder outside the capture, or no depth.
+    """
+    if not isinstance(named, Mapping):
+        raise ConfigError(f"{where}: folders must map roles to names, such as {{'pose': 'pose'}}, got {named!r:.200}")
     for role, name in named.items():
         if role not in ROLES:
             raise ConfigError(
@@ -65,8 +70,9 @@ def _check_named(where: str, named: Mapping[str, str | None]) -> None:
             )
         if name is None and role != "depth":
             continue
-        if not isinstance(name, str) or not name or PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+        if not is_within(name):
             raise ConfigError(f"{where}: folders: {role} must be the name of a folder in the capture, got {name!r}")
+    return dict(named)
 
 
 def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: Mapping[str, str | None]) -> None:
@@ -88,3 +94,10 @@ def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: 
 
 def _plain(name: str) -> str:
     return re.sub(r"[-_ .]", "", name.lower()).removesuffix("s")
+
+
+def is_within(name: Any) -> bool:
+    """Say whether this is the name of something within a folder."""
+    return (
+        isinstance(name, str) and bool(name) and not PurePath(name).is_absolute() and ".." not in PurePath(name).parts
+    )

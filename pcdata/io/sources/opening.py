@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import glob
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,11 @@ from typing import Any
 from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
-from pcdata.io.sources.capture_source import refused_captures
+from pcdata.io.sources.capture_source import kinds_of, refused_captures
 from pcdata.io.sources.combine import JoinedSource, Selectable
 from pcdata.io.sources.detect import detect_layout
-from pcdata.io.sources.listing import check_links, is_litter
-from pcdata.io.sources.registry import COMBINATORS, combined, layout_named, options_of
+from pcdata.io.sources.listing import absolute, check_links, is_litter, link_targets
+from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, checked_fields, combined, layout_named, options_of
 from pcdata.io.sources.source import Source
 
 _WHERE = "open_source"
@@ -58,6 +59,7 @@ def open_source(
     around = {name: value for name, value in around.items() if value is not None and value is not False}
     if len(twice := [name for name in around if COMBINATORS[name].over_time]) > 1:
         raise ConfigError(f"{_WHERE}: {' and '.join(twice)} both smooth over time; choose one")
+    told = _told(path, options, around, only=only, limit=limit, skip=skip, skip_refused=skip_refused)
     source: Selectable[Any] = _open(path, kind, options)
     if only:
         source = _matching(source, [only] if isinstance(only, str) else only)
@@ -69,6 +71,9 @@ def open_source(
         source = source.without(refused)
     for name, value in around.items():
         source = combined(_WHERE, source, name, value)
+    layouts = [kind for kind in kinds_of(source) if kind in LAYOUTS]
+    told = {"path": told.pop("path"), **({"kind": layouts[0]} if len(layouts) == 1 else {}), **told}
+    object.__setattr__(source, "opened", told)  # a combinator is frozen
     return source
 
 
@@ -112,6 +117,38 @@ def _open_one(path: Path, kind: str | None, options: dict[str, Any]) -> Source:
                 f"{', '.join(known) or 'none'}"
             )
     return layout(path, **options)
+
+
+def _told(
+    path: str | os.PathLike[str], options: Mapping[str, Any], around: Mapping[str, Any], **others: Any
+) -> dict[str, Any]:
+    """Return what was said, as a section ``source`` says it; of files the names alone, the same on every machine."""
+    given = Path(path).expanduser()
+    fixed = len(_before_pattern(given.parts))
+    is_pattern = fixed < len(given.parts) and not given.exists()
+    place = given.parts[max(fixed - 1, 0) :] if is_pattern else [absolute(given).name]
+    told = {"path": Path(*place).as_posix(), **{name: value for name, value in others.items() if value}, **options}
+    if isinstance(told.get("only"), str):
+        told["only"] = [told["only"]]
+    if "calibration" in told:
+        file = told["calibration"]
+        told["calibration"] = Path(file).name if isinstance(file, (str, os.PathLike)) else "given as an object"
+    if "links_to" in told:
+        told["links_to"] = [folder.name for folder in link_targets(told["links_to"])]
+    told |= {name: checked_fields(_WHERE, name, value) for name, value in around.items()}
+    return {name: _plain(value) for name, value in told.items() if value is not None}
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON and YAML can hold."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, os.PathLike):
+        return Path(value).name
+    is_plain = isinstance(value, (str, bool, int, type(None))) or (isinstance(value, float) and math.isfinite(value))
+    return value if is_plain else str(value)
 
 
 def _before_pattern(parts: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import cast
 from pcdata.errors import CaptureError, FrameError
 from pcdata.files.sample_names import check_names, in_order_of_last_number, name_some
 from pcdata.functional.depth.unit_fit import DepthEncoding
-from pcdata.io.sources.folder import FolderSource, opened_calibration
+from pcdata.io.sources.folder import FolderSource
 from pcdata.io.sources.joined_views import join_views
 from pcdata.io.sources.listing import (
     LinkTargets,
@@ -23,6 +23,7 @@ from pcdata.io.sources.listing import (
     unread_entries,
 )
 from pcdata.io.sources.source import Source
+from pcdata.io.sources.stated import opened_calibration
 from pcdata.structures import DepthFrame
 from pcdata.structures.calibration import Calibration
 

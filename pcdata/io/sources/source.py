@@ -132,7 +132,7 @@ class Source(Selectable["Source"], metaclass=_Recorded):
     def _part(self, ids: list[str], skipped: Mapping[str, str]) -> Source:
         smaller = copy.copy(self)
         smaller._ids, smaller._known = ids, frozenset(ids)
-        smaller._skipped = {**self._skipped, **skipped}
+        smaller._skipped, smaller.opened = {**self._skipped, **skipped}, {}
         return smaller
 
     def provenance(self, sample_id: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ FILE_NAME = DATASET
 
 _CHECKSUM = "checksum"
 _MAX_BYTES = 256 * 2**20  # about a million samples
+_DEFINED = ("transforms", "layouts", "combinators")  # what a file of one's own may define
 _MAX_KEY = 200  # file names end at 255 bytes
 
 
@@ -49,6 +50,7 @@ class Manifest:
     versions: Mapping[str, str] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     model: Mapping[str, Any] = field(default_factory=dict)  # name and choices of the model that it was built for
+    source: Mapping[str, Any] = field(default_factory=dict)  # the section source that it was built with; {} = unknown
     imports: Sequence[
         Mapping[str, Any]
     ] = ()  # files with steps or the reader that were used: name, hash, what is in it
@@ -126,6 +128,7 @@ def _check(manifest: Manifest) -> None:
         ("versions", dict),
         ("skipped", dict),
         ("model", dict),
+        ("source", dict),
     ):
         if not isinstance(getattr(manifest, name), kind):
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
@@ -149,10 +152,10 @@ def _check(manifest: Manifest) -> None:
 
 def _is_import(entry: Any) -> bool:
     """Say whether an entry is as :meth:`pcdata.imports.ImportedFile.to_json` writes it."""
-    if not isinstance(entry, dict) or set(entry) != {"file", "sha256", "transforms", "layouts"}:
+    if not isinstance(entry, dict) or set(entry) != {"file", "sha256", *_DEFINED}:
         return False
     names = [entry["file"], entry["sha256"]]
-    for listed in (entry["transforms"], entry["layouts"]):
+    for listed in (entry[kind] for kind in _DEFINED):
         names += listed if isinstance(listed, list) else [None]
     return all(isinstance(name, str) for name in names)
 

@@ -180,7 +180,7 @@ def test_the_configuration_says_it_all(capture: Path, config: Path, tmp_path: Pa
 
 
 def test_an_average_loses_the_bad_capture_and_not_its_group(capture: Path, config: Path) -> None:
-    config.write_text(STEPS + "source: {path: capture, average: 4, skip_refused: true}\n")
+    config.write_text(STEPS + "source: {path: capture, averaged: {num_frames: 4}, skip_refused: true}\n")
     source = load_config(config).source.open()
     assert isinstance(source, AveragedSource)
     assert source.group("0") == ["0", "1", "3", "5"]
@@ -214,7 +214,11 @@ def test_options_of_the_layout_come_from_the_configuration_and_may_not_be_contra
         ("{skip: [5]}", "texts in quotes"),
         ("{limit: 0}", "whole number of at least 1"),
         ("{skip_refused: 3}", "true or false"),
-        ("{average: 3, temporal: 3}", "choose one"),
+        ("{averaged: 3, temporal: 3}", "choose one"),
+        ("{average: 3}", "did you mean 'averaged'"),
+        ("{averaged: {num_frame: 3}}", "2:20.*did you mean 'num_frames'"),
+        ("{kind: graspnet, frame_id: base}", "no such setting"),
+        ("{only: 5}", "a pattern of ids"),
         ("[a]", "must be a mapping"),
     ],
 )

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import inspect
 import json
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,173 +9,38 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from scipy.io import savemat
 
-from pcdata.errors import CaptureError, ConfigError, PcdataError, PoseError, UnitError
-from pcdata.files.sample_names import in_order
-from pcdata.io import LAYOUTS, open_source, read_depth, write_pcd, write_ply
-from pcdata.io.sources.source import Source
+from pcdata.errors import CaptureError, PcdataError, PoseError, UnitError
+from pcdata.io import LAYOUTS, open_source, read_depth
 from pcdata.structures import DepthFrame, PointCloud
+from tests.captures import (
+    HEIGHT,
+    WIDTH,
+    K,
+    cloud_files,
+    color_of,
+    depth_of,
+    folder_capture,
+    graspnet_frame,
+    image,
+    seven_scenes_capture,
+)
 from tests.messages import told
-
-HEIGHT, WIDTH = 6, 8
-K: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
-
-
-def image(path: Path, array: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(array).save(path)
-
-
-def depth_of(seed: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
-    return np.random.default_rng(seed).integers(500, 1500, shape).astype(np.uint16)
-
-
-def color_of(seed: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (*shape, 3)).astype(np.uint8)
-
-
-def pose_text(shift: float) -> str:
-    return f"0 -1 0 {shift}\n1 0 0 0\n0 0 1 0.5\n0 0 0 1\n"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    root = tmp_path / "capture"
-    for i, name in enumerate(["a_2", "a_10", "a_1"]):
-        image(root / "depth" / f"{name}.png", depth_of(i))
-        image(root / "color" / f"{name}.png", color_of(i))
-        image(root / "labels" / f"{name}.png", np.full((HEIGHT, WIDTH), i, np.uint8))
-        image(root / "masks" / f"{name}.png", np.eye(HEIGHT, WIDTH, dtype=bool))
-        (root / "poses").mkdir(exist_ok=True)
-        (root / "poses" / f"{name}.txt").write_text(pose_text(i))
-    (root / "intrinsics.json").write_text(json.dumps(K | {"metres_per_unit": 0.001, "frame_id": "base"}))
-    return root
+    return folder_capture(tmp_path / "capture")
 
 
 @pytest.fixture
 def scenes(tmp_path: Path) -> Path:
-    root = tmp_path / "seq-01"
-    for i in (0, 20, 40):
-        raw = depth_of(i)
-        raw[0, :2] = 65535, 0
-        image(root / f"frame-{i:06d}.depth.png", raw)
-        image(root / f"frame-{i:06d}.color.png", color_of(i))
-        (root / f"frame-{i:06d}.pose.txt").write_text(pose_text(i))
-    (root / "camera-intrinsics.txt").write_text("10 0 3.5\n0 11 2.5\n0 0 1\n")
-    return root
-
-
-def graspnet_frame(root: Path, **changes: Any) -> Path:
-    label = np.zeros((HEIGHT, WIDTH), np.uint8)
-    label[2, 3], label[4, 5] = 4, 7
-    image(root / "depth.png", depth_of(1))
-    image(root / "color.png", color_of(1))
-    image(root / "label.png", label)
-    image(root / "workspace_mask.png", np.eye(HEIGHT, WIDTH, dtype=bool))
-    poses = np.tile(np.eye(4)[:3, :, None], (1, 1, 2))
-    poses[:, 3, 1] = 0.1, 0.2, 0.3
-    meta = {"intrinsic_matrix": np.array([[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]]), "factor_depth": np.array([[1000]])}
-    meta |= {"cls_indexes": np.array([[4, 7]], np.uint8), "poses": poses} | changes
-    savemat(root / "meta.mat", {name: value for name, value in meta.items() if value is not None})
-    return root
+    return seven_scenes_capture(tmp_path / "seq-01")
 
 
 @pytest.fixture
 def clouds(tmp_path: Path) -> Path:
-    root = tmp_path / "clouds"
-    root.mkdir()
-    write_pcd(root / "b.pcd", PointCloud(points=torch.rand(5, 3), frame_id="x"))
-    write_ply(root / "a.ply", PointCloud(points=torch.rand(4, 3), frame_id="x"))
-    (root / "README.md").write_text("notes do not matter")
-    return root
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Path:
-    root = tmp_path / "cell"
-    for seed, camera in enumerate(["left", "right"]):
-        for name in ("a_2", "a_10"):
-            image(root / camera / "depth" / f"{name}.png", depth_of(seed))
-            (root / camera / "poses").mkdir(exist_ok=True)
-            (root / camera / "poses" / f"{name}.txt").write_text(pose_text(seed))
-        (root / camera / "intrinsics.json").write_text(json.dumps(K | {"metres_per_unit": 0.001, "frame_id": "base"}))
-    return root
-
-
-# -- laws that every layout keeps --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(params=["folder", "rig", "seven_scenes", "graspnet", "clouds"])
-def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    if request.param == "graspnet":
-        return graspnet_frame(tmp_path / "set" / "frame_1").parent
-    fixture = {"seven_scenes": "scenes"}.get(request.param, request.param)
-    path: Path = request.getfixturevalue(fixture)
-    return path
-
-
-def test_ids_are_in_order_unique_and_all_load(capture: Path) -> None:
-    source = open_source(capture)
-    assert source.ids == in_order(set(source.ids))
-    assert len(source) == len(source.ids) > 0
-    for sample_id in source.ids:
-        sample = source.load(sample_id)
-        facts = sample.provenance if isinstance(sample, DepthFrame) else sample.meta[0]["provenance"]
-        assert (sample.sample_id if isinstance(sample, DepthFrame) else sample.meta[0]["sample_id"]) == sample_id
-        assert facts["source"] == source.kind
-        assert json.loads(json.dumps(facts)) == facts
-        assert all((capture / name).is_file() for name in facts["files"].values())
-        assert facts["metres_per_unit"] > 0
-
-
-def test_a_source_is_small_when_pickled_and_still_loads(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(capture.parent)
-    source = open_source(capture.name)  # a relative path must survive a change of folder
-    again = pickle.loads(pickle.dumps(source))
-    monkeypatch.chdir("/")
-    assert again.ids == source.ids
-    assert len(pickle.dumps(source)) < 5000
-    first, second = source.load(source.ids[0]), again.load(source.ids[0])
-    if isinstance(first, DepthFrame):
-        assert torch.equal(first.depth, second.depth)
-    else:
-        assert torch.equal(first.points, second.points)
-
-
-def test_limit_keeps_the_first_samples_unchanged(capture: Path) -> None:
-    whole, one = open_source(capture), open_source(capture, limit=1)
-    assert one.ids == whole.ids[:1]
-    assert one.files(one.ids[0]) == whole.files(one.ids[0])
-    with pytest.raises(CaptureError, match="no sample 'absent'"):
-        one.load("absent")
-    if len(whole) > 1:
-        with pytest.raises(CaptureError, match="no sample"):
-            one.load(whole.ids[1])
-
-
-def test_naming_the_kind_gives_what_detection_gives(capture: Path) -> None:
-    found = open_source(capture)
-    named = open_source(capture, kind=found.kind)
-    assert type(named) is type(found)
-    assert named.ids == found.ids
-
-
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_a_layout_shows_its_options_in_its_signature(layout: type[Source]) -> None:
-    assert str(inspect.signature(layout)).startswith("(path: ")
-    assert "links_to" in inspect.signature(layout).parameters
-
-
-def test_unknown_options_kinds_and_limits_are_refused_with_near_matches(capture: Path) -> None:
-    with pytest.raises(ConfigError, match="has no option 'nonsense'"):
-        open_source(capture, nonsense=1)
-    with pytest.raises(ConfigError, match="did you mean 'folder'"):
-        open_source(capture, kind="foldr")
-    for limit in (0, -1, 1.5, True):
-        with pytest.raises(ConfigError, match="limit must be"):
-            open_source(capture, limit=limit)  # type: ignore[arg-type]
+    return cloud_files(tmp_path / "clouds")
 
 
 # -- detection ---------------------------------------------------------------------------------------------------------
