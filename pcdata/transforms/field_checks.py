@@ -86,7 +86,7 @@ def _fault_message(cls: type, fault: Any) -> str:
     if fault["type"] == "extra_forbidden":
         name = str(fault["loc"][0])
         known = field_names(cls)
-        return f"no such field{near_matches(name, known) or f'; {cls.__name__} has {known}'}"
+        return f"no such field{near_matches(name, known) or f'; {cls.__name__} has {list(known)}'}"
     given = "" if fault["type"] == "missing" else f" (got {fault['input']!r})"
     return f"{fault['msg']}{given}"
 
