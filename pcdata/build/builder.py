@@ -173,7 +173,7 @@ def _write_samples(
             except Exception as error:
                 way_out = isinstance(error, REFUSALS) and not skip_refused
                 hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
-                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}")
+                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}", sample_id=sample_id)
                 raise
             inputs.check_latest("build_dataset")
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))

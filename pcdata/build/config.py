@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pcdata.build.model_section import preset_of_section, with_model
 from pcdata.build.source_section import SourceSettings, source_settings
-from pcdata.errors import ConfigError, near_matches
+from pcdata.errors import ConfigError, locates_path, near_matches
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
 from pcdata.models import Preset
@@ -80,6 +80,7 @@ class BuildConfig:
 _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
+@locates_path
 def load_config(path: str | Path) -> BuildConfig:
     """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 
