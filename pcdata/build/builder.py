@@ -30,10 +30,10 @@ from pcdata.io.sources.capture_source import (
     reason_of,
     skipped_of,
 )
+from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, key_of
-from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import DepthFrame, PointCloud
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one

@@ -11,7 +11,7 @@ from typing import Any
 from pcdata.errors import CacheError, locate
 from pcdata.files.opening import read_bytes, replacing
 from pcdata.files.whole_folders import EXPORT
-from pcdata.io.store.record import parse_info
+from pcdata.io.store.cloud_record import parse_info
 
 _MAX_BYTES = 1 << 28  # about a million samples
 FILE_NAME = EXPORT

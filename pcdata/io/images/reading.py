@@ -24,7 +24,7 @@ from pcdata.errors import CaptureError, UnitError, locates_path
 from pcdata.files.opening import map_npy, read_bytes
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
-from pcdata.io.images.structure import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
+from pcdata.io.images.file_wholeness import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30

@@ -16,7 +16,7 @@ from pcdata.errors import CacheError, PcdataWarning, locate
 from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import retired_of
 from pcdata.files.whole_folders import DATASET
-from pcdata.io.store.record import parse_info
+from pcdata.io.store.cloud_record import parse_info
 from pcdata.io.store.stores import COMPRESSIONS, STORES, Compression, Format
 
 SCHEMA = "pcdata.dataset/1"

@@ -27,7 +27,7 @@ from pcdata.files.zip_archive import ZipArchive
 from pcdata.io.arrays.hdf5_arrays import hard_linked, open_hdf5, read_group
 from pcdata.io.arrays.hdf5_writing import FaultKeepingFile
 from pcdata.io.arrays.pt_tensors import read_pt
-from pcdata.io.store.record import Record, parse_info
+from pcdata.io.store.cloud_record import Record, parse_info
 
 Format = Literal["hdf5", "npz", "pt"]
 Compression = Literal["none", "lzf", "gzip"]
