@@ -219,17 +219,18 @@ def count_of(data: Any) -> int:
     return data.num_points if isinstance(data, pcdata.PointCloud) else int((data.depth > 0).sum())
 
 
-def pipeline() -> pcdata.Pipeline:
-    return pcdata.Pipeline(
-        depth=[pcdata.MaskDepth(), pcdata.Deproject()],
-        cloud=[
+def pipeline() -> pcdata.Compose:
+    return pcdata.Compose(
+        [
+            pcdata.MaskDepth(),
+            pcdata.Deproject(),
             pcdata.RemoveStatisticalOutliers(num_neighbors=20, std_ratio=2.0),
             pcdata.RemoveRadiusOutliers(min_neighbors=5, radius=0.01),
             pcdata.RemovePlane(distance=0.01, num_hypotheses=1000),
             pcdata.ClusterObjects(eps=0.02, min_points=50, min_size=MIN_SIZE, max_size=MAX_SIZE),
             pcdata.FarthestPointSample(num_points=1024),
             pcdata.EstimateNormals(radius=0.02, max_neighbors=30),
-        ],
+        ]
     )
 
 
@@ -244,7 +245,7 @@ STEPS = {
 }
 
 
-def pipeline_steps(whole: pcdata.Pipeline, frame: pcdata.DepthFrame) -> Iterator[Step]:
+def pipeline_steps(whole: pcdata.Compose, frame: pcdata.DepthFrame) -> Iterator[Step]:
     for step, cloud in whole.step_through(frame):
         if type(step).__name__ in STEPS:
             yield STEPS[type(step).__name__], cloud

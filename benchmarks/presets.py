@@ -28,7 +28,7 @@ from torch.utils._pytree import tree_leaves
 
 import pcdata
 from pcdata.models import CONTRACTS, check, preset
-from pcdata.models.preset import batch_of
+from pcdata.models.batching import batch_of
 from pcdata.report import text_table
 from pcdata.rng import seeded
 from pcdata.structures import DepthFrame

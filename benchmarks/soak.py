@@ -50,11 +50,12 @@ def main() -> None:
 # -- a long loop -------------------------------------------------------------------------------------------------------
 
 
-def usual_chain() -> pcdata.Pipeline:
+def usual_chain() -> pcdata.Compose:
     """From a capture to an augmented sample, with every kind of step."""
-    return pcdata.Pipeline(
-        depth=[pcdata.MaskDepth(near=0.2, far=3.0), pcdata.Deproject()],
-        cloud=[
+    return pcdata.Compose(
+        [
+            pcdata.MaskDepth(near=0.2, far=3.0),
+            pcdata.Deproject(),
             pcdata.ToFrame(frame="base"),
             pcdata.CropWorkspace(frame="base", lower=(-0.5, -0.5, -0.02), upper=(0.5, 0.5, 0.5)),
             pcdata.RemoveStatisticalOutliers(num_neighbors=20, std_ratio=2.0),
@@ -63,13 +64,11 @@ def usual_chain() -> pcdata.Pipeline:
             pcdata.ClusterObjects(eps=0.02, min_points=5, min_size=20),
             pcdata.FarthestPointSample(num_points=256, if_short="repeat"),
             pcdata.EstimateNormals(radius=0.03, max_neighbors=20),
-        ],
-        augment=[
             pcdata.RandomRotation(degrees=15),
             pcdata.RandomScale(),
             pcdata.RandomJitter(),
             pcdata.RandomPointDropout(),
-        ],
+        ]
     )
 
 

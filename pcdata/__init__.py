@@ -44,7 +44,6 @@ _HOMES = {
         "MergeViews",
         "NormalizeUnitSphere",
         "NormalizeWorkspace",
-        "Pipeline",
         "RandomApply",
         "RandomColorJitter",
         "RandomColumn",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
@@ -92,6 +92,39 @@ class SensorChoice:
     depth: float  # metres
 
 
+class Document(Protocol):
+    """What can be read node by node: a parsed file, or plain data."""
+
+    name: str
+    root: Any
+    sensor: SensorChoice | None
+    faults: list[Any]
+
+    def fault(self, node: Any, message: str) -> None:
+        """Note a fault at a node."""
+
+    def raise_faults(self) -> None:
+        """Raise one error with every fault, if there are any."""
+
+    def mapping(self, node: Any, what: str) -> dict[str, tuple[Any, Any]]:
+        """Read a mapping as key -> (node of the key, node of the value)."""
+
+    def sequence(self, node: Any, what: str) -> list[Any]:
+        """Read a list."""
+
+    def word(self, node: Any) -> str | None:
+        """Return a single value as text; None = a mapping or a list."""
+
+    def is_mapping(self, node: Any) -> bool:
+        """Whether the node is a mapping."""
+
+    def plain(self, node: Any) -> Any:
+        """Return the node's value."""
+
+    def at(self, node: Any, path: Sequence[int | str]) -> Any:
+        """Follow keys and positions as far as they lead."""
+
+
 class YamlDocument:
     """One parsed file and the faults found in it so far; all are reported at once."""
 
@@ -168,6 +201,28 @@ class YamlDocument:
             return []
         return list(node.value)
 
+    def word(self, node: yaml.Node) -> str | None:
+        """Return a single value as text; None = a mapping or a list."""
+        return str(node.value) if isinstance(node, yaml.ScalarNode) else None
+
+    def is_mapping(self, node: yaml.Node | None) -> bool:
+        """Whether the node is a mapping."""
+        return isinstance(node, yaml.MappingNode)
+
+    def at(self, node: yaml.Node, path: Sequence[int | str]) -> yaml.Node:
+        """Follow keys and positions as far as they lead."""
+        for part in path:
+            if isinstance(node, yaml.MappingNode):
+                children = {str(key.value): value for key, value in node.value}
+                if str(part) not in children:
+                    break
+                node = children[str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+                node = node.value[part]
+            else:
+                break
+        return node
+
     def plain(self, node: yaml.Node) -> Any:
         """Return the node's value as plain Python data; duplicate keys are noted as faults."""
         before = len(self.faults)
@@ -188,21 +243,6 @@ class YamlDocument:
         except Exception as error:  # PyYAML trusts that words fit their types
             self.fault(node, f"cannot read this value: {str(error) or type(error).__name__:.200}")
         return None
-
-
-def node_at(node: yaml.Node, path: Sequence[int | str]) -> yaml.Node:
-    """Follow keys and positions as far as they lead and return the node there."""
-    for part in path:
-        if isinstance(node, yaml.MappingNode):
-            children = {str(key.value): value for key, value in node.value}
-            if str(part) not in children:
-                break
-            node = children[str(part)]
-        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
-            node = node.value[part]
-        else:
-            break
-    return node
 
 
 def _is_null(node: yaml.Node) -> bool:

@@ -30,10 +30,10 @@ from pcdata.io.sources.capture_source import (
     reason_of,
     skipped_of,
 )
-from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, key_of
+from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.io.writers.capture_folder import write_capture
+from pcdata.io.writers.capture import write_capture
 from pcdata.structures import DepthFrame, PointCloud
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
@@ -97,9 +97,8 @@ def build_dataset(
     with complete_or_nothing(
         folder, overwrite=overwrite, owned=check_only_dataset, note=report.notes.append
     ) as partial:
-        steps = {name for file in imported_files() for name in file.transforms} & step_names(
-            config.pipeline.to_config()
-        )
+        sections = config.pipeline.sections()
+        steps = {name for file in imported_files() for name in file.transforms} & step_names(sections)
         kinds = {*kinds_of(source)}
         imports = [
             file
@@ -110,8 +109,8 @@ def build_dataset(
         manifest = Manifest(
             format=config.output.format,
             compression=config.output.compression,
-            fingerprint=config.pipeline.fingerprint(),
-            pipeline=config.pipeline.to_config(),
+            fingerprint=config.pipeline.stored_fingerprint(),
+            pipeline=sections,
             samples=samples,
             skipped=report.skipped,
             model=_model_of(config),
@@ -147,7 +146,7 @@ def _write_samples(
     progress: Progress | None,
 ) -> list[Sample]:
     store = STORES[config.output.format](partial, config.output.compression)
-    prefix = config.pipeline.deterministic_prefix()
+    prefix, _ = config.pipeline.split()
     ids = list(source.ids)
     written = []
     inputs = inputs_of(source)
@@ -173,7 +172,7 @@ def _write_samples(
             except Exception as error:
                 way_out = isinstance(error, REFUSALS) and not skip_refused
                 hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
-                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}", sample_id=sample_id)
+                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}")
                 raise
             inputs.check_latest("build_dataset")
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
@@ -198,12 +197,15 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
             "pcdata.load_config(path) reads one"
         )
     checked_ids("build_dataset", source)
-    random = [type(step).__name__ for step in config.pipeline.depth if step.is_random]
-    if random:
+    stored, on_the_fly = config.pipeline.split()
+    if on_the_fly.takes is not PointCloud:
         raise ConfigError(
-            f"build_dataset: {random[0]} in the section depth is random, so no cloud is the same in every epoch and "
-            "none can be stored; leave it out here, or load captures on the fly with CloudDataset"
+            f"build_dataset: {type(on_the_fly.steps[0]).__name__} in the section depth is random, so no cloud is the "
+            "same in every epoch and none can be stored; leave it out here, or load captures on the fly with "
+            "CloudDataset"
         )
+    if stored.gives is not PointCloud:
+        raise ConfigError("build_dataset: the pipeline gives images, not clouds to store; put Deproject last")
 
 
 def _model_of(config: BuildConfig) -> dict[str, Any]:

@@ -6,20 +6,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from annotated_types import Ge
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pcdata.build.model_section import preset_of_section, with_model
+from pcdata.build.model_section import preset_of_section, stored_preset
 from pcdata.build.source_section import SourceSettings, source_settings
-from pcdata.errors import ConfigError, locates_path, near_matches
+from pcdata.errors import ConfigError, near_matches
+from pcdata.files.opening import read_text
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
 from pcdata.models import Preset
-from pcdata.transforms.config import read_config
-from pcdata.transforms.pipeline import SECTIONS, Pipeline, pipeline_from_document
+from pcdata.structures import PointCloud
+from pcdata.transforms import Compose
+from pcdata.transforms.chain_reading import SECTIONS
+from pcdata.transforms.plain_document import PlainDocument
 from pcdata.transforms.sensor_words import SENSOR
-from pcdata.yaml_nodes import YamlDocument, node_at, yaml_text
+from pcdata.yaml_nodes import Document, YamlDocument
 
 Collate = Literal["packed", "padded", "fixed"]
 
@@ -49,7 +51,7 @@ class Loader(BaseModel):
 class BuildConfig:
     """A parsed configuration file; without one, everything at its default."""
 
-    pipeline: Pipeline = field(default_factory=Pipeline)
+    pipeline: Compose = field(default_factory=lambda: Compose([]))
     output: Output = field(default_factory=Output)
     loader: Loader = field(default_factory=Loader)
     source: SourceSettings = field(default_factory=SourceSettings)
@@ -61,7 +63,15 @@ class BuildConfig:
         Raises:
             ConfigError: it has steps or a model already, or the model takes no clouds that a build stores.
         """
-        return with_model(self, made)
+        if self.model is not None:
+            raise ConfigError(f"the configuration names the model {self.model.contract.name} already; name one only")
+        if len(self.pipeline):
+            raise ConfigError(
+                f"the configuration has steps of its own, and the preset of {made.contract.name} has its own; drop one"
+            )
+        if "collate" in self.loader.model_fields_set:
+            raise ConfigError("loader.collate: the model's preset makes its own batches; leave it out")
+        return replace(self, pipeline=stored_preset(made).pipeline, model=made)
 
     def stored_as(self, format: Format) -> BuildConfig:
         """Return this configuration with another format of storage.
@@ -80,7 +90,6 @@ class BuildConfig:
 _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
-@locates_path
 def load_config(path: str | Path) -> BuildConfig:
     """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 
@@ -101,12 +110,16 @@ def load_config(path: str | Path) -> BuildConfig:
     """
     if (Path(path) / FILE_NAME).is_file():
         return _config_of_dataset(Path(path))
-    return config_from_yaml(read_config(path), name=str(path), folder=Path(path).parent)
+    text = read_text("configuration", path, error=ConfigError)
+    return config_from_yaml(text, name=str(path), folder=Path(path).parent)
 
 
 def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = None) -> BuildConfig:
     """Parse the text of a configuration; see :func:`load_config`. Relative paths in it start from ``folder``."""
-    document = YamlDocument(text, name)
+    return _config_of(YamlDocument(text, name), folder)
+
+
+def _config_of(document: Document, folder: Path | None = None) -> BuildConfig:
     entries = document.mapping(document.root, "a configuration")
     known = ["source", SENSOR, *SECTIONS, "model", *_SETTINGS]
     for section, (key, _) in entries.items():
@@ -120,12 +133,16 @@ def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = N
     if output is not None and output.compression not in COMPRESSIONS[output.format]:
         known_here = ", ".join(COMPRESSIONS[output.format])
         document.fault(
-            node_at(entries["output"][1], ["compression"]),
+            document.at(entries["output"][1], ["compression"]),
             f"output.compression: format {output.format} knows {known_here}, not {output.compression}",
         )
     source = source_settings(document, entries["source"][1] if "source" in entries else None, folder)
     made = preset_of_section(document, entries)
-    config = BuildConfig(pipeline_from_document(document, entries), settings["output"], settings["loader"], source)
+    pipeline = Compose.from_sections(document, entries)
+    if pipeline.gives is not PointCloud:
+        document.fault(entries["depth"][0], "the section depth must end in points; put Deproject last")
+        document.raise_faults()
+    config = BuildConfig(pipeline, settings["output"], settings["loader"], source)
     return config if made is None else config.for_model(made)
 
 
@@ -139,13 +156,13 @@ def _config_of_dataset(folder: Path) -> BuildConfig:
     }
     common = {"source": dict(manifest.source), "output": output}
     name = str(folder / FILE_NAME)
-    config = config_from_yaml(yaml_text({**common, **({"model": model} if model else manifest.pipeline)}), name=name)
-    if model and config.pipeline.to_config() != manifest.pipeline:  # the steps of the model were changed by hand
-        config = config_from_yaml(yaml_text({**common, **manifest.pipeline}), name=name)
+    config = _config_of(PlainDocument({**common, **({"model": model} if model else manifest.pipeline)}, name))
+    if model and config.pipeline.sections() != manifest.pipeline:  # the steps of the model were changed by hand
+        config = _config_of(PlainDocument({**common, **manifest.pipeline}, name))
     return replace(config, source=replace(config.source, path=None, by_name=True))
 
 
-def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | None) -> Any:
+def _settings(document: Document, model: type[BaseModel], node: Any) -> Any:
     entries = document.mapping(node, model.__name__.lower())
     values = {key: document.plain(value) for key, (_, value) in entries.items()}
     try:
@@ -157,6 +174,6 @@ def _settings(document: YamlDocument, model: type[BaseModel], node: yaml.Node | 
                 hint = near_matches(name, model.model_fields) or f"; known: {', '.join(model.model_fields)}"
                 document.fault(entries[name][0], f"{model.__name__.lower()}.{name}: no such setting{hint}")
             else:
-                place = node_at(entries[name][1], fault["loc"][1:]) if name in entries else node
+                place = document.at(entries[name][1], fault["loc"][1:]) if name in entries else node
                 document.fault(place, f"{model.__name__.lower()}.{name}: {fault['msg']} (got {fault['input']!r})")
         return None

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pcdata.errors import ConfigError
 from pcdata.models import Preset, preset
-from pcdata.transforms.pipeline import SECTIONS, Pipeline
-from pcdata.yaml_nodes import YamlDocument
-
-if TYPE_CHECKING:
-    from pcdata.build.config import BuildConfig
+from pcdata.transforms.chain_reading import SECTIONS
+from pcdata.yaml_nodes import Document
 
 _NAME = "name"
 
 
-def preset_of_section(document: YamlDocument, entries: dict[str, Any]) -> Preset | None:
+def preset_of_section(document: Document, entries: dict[str, Any]) -> Preset | None:
     """Read the section, ``{name: MODEL, CHOICE: VALUE, ...}``; faults go to the document."""
     if "model" not in entries:
         return None
@@ -45,7 +41,7 @@ def stored_preset(made: Preset) -> Preset:
     Raises:
         ConfigError: the model takes depth images, or clouds with a point for every pixel.
     """
-    is_image = not isinstance(made.pipeline, Pipeline)
+    is_image = made.contract.takes == "depth image"
     if is_image or made.contract.main.content == "organised":
         name = made.contract.name
         what = "depth images" if is_image else "clouds with a point for every pixel"
@@ -54,22 +50,3 @@ def stored_preset(made: Preset) -> Preset:
             f"instead, with preset({name!r}, ...).dataset(source)"
         )
     return made
-
-
-def with_model(config: BuildConfig, made: Preset) -> BuildConfig:
-    """Return a configuration without steps of its own with the preset of a model.
-
-    Raises:
-        ConfigError: it has steps or a model already, or the model takes no clouds that a build stores.
-    """
-    if config.model is not None:
-        raise ConfigError(f"the configuration names the model {config.model.contract.name} already; name one only")
-    if any(getattr(config.pipeline, section) for section in SECTIONS):
-        raise ConfigError(
-            f"the configuration has steps of its own, and the preset of {made.contract.name} has its own; drop one"
-        )
-    if "collate" in config.loader.model_fields_set:
-        raise ConfigError("loader.collate: the model's preset makes its own batches; leave it out")
-    pipeline = stored_preset(made).pipeline
-    assert isinstance(pipeline, Pipeline)
-    return replace(config, pipeline=pipeline, model=made)

@@ -10,9 +10,9 @@ from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.io.sources.combine import Selectable
-from pcdata.io.sources.open_source import open_source, read_skip_file
+from pcdata.io.sources.opening import open_source, read_skip_file
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, OPENING, checked_fields, options_of
-from pcdata.yaml_nodes import YamlDocument
+from pcdata.yaml_nodes import Document
 
 _FILES = ("path", "calibration", "skip_file")  # relative to the folder of the configuration
 
@@ -106,7 +106,7 @@ class SourceSettings:
         raise ConfigError(f"source: the configuration says {name} {stated!r}, the argument {given!r}; drop one")
 
 
-def source_settings(document: YamlDocument, node: Any, folder: Path | None) -> SourceSettings:
+def source_settings(document: Document, node: Any, folder: Path | None) -> SourceSettings:
     """Read the section; faults go to the document.
 
     Args:

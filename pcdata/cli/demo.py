@@ -63,7 +63,7 @@ def run_demo(
 
     picture = folder / "demo.png"
     capture = source.load(source.ids[0])
-    stages = {type(step).__name__: data for step, data in config.pipeline.deterministic_prefix().step_through(capture)}
+    stages = {type(step).__name__: data for step, data in config.pipeline.split()[0].step_through(capture)}
     drawn = [(caption, stages[step]) for step, caption in _DRAWN.items()]
     save_pipeline_figure(picture, capture, drawn, title="pcdata: from raw depth to a training sample")
     return DemoResult(report, picture, batches)

@@ -9,12 +9,11 @@ from typing import Literal
 from pcdata.datasets.samples import SampleDataset
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning
 from pcdata.imports import imported_files
-from pcdata.io.store.cloud_record import cloud_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.record import cloud_from_record
 from pcdata.io.store.stores import STORES
 from pcdata.structures import PointCloud
-from pcdata.transforms import Transform
-from pcdata.transforms.pipeline import Pipeline
+from pcdata.transforms import Compose, Transform
 
 
 class CachedCloudDataset(SampleDataset):
@@ -40,16 +39,16 @@ class CachedCloudDataset(SampleDataset):
         self,
         folder: str | Path,
         *,
-        pipeline: Pipeline | None = None,
+        pipeline: Compose | None = None,
         augment: Transform | Literal["stored"] | None = "stored",
         seed: int = 0,
         repeats: int = 1,
     ) -> None:
         if isinstance(augment, str) and augment != "stored":
             raise ConfigError(f"augment must be 'stored', None or a transform, got {augment!r}")
-        if pipeline is not None and not isinstance(pipeline, Pipeline):
+        if pipeline is not None and not isinstance(pipeline, Compose):
             raise DTypeError(
-                f"pipeline must be a Pipeline, not {type(pipeline).__name__}; of a configuration file it is "
+                f"pipeline must be a Compose, not {type(pipeline).__name__}; of a configuration file it is "
                 "pcdata.load_config(path).pipeline"
             )
         self.folder = Path(folder)
@@ -57,20 +56,21 @@ class CachedCloudDataset(SampleDataset):
         stored = self._stored_pipeline()
         self._warn_of_other_files()
         wanted = stored if pipeline is None else pipeline
-        if wanted.fingerprint() != self.manifest.fingerprint:
+        fingerprint = wanted.stored_fingerprint()
+        if fingerprint != self.manifest.fingerprint:
             raise CacheError(
                 f"{folder}: the cache was made by other deterministic steps than the ones given "
-                f"(fingerprint {self.manifest.fingerprint[:12]}, expected {wanted.fingerprint()[:12]}): "
+                f"(fingerprint {self.manifest.fingerprint[:12]}, expected {fingerprint[:12]}): "
                 f"{wanted.difference(stored)}; rebuild it with this pipeline, or load it with its own"
             )
         self.pipeline = wanted
-        transform = wanted.random_suffix() if isinstance(augment, str) else augment
+        transform = wanted.split()[1] if isinstance(augment, str) else augment
         super().__init__([sample.id for sample in self.manifest.samples], transform, seed, repeats)
         self._store = STORES[self.manifest.format](self.folder)
 
-    def _stored_pipeline(self) -> Pipeline:
+    def _stored_pipeline(self) -> Compose:
         try:
-            return Pipeline.from_config(self.manifest.pipeline)
+            return Compose.from_config(self.manifest.pipeline)
         except (ConfigError, RecursionError) as error:
             raise CacheError(
                 f"{self.folder / FILE_NAME}: its pipeline cannot be built: {error}{self._own_steps()}, or rebuild the "

@@ -11,7 +11,7 @@ from pcdata.errors import ContractError, PcdataError
 from pcdata.exports.target import Target
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.models import ModelBatch, contract, preset, require
-from pcdata.models.preset import batch_of
+from pcdata.models.batching import batch_of
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Deproject
 

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from pcdata.datasets import CachedCloudDataset, SampleDataset
-from pcdata.errors import ContractError, DTypeError, PcdataError, locates_path
+from pcdata.errors import ContractError, DTypeError, PcdataError
 from pcdata.models.batch import ModelBatch
+from pcdata.models.batching import batch_of
 from pcdata.models.catalogue import contract as contract_named
 from pcdata.models.contract import ModelContract
 from pcdata.models.foreign import read_samples
-from pcdata.models.preset import batch_of
 from pcdata.models.rules import cheap_checks
 from pcdata.models.value_rules import value_checks
 from pcdata.structures import DepthFrame, PointCloud
@@ -69,7 +69,6 @@ def check(
     return summary
 
 
-@locates_path
 def check_files(
     path: str | Path,
     model: str,

@@ -5,34 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import yaml
-
 from pcdata.datasets import CloudDataset
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.io import CaptureSource
 from pcdata.models.batch import ModelBatch
+from pcdata.models.batching import batch_of
 from pcdata.models.catalogue import contract as contract_named
 from pcdata.models.catalogue import missing_choices
+from pcdata.models.check import require
 from pcdata.models.contract import ModelContract
-from pcdata.models.images import image_tensor
 from pcdata.models.steps import pipeline_of
-from pcdata.models.tensors import contract_tensor
-from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
-from pcdata.transforms import Compose, Pipeline
-from pcdata.transforms.config import pipeline_from_config
-from pcdata.yaml_nodes import yaml_text
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms import Compose
+from pcdata.yaml_nodes import YamlDocument, yaml_text
 
 
 class Preset:
     """A contract with its choices made, the pipeline that meets it, and :meth:`collate` for ``DataLoader``.
 
-    The pipeline is yours to change (``preset.pipeline``): put your own cleaning and augmentation into its sections;
+    The pipeline is yours to change (``preset.pipeline``): a chain of its steps and your own cleaning and augmentation;
     :func:`pcdata.models.check` says whether the result still fits the model.
     """
 
-    def __init__(
-        self, contract: ModelContract, choices: Mapping[str, Any], pipeline: Pipeline | Compose | None = None
-    ) -> None:
+    def __init__(self, contract: ModelContract, choices: Mapping[str, Any], pipeline: Compose | None = None) -> None:
         self.contract = contract
         self.choices = dict(choices)
         self.pipeline = pipeline_of(contract, merge_views=True) if pipeline is None else pipeline
@@ -53,8 +48,6 @@ class Preset:
         wrong = [type(sample).__name__ for sample in samples if not isinstance(sample, kind)]
         if wrong:
             raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got a {wrong[0]} in it")
-        from pcdata.models.check import require  # it builds batches of clouds by this module
-
         batch = batch_of(samples, self.contract, self.choices)
         require(batch, self.contract.name, cheap=True)
         return batch
@@ -64,11 +57,8 @@ class Preset:
 
     def to_yaml(self) -> str:
         """Write model, choices and pipeline as YAML that :meth:`from_yaml` reads back."""
-        if isinstance(self.pipeline, Pipeline):
-            sections: Any = self.pipeline.to_config()
-        else:
-            sections = {"depth": self.pipeline.to_config_list()}
-        return yaml_text({"model": self.contract.name, "choices": self.plain_choices(), "pipeline": sections})
+        parts = {"model": self.contract.name, "choices": self.plain_choices(), "pipeline": self.pipeline.sections()}
+        return yaml_text(parts)
 
     def plain_choices(self) -> dict[str, Any]:
         """Return the choices as JSON and YAML can hold them."""
@@ -81,18 +71,19 @@ class Preset:
         Raises:
             ConfigError: not a preset, an unknown model or choice, or a pipeline that cannot be built.
         """
-        try:
-            stored = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"preset: cannot read this YAML: {error}") from error
-        if not isinstance(stored, dict) or set(stored) != {"model", "choices", "pipeline"}:
-            raise ConfigError("preset: the YAML must have model, choices and pipeline, and only those")
-        choices = {name: _tuples(value) for name, value in (stored["choices"] or {}).items()}
-        made = preset(stored["model"], **choices)
-        if made.contract.takes == "depth image":
-            made.pipeline = pipeline_from_config(stored["pipeline"]["depth"])
-        else:
-            made.pipeline = Pipeline.from_config(stored["pipeline"])
+        document = YamlDocument(text, "preset")
+        entries = document.mapping(document.root, "a preset")
+        if set(entries) != {"model", "choices", "pipeline"}:
+            document.fault(document.root, "the YAML must have model, choices and pipeline, and only those")
+        document.raise_faults()
+        name, choices, pipeline = (entries[key][1] for key in ("model", "choices", "pipeline"))
+        chosen = {key: _tuples(document.plain(node)) for key, (_, node) in document.mapping(choices, "choices").items()}
+        document.raise_faults()
+        made = preset(str(document.plain(name)), **chosen)
+        made.pipeline = Compose.from_document(document, pipeline)
+        if made.pipeline.gives is not made._sample_type():
+            document.fault(pipeline, f"{made!r} takes a {made._sample_type().__name__}, the pipeline ends in another")
+            document.raise_faults()
         return made
 
     def __repr__(self) -> str:
@@ -119,52 +110,10 @@ def preset(name: str, /, **choices: Any) -> Preset:
     return Preset(contract, choices)
 
 
-def batch_of(
-    samples: Sequence[PointCloud | DepthFrame], contract: ModelContract, choices: Mapping[str, Any]
-) -> ModelBatch:
-    """Make the contract's tensors of clouds or depth images, without judging them."""
-    kind = DepthFrame if contract.takes == "depth image" else PointCloud
-    for sample in samples:
-        if not isinstance(sample, kind):
-            raise DTypeError(f"{contract.name}: takes a {kind.__name__}, got a {type(sample).__name__}")
-    channels = {tensor.key: tensor.channel_names for tensor in contract.tensors}
-    if contract.takes == "depth image":
-        frames = [sample for sample in samples if isinstance(sample, DepthFrame)]
-        return ModelBatch(
-            tensors={tensor.key: image_tensor(frames, contract, tensor) for tensor in contract.tensors},
-            model=contract.name,
-            choices=choices,
-            channels=channels,
-            frame_id=CAMERA_FRAME,
-            unit=METRE,
-            meta=[{"sample_id": frame.sample_id} for frame in frames],
-        )
-    parts = [sample for sample in samples if isinstance(sample, PointCloud)]
-    clouds = PointCloud.cat(parts).with_meta(
-        [{"sample": number} for number, part in enumerate(parts) for _ in range(part.num_clouds)]
-    )
-    if "category" in choices:
-        clouds = clouds.with_meta([{"category": choices["category"]}] * clouds.num_clouds)
-    return ModelBatch(
-        tensors={tensor.key: contract_tensor(clouds, contract, tensor) for tensor in contract.tensors},
-        model=contract.name,
-        choices=choices,
-        channels=channels,
-        frame_id=clouds.frame_id,
-        unit=clouds.unit,
-        counts=tuple(clouds.counts.tolist()),
-        steps=tuple(str(step.get("step", "")) for step in clouds.history[0]),
-        source_from_cloud=clouds.source_from_cloud,
-        source_frame=clouds.source_frame,
-        frames=clouds.frames,
-        meta=clouds.meta,
-    )
-
-
 class _PresetDataset(CloudDataset):
     """A dataset whose samples are what the preset's pipeline gives."""
 
-    def __init__(self, source: CaptureSource, pipeline: Pipeline | Compose, *, seed: int, gives: type) -> None:
+    def __init__(self, source: CaptureSource, pipeline: Compose, *, seed: int, gives: type) -> None:
         super().__init__(source, pipeline, seed=seed)
         self.gives = gives
 

@@ -18,7 +18,6 @@ from pcdata.transforms import (
     MaskDepth,
     MergeViews,
     NormalizeUnitSphere,
-    Pipeline,
     RandomColumn,
     RandomSample,
     RandomVoxelSample,
@@ -33,8 +32,8 @@ from pcdata.transforms import (
 _HALF_TURN = ((-1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Pipeline | Compose:
-    """Build the pipeline: a Pipeline that ends in clouds, or a Compose of image steps that ends in images."""
+def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Compose:
+    """Build the chain, which ends in clouds or in images as the model takes them."""
     if contract.takes == "depth image":
         return Compose(_image_steps(contract))
     depth: list[Transform] = [Deproject()]
@@ -42,9 +41,7 @@ def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Pipeline | Com
         depth = [ResizeDepth(size=contract.image_size), Deproject()]
     if contract.far is not None:
         depth = [MaskDepth(far=contract.far, use_mask=False), *depth]
-    steps = _cloud_steps(contract, merge_views)
-    first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
-    return Pipeline(depth=depth, cloud=steps[:first], augment=steps[first:])
+    return Compose([*depth, *_cloud_steps(contract, merge_views)])
 
 
 def _image_steps(contract: ModelContract) -> list[Transform]:

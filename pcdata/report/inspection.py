@@ -62,9 +62,9 @@ def dataset_text(folder: str | Path) -> str:
         ["made with", ", ".join(f"{name} {version}" for name, version in manifest.versions.items())],
     ]
     facts += [["built with", f"{one['file']}, sha256 {one['sha256'][:16]}"] for one in manifest.imports]
-    stored = dataset.pipeline.deterministic_prefix()
-    steps = [["stored", repr(step)] for step in [*stored.depth, *stored.cloud, *stored.augment]]
-    steps += [["on the fly", repr(step)] for step in dataset.pipeline.random_suffix().steps]
+    stored, on_the_fly = dataset.pipeline.split()
+    steps = [["stored", repr(step)] for step in stored.steps]
+    steps += [["on the fly", repr(step)] for step in on_the_fly.steps]
     tables = f"{text_table(['dataset', str(folder)], facts)}\n\n{text_table(['when', 'step'], steps)}"
     return f"{tables}\n\n{skipped_text(manifest.skipped)}" if manifest.skipped else tables
 

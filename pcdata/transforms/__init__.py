@@ -2,10 +2,11 @@
 
 from pcdata.transforms.augment import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
+from pcdata.transforms.chain_rules import PipelineOrderWarning
 from pcdata.transforms.clusters import ClusterObjects, LeftOutWarning, SplitObjects
 from pcdata.transforms.columns import RandomColumn, ShiftToOrigin
 from pcdata.transforms.completion import CompleteDepth
-from pcdata.transforms.compose import Compose, PipelineOrderWarning, RandomApply
+from pcdata.transforms.compose import Compose
 from pcdata.transforms.confidence import KeepConfidence
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.depth import Deproject, MaskDepth
@@ -20,8 +21,8 @@ from pcdata.transforms.noise import RandomColorJitter, RandomJitter, RandomPoint
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace
 from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
-from pcdata.transforms.pipeline import Pipeline
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
+from pcdata.transforms.random_apply import RandomApply
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.unreliable import MarkUnreliableDepth
 from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
@@ -49,7 +50,6 @@ __all__ = [
     "NearestCompletion",
     "NormalizeUnitSphere",
     "NormalizeWorkspace",
-    "Pipeline",
     "PipelineOrderWarning",
     "RandomApply",
     "RandomColorJitter",

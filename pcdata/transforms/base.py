@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -98,13 +98,17 @@ class Transform(nn.Module):
 
     def unit_needed(self) -> str | None:
         """The unit that the fields' lengths are in, or None when no length is given: any will do."""
-        units = length_fields(type(self))  # type: ignore[arg-type]
+        units = length_fields(type(self))
         given = [unit for name, unit in units.items() if getattr(self, name) is not None]
         return METRE if self.needs_metres else next(iter(given), None)
 
     def unit_given(self) -> str | None:
         """The unit of the result, or None when it is the input's."""
         return None
+
+    def parts(self) -> Iterator[Transform]:
+        """The steps that do the work: those within a step that is made of others, else the step itself."""
+        yield self
 
     # -- what everybody calls --------------------------------------------------------------------------------------
 
@@ -124,12 +128,12 @@ class Transform(nn.Module):
             result = self.transform(data, params)
             return self.recorded(data, result, params)
         except Exception as error:
-            add_note(error, f"in {self!r} on {data!r}", step=type(self).__name__, sample_id=_sample_id(data))
+            add_note(error, f"in {self!r} on {data!r}")
             raise
 
     def config_fields(self) -> dict[str, Any]:
         """Return the fields by name, as they were given."""
-        return {name: getattr(self, name) for name in field_names(type(self))}  # type: ignore[arg-type]
+        return {name: getattr(self, name) for name in field_names(type(self))}
 
     def to_config(self) -> dict[str, dict[str, Any]]:
         """Return ``{name: fields}`` with plain values, the form that YAML holds."""
@@ -250,19 +254,12 @@ def unit_advice(step: Transform) -> str:
     if step.unit_needed() != METRE:
         return "put it after normalising, or leave unit out and give metres"
     own = ", or say unit: normalized if the length is meant in the normalised cloud"
-    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"  # type: ignore[arg-type]
+    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"
 
 
 def num_clouds(data: Data) -> int:
     """The number of independent clouds: B of a cloud, 1 of a capture."""
     return data.num_clouds if isinstance(data, PointCloud) else 1
-
-
-def _sample_id(data: Any) -> str | None:
-    """The sample id of one capture or one cloud; None = it has none, or there are several clouds."""
-    if isinstance(data, PointCloud):
-        return data.meta[0].get("sample_id") if data.num_clouds == 1 else None
-    return data.sample_id if isinstance(data, DepthFrame) else None
 
 
 def sample_name(cloud: PointCloud, b: int) -> str:

@@ -1,29 +1,34 @@
-"""Compose and RandomApply: transforms made of transforms."""
+"""Compose: the one chain, from captures or clouds to what a model takes."""
 
 from __future__ import annotations
 
-import itertools
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
+from os import PathLike
 from typing import Any
 
 from torch import Generator, nn
 
-from pcdata.errors import ConfigError, PcdataWarning
-from pcdata.rng import Streams, seeded
-from pcdata.structures import METRE, NORMALIZED, PointCloud
-from pcdata.transforms.base import Data, GeneratorLike, Params, Transform, num_clouds, unit_advice
+from pcdata.errors import ConfigError
+from pcdata.files.opening import read_text
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.transforms.base import Data, GeneratorLike, Transform, num_clouds
 from pcdata.transforms.capture import find_capture, run_capture
-from pcdata.transforms.fields import Fraction
-
-
-class PipelineOrderWarning(PcdataWarning):
-    """A pipeline is valid but its order costs time or quality."""
+from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
+from pcdata.transforms.chain_rules import check_chain, takes_clouds, warn_of_order
+from pcdata.transforms.field_checks import FaultyConfigError, validated_fields
+from pcdata.transforms.plain_document import PlainDocument
+from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
 class Compose(Transform):
-    """Run steps one after another; check at construction that neighbours fit.
+    """Run steps one after another, on captures or on clouds; check at construction that neighbours fit.
+
+    A cloud enters at the first step that takes one, so one chain serves depth images and PLY files. The steps before
+    the first random one always give the same: a dataset may store what they leave (:meth:`split`). A chain within is
+    opened: it adds nothing to its steps.
 
     Raises:
         ConfigError: a step cannot take what the step before it gives (capture or cloud, frame, unit).
@@ -32,18 +37,28 @@ class Compose(Transform):
     steps: Sequence[Transform]
 
     def __init__(self, steps: Sequence[Transform]) -> None:
-        self.steps = list(steps)
-        self.__post_init__()
+        given = validated_fields(Compose, {"steps": list(steps)})["steps"]
+        flat = [one for step in given for one in _opened(step)]
+        check_chain(flat)
+        warn_of_order(flat, stacklevel=2)
+        self._hold(flat)
 
-    def check_fields(self) -> None:
-        """Check the chain and make the steps submodules."""
-        flat = list(_flatten(self.steps))
-        _check_chain(flat)
-        _warn_statistics_before_crop(flat)
-        steps = self.__dict__.pop("steps")
+    @classmethod
+    def _of(cls, steps: Sequence[Transform]) -> Compose:
+        """A part of a chain, which was checked as a whole and warned about."""
+        part = cls.__new__(cls)
+        assert isinstance(part, Compose)
+        part._hold(steps)
+        return part
+
+    def _hold(self, steps: Sequence[Transform]) -> None:
         self._capture = find_capture(steps)
+        entry = next((i for i, step in enumerate(steps) if takes_clouds(step)), len(steps))
+        # A chain of images alone has no place for a cloud: its first step says so.
+        self._cloud_entry = 0 if steps and not issubclass(steps[-1].gives, PointCloud) else entry
+        self._last_random = max((i for i, step in enumerate(steps) if step.is_random), default=-1)
         self.steps = nn.ModuleList(steps)  # type: ignore[assignment]
-        self.is_random = any(step.is_random for step in steps)  # type: ignore[misc]
+        self.is_random = self._last_random >= 0  # type: ignore[misc]
         self.keeps_clouds = all(step.keeps_clouds for step in steps)  # type: ignore[misc]
         self.takes = steps[0].takes if steps else PointCloud  # type: ignore[misc]
         self.gives = steps[-1].gives if steps else PointCloud  # type: ignore[misc]
@@ -59,53 +74,138 @@ class Compose(Transform):
         units = [step.unit_given() for step in self.steps]
         return next((unit for unit in reversed(units) if unit is not None), None)
 
+    def parts(self) -> Iterator[Transform]:
+        """The steps, with those within them."""
+        for step in self.steps:
+            yield from step.parts()
+
+    # -- running ---------------------------------------------------------------------------------------------------
+
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
-        """Run every step; the steps record themselves, the chain adds nothing."""
-        result = data
-        for _, result in self._run(data, generator, self._capture):  # noqa: B007 - the last one counts
-            pass
-        return result
+        """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
+        position, generator = self._enter(data, generator)
+        steps = list(self.steps)
+        capture = self._capture
+        if capture is not None and position <= capture.start:
+            for step in steps[position : capture.start]:
+                data, generator = _step(step, data, generator)
+            cloud = run_capture(steps[capture], data)
+            position = capture.start
+            if cloud is not None:
+                data, position = cloud, capture.stop
+        for step in steps[position:]:
+            data, generator = _step(step, data, generator)
+        return data
 
     def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
         """Yield ``(step, data)`` after every step, for looking inside."""
-        return self._run(data, generator, None)
-
-    def _run(
-        self, data: Data, generator: GeneratorLike | None, capture: slice | None
-    ) -> Iterator[tuple[Transform, Any]]:
-        """Yield after every step, with those of ``capture`` run as one where that is possible."""
-        if self.is_random:
-            generator = self._generator(generator)
-            if not isinstance(generator, Generator):
-                generator = Streams.of(generator, num_clouds(data)).generators
-        steps = list(self.steps)
-        position = 0
-        while position < len(steps):
-            step = steps[position]
-            if capture is not None and position == capture.start:
-                cloud = run_capture(steps[capture], data)
-                if cloud is not None:
-                    data, position = cloud, capture.stop
-                    yield steps[position - 1], data
-                    continue
-            if step.is_random:
-                # One stream per cloud, split off once: random steps in a row draw from the same streams, so that
-                # running only the random suffix on a cached prefix gives the same draws.
-                generator = _streams_for(generator, num_clouds(data))
-            data = step(data, generator=generator if step.is_random else None)
-            position += 1
+        position, generator = self._enter(data, generator)
+        for step in list(self.steps)[position:]:
+            data, generator = _step(step, data, generator)
             yield step, data
 
-    def split(self) -> tuple[Compose, Compose]:
-        """Return the longest deterministic prefix, which a cache may hold, and the rest; a chain within is opened."""
-        steps = list(opened(self.steps))
-        first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
-        with order_checked_before():
-            return Compose(steps[:first]), Compose(steps[first:])
+    def _enter(self, data: Data, generator: GeneratorLike | None) -> tuple[int, GeneratorLike | None]:
+        """Return the first step to run, and the generator or one for each cloud."""
+        position = self._cloud_entry if isinstance(data, PointCloud) else 0
+        if self._last_random < position:
+            return position, None
+        generator = self._generator(generator)
+        if not isinstance(generator, Generator):
+            generator = Streams.of(generator, num_clouds(data)).generators
+        return position, generator
 
-    def to_config_list(self) -> list[dict[str, Any]]:
-        """Return the steps as a list of ``{name: fields}``."""
-        return [step.to_config() for step in self.steps]
+    # -- what may be stored ----------------------------------------------------------------------------------------
+
+    def split(self) -> tuple[Compose, Compose]:
+        """Return the longest deterministic beginning, which a dataset may store, and the rest."""
+        steps = list(self.steps)
+        first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
+        return self._of(steps[:first]), self._of(steps[first:])
+
+    def stored_fingerprint(self) -> str:
+        """SHA-256 of what may be stored: equal for datasets that hold the same clouds."""
+        stored = list(self.split()[0].steps)
+        # Of captures, of clouds, and of nothing random.
+        parts = [self._of(part).fingerprint() for part in (*self._at_entry(stored), [])]
+        return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+    def difference(self, other: Compose) -> str:
+        """Say where the steps of two chains that may be stored first differ."""
+        pairs = zip_longest(self.split()[0].steps, other.split()[0].steps)
+        for position, (mine, stored) in enumerate(pairs, start=1):
+            if mine is None or stored is None or mine.fingerprint() != stored.fingerprint():
+                return f"step {position}: {mine or 'nothing'} here, {stored or 'nothing'} there"
+        return "a transform's version changed"
+
+    # -- written down ----------------------------------------------------------------------------------------------
+
+    def sections(self) -> dict[str, list[Any]]:
+        """Return the steps as plain data in the sections of a configuration, which :meth:`from_config` reads.
+
+        ``depth`` takes captures, ``cloud`` clouds, and ``augment`` begins with the first random step on clouds.
+        """
+        depth, clouds = self._at_entry(list(self.steps))
+        first = next((i for i, step in enumerate(clouds) if step.is_random), len(clouds))
+        parts = (depth, clouds[:first], clouds[first:])
+        return {section: [step.to_config() for step in part] for section, part in zip(SECTIONS, parts)}
+
+    def to_yaml(self) -> str:
+        """Write the sections as YAML that :meth:`from_yaml` reads."""
+        return yaml_text(self.sections())
+
+    @classmethod
+    def from_yaml(cls, text: str, *, name: str = "<yaml>") -> Compose:
+        """Build from YAML: a list of ``{transform: fields}``, or such lists in the sections depth, cloud and augment.
+
+        Beside sections, ``sensor`` may name the one whose figures stand for the word ``sensor`` as a value: the value
+        is computed here, and the chain holds the number.
+
+        Raises:
+            ConfigError: every fault, as ``name:line:column: what``.
+        """
+        document = YamlDocument(text, name)
+        return cls.from_document(document, document.root)
+
+    @classmethod
+    def from_config(cls, steps: Sequence[Any] | Mapping[str, Any], *, name: str = "<config>") -> Compose:
+        """Build from plain data: a list of steps, or the sections that :meth:`sections` returns.
+
+        Raises:
+            ConfigError: every fault.
+        """
+        return cls.from_document(PlainDocument(steps, name), steps)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Compose:
+        """Build from a YAML file; see :meth:`from_yaml`."""
+        return cls.from_yaml(read_text("configuration", path, error=ConfigError), name=str(path))
+
+    @classmethod
+    def from_document(cls, document: Document, node: Any) -> Compose:
+        """Build from a node of a document and raise its faults; see :meth:`from_yaml`."""
+        return cls._placed(document, steps_of_document(document, node))
+
+    @classmethod
+    def from_sections(cls, document: Document, entries: Mapping[str, tuple[Any, Any]]) -> Compose:
+        """Build from those entries of a document that are sections of a chain, and raise its faults."""
+        return cls._placed(document, steps_of_sections(document, entries))
+
+    @classmethod
+    def _placed(cls, document: Document, placed: Sequence[tuple[Transform, Any]]) -> Compose:
+        document.raise_faults()
+        try:
+            return cls([step for step, _ in placed])
+        except FaultyConfigError as error:
+            places = [node for step, node in placed for _ in _opened(step)]
+            for (position, *_), message in error.faults:
+                document.fault(places[int(position)], message)
+            document.raise_faults()
+            raise
+
+    def _at_entry(self, steps: list[Transform]) -> tuple[list[Transform], list[Transform]]:
+        """Return the steps before the first that takes a cloud, and the others."""
+        entry = next((i for i, step in enumerate(steps) if takes_clouds(step)), len(steps))
+        return steps[:entry], steps[entry:]
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -114,44 +214,17 @@ class Compose(Transform):
         return f"Compose([{', '.join(map(repr, self.steps))}])"
 
 
-class RandomApply(Transform):
-    """Apply a transform to each cloud with a probability.
-
-    Args:
-        step: what is applied, from clouds to clouds.
-    """
-
-    is_random = True
-
-    step: Transform
-    probability: Fraction = 0.5
-
-    def check_fields(self) -> None:
-        """Require a transform from clouds to clouds."""
-        if not (self.step.takes is PointCloud and self.step.gives is PointCloud):
-            raise ConfigError(f"RandomApply: {type(self.step).__name__} does not turn clouds into clouds")
-        self.keeps_clouds = self.step.keeps_clouds  # type: ignore[misc]
-
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
-        chosen = streams.uniform(0.0, 1.0) < self.probability
-        return {"chosen": chosen, "seed": streams.seeds()}
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Run the inner transform on the chosen clouds and pack all again."""
-        clouds = data.unbatch()
-        for b, (chosen, seed) in enumerate(zip(params["chosen"].tolist(), params["seed"].tolist(), strict=True)):
-            if chosen:
-                clouds[b] = self.step(clouds[b], generator=[seeded(seed)])
-        return PointCloud.cat(clouds)
+def _opened(step: Transform) -> Sequence[Transform]:
+    return step.steps if isinstance(step, Compose) else [step]
 
 
-@contextmanager
-def order_checked_before() -> Iterator[None]:
-    """Compose steps again whose order was warned about when they were first composed."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PipelineOrderWarning)
-        yield
+def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:
+    if not step.is_random:
+        return step(data, generator=None), generator
+    # One stream per cloud, split off once: random steps in a row draw from the same streams, so that running only the
+    # random suffix on a stored prefix gives the same draws.
+    generator = _streams_for(generator, num_clouds(data))
+    return step(data, generator=generator), generator
 
 
 def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Generator]:
@@ -162,56 +235,3 @@ def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Genera
         return generator
     # Views were merged or split: the first stream carries on.
     return generator[:1] if count == 1 else Streams.of(generator[0], count).generators
-
-
-def opened(steps: Sequence[Transform]) -> Iterator[Transform]:
-    """Yield the steps with those of a chain within in its place: a chain adds nothing to its steps."""
-    for step in steps:
-        if isinstance(step, Compose):
-            yield from opened(step.steps)
-        else:
-            yield step
-
-
-def _flatten(steps: Sequence[Transform]) -> Iterator[Transform]:
-    for step in opened(steps):
-        if isinstance(step, RandomApply):
-            yield from _flatten([step.step])
-        else:
-            yield step
-
-
-def _check_chain(steps: Sequence[Transform]) -> None:
-    frame: str | None = None
-    unit = METRE if steps and steps[0].takes is not PointCloud else None  # None: that of whatever comes in
-    for position, (before, after) in enumerate(itertools.pairwise(steps), start=1):
-        if not issubclass(before.gives, after.takes):
-            raise ConfigError(
-                f"Compose: step {position + 1}, {type(after).__name__}, takes a {after.takes.__name__} but step "
-                f"{position}, {type(before).__name__}, gives a {before.gives.__name__}"
-                + ("; put Deproject between them" if before.gives is not PointCloud else "")
-            )
-    for position, step in enumerate(steps, start=1):
-        where = f"Compose: step {position}, {type(step).__name__},"
-        needed = step.frame_needed()
-        if frame is not None and needed is not None and needed != frame:
-            raise ConfigError(f"{where} works in frame {needed!r} but the cloud is in {frame!r} there")
-        wanted = step.unit_needed()
-        if unit is not None and wanted is not None and wanted != unit:
-            names = {METRE: "in metres", NORMALIZED: "normalised"}
-            works = "in metres" if wanted == METRE else "on normalised clouds"
-            raise ConfigError(f"{where} works {works} but the cloud is {names[unit]} there; {unit_advice(step)}")
-        frame = step.frame_after(frame)
-        unit = step.unit_given() or wanted or unit
-
-
-def _warn_statistics_before_crop(steps: Sequence[Transform]) -> None:
-    names = [type(step).__name__ for step in steps]
-    early = next((i for i, step in enumerate(steps) if step.runs_statistics), len(steps))
-    if "CropWorkspace" in names[early:] and "CropWorkspace" not in names[:early]:
-        warnings.warn(
-            f"{names[early]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "
-            "alone find more of its outliers",
-            PipelineOrderWarning,
-            stacklevel=5,  # check_fields, __post_init__, __init__, then the caller
-        )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any, get_args, get_type_hints
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from torch import Tensor
@@ -13,21 +13,41 @@ from torch import Tensor
 from pcdata.errors import ConfigError, near_matches
 from pcdata.transforms.fields import LengthIn
 
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
-@functools.cache
+
+def _cached(function: _Function) -> _Function:
+    """functools.cache under the function's own type: to a type checker no class of modules can be hashed."""
+    return functools.cache(function)  # type: ignore[return-value]
+
+
+@_cached
 def field_names(cls: type) -> tuple[str, ...]:
     """Return the names of the declared fields, in order."""
     return tuple(f.name for f in dataclasses.fields(cls))
 
 
-@functools.cache
+def has_fields(cls: type, given: Mapping[str, Any]) -> bool:
+    """Whether all that must be given is given, and nothing that is no field."""
+    known = field_names(cls)
+    return all(name in known for name in given) and required_fields(cls) <= given.keys()
+
+
+@_cached
+def required_fields(cls: type) -> frozenset[str]:
+    """Return the names of the fields without a default."""
+    missing = dataclasses.MISSING
+    return frozenset(f.name for f in dataclasses.fields(cls) if f.default is missing and f.default_factory is missing)
+
+
+@_cached
 def field_types(cls: type) -> dict[str, Any]:
     """Return the declared fields' types with their limits."""
     hints = get_type_hints(cls, include_extras=True)
     return {name: hints[name] for name in field_names(cls)}
 
 
-@functools.cache
+@_cached
 def length_fields(cls: type) -> dict[str, str]:
     """Return the unit of every declared field that is a length in a unit."""
     found = {name: _length_unit(hint) for name, hint in field_types(cls).items()}
@@ -39,7 +59,7 @@ def _length_unit(hint: Any) -> str | None:
     return next(iter(own), None) or next(filter(None, map(_length_unit, get_args(hint))), None)
 
 
-@functools.cache
+@_cached
 def _field_model(cls: type) -> Any:
     import pydantic  # imported late: only needed once a transform is made
 
@@ -57,28 +77,31 @@ def _field_model(cls: type) -> Any:
     return pydantic.create_model(cls.__name__, __config__=config, **fields)
 
 
-def field_faults(cls: type, fields: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:
-    """Return every fault of these fields as (path, message); empty when they are valid."""
-    import pydantic
+Path = tuple[int | str, ...]
 
-    try:
-        _field_model(cls)(**_as_plain_fields(fields))
-    except pydantic.ValidationError as error:
-        return [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
-    return []
+
+class FaultyConfigError(ConfigError):
+    """Faults of one configuration, each with the path that leads to it from what was given."""
+
+    def __init__(self, message: str, faults: Sequence[tuple[Path, str]] = ()) -> None:
+        super().__init__(message)
+        self.faults = list(faults)
 
 
 def validated_fields(cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields converted to their declared types.
 
     Raises:
-        ConfigError: listing every fault.
+        FaultyConfigError: every fault with its path.
     """
-    given = _as_plain_fields(fields)
-    faults = field_faults(cls, given)
-    if faults:
-        raise ConfigError("\n".join(f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults))
-    model = _field_model(cls)(**given)
+    import pydantic
+
+    try:
+        model = _field_model(cls)(**{name: _as_plain(value) for name, value in fields.items()})
+    except pydantic.ValidationError as error:
+        faults = [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
+        lines = [f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults]
+        raise FaultyConfigError("\n".join(lines), faults) from None
     return {name: getattr(model, name) for name in field_names(cls)}
 
 
@@ -89,10 +112,6 @@ def _fault_message(cls: type, fault: Any) -> str:
         return f"no such field{near_matches(name, known) or f'; {cls.__name__} has {list(known)}'}"
     given = "" if fault["type"] == "missing" else f" (got {fault['input']!r})"
     return f"{fault['msg']}{given}"
-
-
-def _as_plain_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _as_plain(value) for name, value in fields.items()}
 
 
 def _as_plain(value: Any) -> Any:

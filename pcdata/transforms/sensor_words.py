@@ -12,23 +12,21 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, get_args, get_origin
 
-import yaml
-
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
 from pcdata.structures import METRE
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.field_checks import field_types
 from pcdata.transforms.fields import FromSensor
-from pcdata.yaml_nodes import SensorChoice, YamlDocument
+from pcdata.yaml_nodes import Document, SensorChoice
 
 SENSOR = "sensor"
 _DIGITS = 3  # significant: no figure of a profile is known better, and libm's last digits differ between machines
 
 
-def sensor_from_node(document: YamlDocument, node: yaml.Node) -> SensorChoice | None:
+def sensor_from_node(document: Document, node: Any) -> SensorChoice | None:
     """Read which sensor a file names; faults are noted."""
-    if isinstance(node, yaml.MappingNode):
+    if document.is_mapping(node):
         entries = document.mapping(node, SENSOR)
         for key, (place, _) in entries.items():
             if key not in ("name", "depth"):
@@ -57,12 +55,12 @@ def sensor_from_node(document: YamlDocument, node: yaml.Node) -> SensorChoice | 
     return SensorChoice(profile, float(depth))
 
 
-def is_sensor_word(node: yaml.Node, declared: Any) -> bool:
+def is_sensor_word(word: str | None, declared: Any) -> bool:
     """Say whether a field's value is the word ``sensor`` and the field may say so."""
-    return isinstance(node, yaml.ScalarNode) and node.value == SENSOR and _mark(declared) is not None
+    return word == SENSOR and _mark(declared) is not None
 
 
-def sensor_value(document: YamlDocument, node: yaml.Node, cls: type[Transform], key: str) -> float | str | None:
+def sensor_value(document: Document, node: Any, cls: type[Transform], key: str) -> float | str | None:
     """Return what the word ``sensor`` stands for in this field; faults are noted."""
     mark = _mark(_types(cls)[key])
     assert mark is not None  # is_sensor_word
@@ -76,12 +74,12 @@ def sensor_value(document: YamlDocument, node: yaml.Node, cls: type[Transform], 
 
 
 def check_sensor_unit(
-    document: YamlDocument, cls: type[Transform], nodes: Mapping[str, yaml.Node], fields: Mapping[str, Any]
+    document: Document, cls: type[Transform], nodes: Mapping[str, Any], fields: Mapping[str, Any]
 ) -> None:
     """Note a fault where a step says ``sensor``, which means metres, for a length in another unit."""
     unit = fields.get("unit", METRE)
     for key, node in nodes.items():
-        if unit != METRE and is_sensor_word(node, _types(cls).get(key)):
+        if unit != METRE and is_sensor_word(document.word(node), _types(cls).get(key)):
             document.fault(
                 node,
                 f"{cls.__name__}.{key}: a sensor's figures are in metres, but unit is {unit!r}; give a number in that "
@@ -104,4 +102,4 @@ def _mark(declared: Any) -> FromSensor | None:
 
 
 def _types(cls: type[Transform]) -> dict[str, Any]:
-    return field_types(cls)  # type: ignore[arg-type]
+    return field_types(cls)

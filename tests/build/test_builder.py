@@ -57,7 +57,7 @@ def test_a_dataset_holds_what_the_deterministic_steps_give(tmp_path, source, con
     config = configure(f"output: {{format: {form}}}")
     report = build_dataset(config, source, tmp_path / "out")
     assert [sample.id for sample in report.samples] == source.ids
-    prefix = config.pipeline.deterministic_prefix()
+    prefix = config.pipeline.split()[0]
     dataset = CachedCloudDataset(tmp_path / "out", augment=None)
     for stored, name in zip(dataset, source.ids, strict=True):
         wanted = prefix(source.load(name))
@@ -71,8 +71,9 @@ def test_the_fingerprint_stored_is_that_of_the_prefix(tmp_path, source, configur
     config = configure()
     build_dataset(config, source, tmp_path / "out")
     manifest = Manifest.read(tmp_path / "out")
-    assert manifest.fingerprint == config.pipeline.fingerprint() == config.pipeline.deterministic_prefix().fingerprint()
-    assert manifest.pipeline == config.pipeline.to_config()
+    prefix, _ = config.pipeline.split()
+    assert manifest.fingerprint == config.pipeline.stored_fingerprint() == prefix.stored_fingerprint()
+    assert manifest.pipeline == config.pipeline.sections()
     assert set(manifest.versions) == {"pcdata", "torch", "numpy", "python"}
 
 
@@ -368,9 +369,9 @@ def test_the_manifest_is_readable_by_people_and_other_programs(tmp_path, source,
 
 
 def test_the_stored_yaml_makes_the_same_pipeline(tmp_path, source, configure):
-    from pcdata.transforms import Pipeline
+    from pcdata.transforms import Compose
 
     config = configure()
     build_dataset(config, source, tmp_path / "out")
-    again = Pipeline.load(str(tmp_path / "out" / "pipeline.yaml"))
-    assert again.to_config() == config.pipeline.to_config()
+    again = Compose.load(str(tmp_path / "out" / "pipeline.yaml"))
+    assert again.to_config() == config.pipeline.sections()

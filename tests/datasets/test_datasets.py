@@ -14,7 +14,7 @@ from torch.utils.data import Subset
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataError
 from pcdata.io.store.manifest import checksum_of
-from pcdata.transforms import MaskDepth, Pipeline, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
+from pcdata.transforms import Compose, MaskDepth, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
 from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "pt"]
@@ -94,7 +94,7 @@ def test_the_global_random_state_neither_matters_nor_changes(caches):
 
 def test_augment_none_gives_the_stored_clouds_in_every_epoch(caches, source, config):
     dataset = CachedCloudDataset(caches["hdf5"], augment=None)
-    stored = config.pipeline.deterministic_prefix()(source.load(source.ids[0]))
+    stored = config.pipeline.split()[0](source.load(source.ids[0]))
     assert same(dataset[0], stored)
     dataset.set_epoch(9)
     assert same(dataset[0], stored)
@@ -127,24 +127,24 @@ def test_the_pipeline_that_built_a_cache_opens_it(caches, config):
 
 
 def test_another_augmentation_opens_it_too_and_is_the_one_that_runs(caches, config):
-    calm = Pipeline(depth=list(config.pipeline.depth), cloud=list(config.pipeline.cloud))
+    calm = config.pipeline.split()[0]
     dataset = CachedCloudDataset(caches["pt"], pipeline=calm)
     assert same(dataset[0], CachedCloudDataset(caches["pt"], augment=None)[0])
 
 
 def test_other_deterministic_steps_are_refused_and_the_message_says_which(caches, config):
-    depth = [MaskDepth(near=0.1, far=2.5), *config.pipeline.depth[1:]]
+    other = Compose([MaskDepth(near=0.1, far=2.5), *list(config.pipeline.steps)[1:]])
     with pytest.raises(CacheError) as caught:
-        CachedCloudDataset(caches["hdf5"], pipeline=Pipeline(depth=depth, cloud=list(config.pipeline.cloud)))
+        CachedCloudDataset(caches["hdf5"], pipeline=other)
     message = str(caught.value)
     assert str(caches["hdf5"]) in message
-    for part in ("in depth, step 1", "far=2.5", "far=3.0", "rebuild"):
+    for part in ("step 1: ", "far=2.5", "far=3.0", "rebuild"):
         assert part in message
 
 
 def test_a_missing_step_is_named(caches, config):
-    shorter = Pipeline(depth=list(config.pipeline.depth), cloud=list(config.pipeline.cloud)[:1])
-    with pytest.raises(CacheError, match=r"in cloud, step 2: nothing here, FarthestPointSample"):
+    shorter = Compose(list(config.pipeline.steps)[:3])
+    with pytest.raises(CacheError, match=r"step 4: nothing here, FarthestPointSample"):
         CachedCloudDataset(caches["hdf5"], pipeline=shorter)
 
 
@@ -280,11 +280,11 @@ def test_an_error_keeps_its_type_and_names_the_sample(source):
 
 
 def test_a_step_that_fails_names_step_sample_and_cloud():
-    dataset = CloudDataset(FixedSource({"s1": cloud()}), Pipeline(cloud=[VoxelDownsample(voxel_size=1.0)]))
+    dataset = CloudDataset(FixedSource({"s1": cloud()}), Compose([VoxelDownsample(voxel_size=1.0)]))
     assert dataset[0].num_points == 1
     normalized = PointCloud(points=torch.rand(5, 3), frame_id="base", unit="normalized")
     step = RemoveRadiusOutliers(radius=0.1, min_neighbors=2)
-    dataset = CloudDataset(FixedSource({"s1": normalized}), Pipeline(cloud=[step]))
+    dataset = CloudDataset(FixedSource({"s1": normalized}), Compose([step]))
     with pytest.raises(PcdataError, match="metres") as caught:
         dataset[0]
     notes = told(caught.value)

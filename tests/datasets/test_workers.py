@@ -14,10 +14,10 @@ from torch.utils.data import DataLoader
 
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud, collate_fixed, collate_packed, collate_padded
 from pcdata.errors import CacheError, CaptureError, ShapeError
-from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, checksum_of
+from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.transforms import Pipeline, RandomJitter
+from pcdata.transforms import Compose, RandomJitter
 
 # Workers are counted against the cores of the machine; here there must be more workers than some machines have cores.
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
@@ -147,8 +147,8 @@ def big_h5(tmp_path_factory):
         store.write(f"s{number}", record)
         samples.append(Sample(f"s{number}", f"s{number}", 20_000, record.digest()))
     store.close()
-    pipeline = Pipeline(augment=[RandomJitter(sigma=0.001)])
-    Manifest("hdf5", "lzf", pipeline.fingerprint(), pipeline.to_config(), samples).write(folder)
+    pipeline = Compose([RandomJitter(sigma=0.001)])
+    Manifest("hdf5", "lzf", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(folder)
     return folder
 
 

@@ -15,10 +15,10 @@ import torch
 from pcdata import PointCloud
 from pcdata.errors import CacheError, PcdataError
 from pcdata.io.arrays.stored_arrays import stored_arrays
-from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample
+from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.transforms.pipeline import Pipeline
+from pcdata.transforms import Compose
 from tests.io.memory import memory_limit
 
 
@@ -41,9 +41,9 @@ def stored(folder: Path, form: str, compression: str = "none") -> Path:
 def dataset(folder: Path, form: str) -> Path:
     record = record_from_cloud(cloud())
     path = stored(folder, form)
-    pipeline = Pipeline()
+    pipeline = Compose([])
     samples = [Sample("a", "a", 64, record.digest())]
-    Manifest(form, "none", pipeline.fingerprint(), pipeline.to_config(), samples).write(folder)
+    Manifest(form, "none", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(folder)
     return path
 
 

@@ -65,7 +65,7 @@ def test_the_voxel_size_is_found_for_the_count_whatever_the_crop(num_views, crop
 
 def test_a_voxel_size_that_was_chosen_stays_and_a_count_it_cannot_reach_names_the_choice():
     made = preset("dp3_guide", frame="base", crop=TABLE_BOX, voxel_size=0.003)
-    assert [step.voxel_size for step in made.pipeline.cloud if isinstance(step, VoxelDownsample)] == [0.003]
+    assert [step.voxel_size for step in made.pipeline.steps if isinstance(step, VoxelDownsample)] == [0.003]
     with pytest.raises(ContractError, match=r"takes 5000 to 20000: .*crop=.*voxel_size="):
         made.collate([made.pipeline(noisy(2))])
     coarse = preset("dp3_guide", frame="base", crop=TABLE_BOX, voxel_size=0.05)

@@ -147,7 +147,5 @@ def test_a_subclass_or_a_hook_is_not_passed_over(runs):
 
 
 def test_a_cloud_enters_after_the_beginning_as_before():
-    from pcdata.transforms import Pipeline
-
-    pipeline = Pipeline(depth=[Deproject()], cloud=[IN_CAMERA])
-    assert_same(pipeline(Deproject()(FULL)), pipeline(FULL))
+    chain = Compose([Deproject(), IN_CAMERA])
+    assert_same(chain(Deproject()(FULL)), chain(FULL))

@@ -13,7 +13,6 @@ from torch import nn
 from pcdata.errors import CaptureError, ConfigError, DTypeError, NonFiniteError, ShapeError
 from pcdata.structures import Camera, Confidence, DepthFrame
 from pcdata.transforms import CompleteDepth, Compose, Deproject, MaskDepth, NearestCompletion, SmoothCompletion
-from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml
 from tests.factories import differences, tabletop_frame, tree
 
 
@@ -218,9 +217,9 @@ def test_the_fingerprint_follows_the_weights():
 def test_a_configuration_keeps_the_identity_and_says_that_it_cannot_run():
     step = CompleteDepth(completion=Recorder(1.0))
     chain = Compose([step, MaskDepth(min_confidence="completed"), Deproject()])
-    read = pipeline_from_config(chain.to_config_list())
+    read = Compose.from_config(chain.sections())
     assert read.fingerprint() == chain.fingerprint()
-    assert read.to_config_list() == chain.to_config_list()
+    assert read.sections() == chain.sections()
     with pytest.raises(ConfigError, match="a configuration cannot hold; to run it make the pipeline in Python"):
         read(with_hole(plane()))
     assert "Recorder sha256:" in repr(step)
@@ -230,4 +229,4 @@ def test_a_configuration_keeps_the_identity_and_says_that_it_cannot_run():
 
 def test_an_unknown_completion_is_told_with_its_place():
     with pytest.raises(ConfigError, match=r"^p.yaml:1:3: CompleteDepth: no built-in completion 'smoth'; did you mean"):
-        pipeline_from_yaml("- CompleteDepth: {completion: smoth}", name="p.yaml")
+        Compose.from_yaml("- CompleteDepth: {completion: smoth}", name="p.yaml")

@@ -15,7 +15,6 @@ from pcdata import transforms as T
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataError, UnitError
 from pcdata.rng import seeded
 from pcdata.structures import METRE, NORMALIZED, DepthFrame, PointCloud
-from pcdata.transforms.config import pipeline_from_config, pipeline_from_yaml, pipeline_to_yaml
 from pcdata.transforms.field_checks import field_names, length_fields
 from tests.factories import assert_same, cloud_in_base, differences, frame_with_counts, torch_defaults, tree
 from tests.messages import told
@@ -238,8 +237,10 @@ def test_the_way_back_leads_to_the_source(example):
 
 def round_trips(transform: T.Transform) -> dict[str, T.Transform]:
     """The same transform through every way it can be written down."""
-    (from_config,) = pipeline_from_config([transform.to_config()]).steps
-    (from_yaml,) = pipeline_from_yaml(pipeline_to_yaml(T.Compose([transform]))).steps
+    chain = T.Compose([transform])
+    from_config, from_yaml = T.Compose.from_config([transform.to_config()]), T.Compose.from_yaml(chain.to_yaml())
+    if not isinstance(transform, T.Compose):  # which is opened: it is its steps
+        (from_config,), (from_yaml,) = from_config.steps, from_yaml.steps
     ((name, fields),) = json.loads(json.dumps(transform.to_config(), allow_nan=False)).items()
     ways = {"config": from_config, "yaml": from_yaml, "deepcopy": copy.deepcopy(transform)}
     ways["pickle"] = pickle.loads(pickle.dumps(transform))

@@ -7,7 +7,7 @@ import pytest
 from pcdata.errors import ConfigError, FrameError, VolumeTooLargeError
 from pcdata.sensors import sensor_profile
 from pcdata.structures import TSDFVolume
-from pcdata.transforms import Compose, CropWorkspace, FuseTSDF, MaskDepth, Pipeline
+from pcdata.transforms import Compose, CropWorkspace, FuseTSDF, MaskDepth
 from tests.factories import frame_with_counts, tabletop_frame
 
 
@@ -43,9 +43,7 @@ def test_it_stands_between_masks_and_crops():
 
 def test_the_voxel_size_may_come_from_the_sensor():
     profile = sensor_profile("realsense_d435")
-    (step,) = Pipeline.from_yaml(
-        "sensor: realsense_d435\ndepth:\n- FuseTSDF: {frame: base, voxel_size: sensor}\n"
-    ).depth
+    (step,) = Compose.from_yaml("sensor: realsense_d435\ndepth:\n- FuseTSDF: {frame: base, voxel_size: sensor}\n").steps
     assert step.voxel_size == pytest.approx(profile.voxel_size(profile.reference_depth), rel=0.01)
 
 

@@ -7,8 +7,7 @@ import pytest
 from pcdata.build import config_from_yaml
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
-from pcdata.transforms import MaskDepth, Pipeline, RemoveRadiusOutliers, VoxelDownsample
-from pcdata.transforms.config import pipeline_from_yaml
+from pcdata.transforms import Compose, MaskDepth, RemoveRadiusOutliers, VoxelDownsample
 
 STEPS = """
 depth: [MaskDepth: {near: sensor, far: sensor}, Deproject]
@@ -25,7 +24,7 @@ def faults(text: str) -> list[str]:
 def test_the_steps_hold_the_numbers_of_the_profile():
     pipeline = config_from_yaml("sensor: {name: realsense_d435, depth: 0.6}" + STEPS).pipeline
     profile = sensor_profile("realsense_d435")
-    mask, voxel, radius = pipeline.depth[0], pipeline.cloud[0], pipeline.cloud[1]
+    mask, _, voxel, radius = pipeline.steps
     assert isinstance(mask, MaskDepth)
     assert isinstance(voxel, VoxelDownsample)
     assert isinstance(radius, RemoveRadiusOutliers)
@@ -46,8 +45,8 @@ def test_another_sensor_or_depth_is_another_fingerprint():
 
 
 def test_the_numbers_alone_give_the_same_pipeline():
-    pipeline = Pipeline.from_yaml("sensor: realsense_d455" + STEPS)
-    again = Pipeline.from_yaml(pipeline.to_yaml())
+    pipeline = Compose.from_yaml("sensor: realsense_d455" + STEPS)
+    again = Compose.from_yaml(pipeline.to_yaml())
     assert again.fingerprint() == pipeline.fingerprint()
     assert "sensor" not in pipeline.to_yaml()
 
@@ -55,11 +54,11 @@ def test_the_numbers_alone_give_the_same_pipeline():
 def test_steps_that_take_a_sensor_may_take_the_one_that_was_named():
     steps = "[MarkUnreliableDepth: {sensor: sensor}, RandomSensorNoise: {sensor: sensor}, Deproject]"
     pipeline = config_from_yaml(f"sensor: kinect_v1\ndepth: {steps}").pipeline
-    assert [step.sensor for step in pipeline.depth[:2]] == ["kinect_v1", "kinect_v1"]
+    assert [step.sensor for step in pipeline.steps[:2]] == ["kinect_v1", "kinect_v1"]
 
 
 def test_a_name_may_still_be_called_sensor():
-    pipeline = pipeline_from_yaml("- Deproject\n- ToFrame: {frame: sensor}")
+    pipeline = Compose.from_yaml("- Deproject\n- ToFrame: {frame: sensor}")
     assert pipeline.steps[1].frame == "sensor"
 
 

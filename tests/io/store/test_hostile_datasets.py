@@ -11,10 +11,10 @@ import pytest
 from pcdata import CachedCloudDataset, read_volume
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports.episodes import read_episodes
-from pcdata.io.store.cloud_record import Record, record_from_cloud
 from pcdata.io.store.manifest import FILE_NAME, Manifest, Sample
+from pcdata.io.store.record import Record, record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.transforms.pipeline import Pipeline
+from pcdata.transforms import Compose
 from tests.io.forged import cloud, dataset, foreign_refused, stored
 
 FORMATS = list(STORES)
@@ -77,10 +77,10 @@ def test_a_dataset_whose_files_are_links_to_elsewhere_is_refused(tmp_path, form,
 def test_a_field_under_another_name_is_no_extra_that_nothing_rotates(tmp_path, form, old_name):
     record = record_from_cloud(cloud())
     arrays = {("extra." + name if name == old_name else name): array for name, array in record.arrays.items()}
-    pipeline = Pipeline()
-    Manifest(form, "none", pipeline.fingerprint(), pipeline.to_config(), [Sample("a", "a", 64, record.digest())]).write(
-        tmp_path
-    )
+    pipeline = Compose([])
+    Manifest(
+        form, "none", pipeline.stored_fingerprint(), pipeline.sections(), [Sample("a", "a", 64, record.digest())]
+    ).write(tmp_path)
     store = STORES[form](tmp_path)
     store.write("a", Record(arrays, record.info))
     store.close()
@@ -112,9 +112,9 @@ def test_facts_that_json_cannot_hold_or_that_swell_are_typed_errors(tmp_path, fo
 def test_a_number_of_points_that_differs_from_the_manifest_is_told(tmp_path, form):
     record = record_from_cloud(cloud())
     stored(tmp_path, form)
-    pipeline = Pipeline()
+    pipeline = Compose([])
     samples = [Sample("a", "a", 65, record.digest())]
-    Manifest(form, "none", pipeline.fingerprint(), pipeline.to_config(), samples).write(tmp_path)
+    Manifest(form, "none", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(tmp_path)
     with pytest.raises(CacheError, match="has 64 points, but"):
         CachedCloudDataset(tmp_path)[0]
 

@@ -1,0 +1,72 @@
+"""What makes a chain of steps valid, and what makes it slow."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Sequence
+
+from pcdata.errors import PcdataWarning
+from pcdata.structures import METRE, NORMALIZED, PointCloud
+from pcdata.transforms.base import Transform, unit_advice
+from pcdata.transforms.field_checks import FaultyConfigError
+
+
+class PipelineOrderWarning(PcdataWarning):
+    """A pipeline is valid but its order costs time or quality."""
+
+
+def takes_clouds(step: Transform) -> bool:
+    """Whether a cloud may enter a chain at this step."""
+    return issubclass(PointCloud, step.takes)
+
+
+def check_chain(steps: Sequence[Transform]) -> None:
+    """Require that neighbours fit: capture or cloud, frame, unit.
+
+    Raises:
+        FaultyConfigError: the first step that does not fit; its path is the position of the step from 0.
+    """
+    for position, (before, after) in enumerate(itertools.pairwise(steps), start=1):
+        if not issubclass(before.gives, after.takes):
+            raise _misfit(
+                position,
+                after,
+                f"takes a {after.takes.__name__} but step {position}, {type(before).__name__}, gives a "
+                f"{before.gives.__name__}" + ("; put Deproject between them" if before.gives is not PointCloud else ""),
+            )
+    frame: str | None = None
+    unit = METRE if steps and not takes_clouds(steps[0]) else None  # None: that of whatever comes in
+    for position, outer in enumerate(steps):
+        for step in outer.parts():
+            needed = step.frame_needed()
+            if frame is not None and needed is not None and needed != frame:
+                raise _misfit(position, step, f"works in frame {needed!r} but the cloud is in {frame!r} there")
+            wanted = step.unit_needed()
+            if unit is not None and wanted is not None and wanted != unit:
+                names = {METRE: "in metres", NORMALIZED: "normalised"}
+                works = "in metres" if wanted == METRE else "on normalised clouds"
+                raise _misfit(
+                    position, step, f"works {works} but the cloud is {names[unit]} there; {unit_advice(step)}"
+                )
+            frame = step.frame_after(frame)
+            unit = step.unit_given() or wanted or unit
+
+
+def warn_of_order(steps: Sequence[Transform], *, stacklevel: int) -> None:
+    """Warn where statistics run before the crop."""
+    flat = [step for outer in steps for step in outer.parts()]
+    names = [type(step).__name__ for step in flat]
+    early = next((i for i, step in enumerate(flat) if step.runs_statistics), len(flat))
+    if "CropWorkspace" in names[early:] and "CropWorkspace" not in names[:early]:
+        warnings.warn(
+            f"{names[early]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "
+            "alone find more of its outliers",
+            PipelineOrderWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+def _misfit(position: int, step: Transform, what: str) -> FaultyConfigError:
+    message = f"step {position + 1}, {type(step).__name__}, {what}"
+    return FaultyConfigError(f"Compose: {message}", [((position,), message)])
