@@ -59,7 +59,7 @@ from pcdata.io import (  # noqa: F401
     write_pose,
     write_volume,
 )
-from pcdata.io.writers.capture import write_capture  # noqa: F401
+from pcdata.io.writers.capture_folder import write_capture  # noqa: F401
 from pcdata.models import CONTRACTS, preset
 from pcdata.structures import (  # noqa: F401
     NORMALIZED,

@@ -234,7 +234,7 @@ def prepare(server: Server, work: Path) -> None:
     """Write captures, configurations, datasets and side files."""
     import numpy as np
 
-    from pcdata.io.writers.capture import write_capture
+    from pcdata.io.writers.capture_folder import write_capture
     from pcdata.synthetic import SyntheticSource
 
     source = SyntheticSource(num_scenes=NUM_CAPTURES, num_objects=2, num_views=1, size=(60, 80))

@@ -7,14 +7,30 @@ from __future__ import annotations
 
 import difflib
 import errno
-from collections.abc import Iterable, Sequence
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import ParamSpec, TypeVar
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 _LONGEST = 2000  # characters of one fault, which may repeat a name from a file
 _LINES = 50  # faults of one file, of which nearly every line is wrong
 
 
 class PcdataError(Exception):
-    """Base of every error that pcdata raises on purpose."""
+    """Base of every error that pcdata raises on purpose.
+
+    Beside its words it says where it happened, as far as that is known: programs need not read the message. What is
+    raised inside a step by others (torch, a transform of your own) has the same attributes.
+    """
+
+    step: str | None = None  # the class name of the innermost transform that failed
+    sample_id: str | None = None  # of the capture, as the source that was iterated calls it
+    path: str | None = None  # the file or folder that could not be read or written
 
 
 class ShapeError(PcdataError, ValueError):
@@ -126,11 +142,54 @@ def write_fault(error: BaseException) -> str:
     return f"{words}: {error}" if words else str(error)
 
 
-def add_note(error: BaseException, note: str) -> None:
-    """Attach context to an exception in flight, keeping its type and traceback.
+def locate(
+    error: BaseException,
+    *,
+    step: str | None = None,
+    sample_id: str | None = None,
+    path: str | os.PathLike[str] | None = None,
+) -> None:
+    """Give an exception in flight the attributes of :class:`PcdataError`; what is not given stays.
+
+    The innermost step and file are kept, since they are the cause; the outermost sample id, since that is the caller's.
+    """
+    inner = {"step": step, "path": None if path is None else os.fspath(path)}
+    given = {name: value for name, value in inner.items() if getattr(error, name, None) is None}
+    for name, value in {**given, "sample_id": sample_id}.items():
+        if value is not None:
+            with suppress(AttributeError, TypeError):  # an exception may have slots, or other ideas of a name
+                setattr(error, name, value)
+
+
+def locates_path(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate what reads or writes the file named by its parameter ``path``: what it raises has that ``path``."""
+    position = list(inspect.signature(function).parameters).index("path")
+
+    @functools.wraps(function)
+    def located(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        try:
+            return function(*args, **kwargs)
+        except Exception as error:
+            given = kwargs["path"] if "path" in kwargs else args[position] if position < len(args) else None
+            locate(error, path=given if isinstance(given, (str, os.PathLike)) else None)
+            raise
+
+    return located
+
+
+def add_note(
+    error: BaseException,
+    note: str,
+    *,
+    step: str | None = None,
+    sample_id: str | None = None,
+    path: str | os.PathLike[str] | None = None,
+) -> None:
+    """Attach context to an exception in flight, in words and as :func:`locate` does, keeping its type and traceback.
 
     Python 3.10 has no ``add_note``: there the note joins the message, or is kept where 3.11 keeps it.
     """
+    locate(error, step=step, sample_id=sample_id, path=path)
     if hasattr(error, "add_note"):
         error.add_note(note)
     elif error.args and isinstance(error.args[0], str):

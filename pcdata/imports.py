@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pcdata.errors import ConfigError, PcdataError
+from pcdata.errors import ConfigError, PcdataError, locates_path
 from pcdata.files.opening import read_bytes
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS
 from pcdata.registry import registries
@@ -48,6 +48,7 @@ class ImportedFile:
 _FILES: dict[str, ImportedFile] = {}  # by the hash of the content, in the order of import
 
 
+@locates_path
 def import_file(path: str | os.PathLike[str]) -> ImportedFile:
     """Run a Python file once, so that the transforms, layouts and combinators that it defines are known by name.
 

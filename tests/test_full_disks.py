@@ -14,7 +14,7 @@ from pcdata.errors import PcdataError
 from pcdata.io import write_calibration, write_color, write_depth, write_labels, write_mask, write_pcd, write_ply
 from pcdata.io.calibration.capture_camera import write_pose
 from pcdata.io.images.confidence import write_confidence
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.report.figure import save_pipeline_figure
 from pcdata.structures import TSDFVolume
 from pcdata.structures.calibration import Calibration

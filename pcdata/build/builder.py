@@ -30,10 +30,10 @@ from pcdata.io.sources.capture_source import (
     reason_of,
     skipped_of,
 )
+from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, key_of
-from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import DepthFrame, PointCloud
 
 Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
@@ -172,7 +172,7 @@ def _write_samples(
             except Exception as error:
                 way_out = isinstance(error, REFUSALS) and not skip_refused
                 hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
-                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}")
+                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}", sample_id=sample_id)
                 raise
             inputs.check_latest("build_dataset")
             written.append(Sample(sample_id, key, cloud.num_points, record.digest()))

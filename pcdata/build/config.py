@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pcdata.build.model_section import preset_of_section, stored_preset
 from pcdata.build.source_section import SourceSettings, source_settings
-from pcdata.errors import ConfigError, near_matches
+from pcdata.errors import ConfigError, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
@@ -90,6 +90,7 @@ class BuildConfig:
 _SETTINGS: dict[str, type[BaseModel]] = {"output": Output, "loader": Loader}
 
 
+@locates_path
 def load_config(path: str | Path) -> BuildConfig:
     """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.io.sources.combine import Selectable
-from pcdata.io.sources.opening import open_source, read_skip_file
+from pcdata.io.sources.open_source import open_source, read_skip_file
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, OPENING, checked_fields, options_of
 from pcdata.yaml_nodes import Document
 

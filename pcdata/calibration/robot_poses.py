@@ -16,7 +16,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from pcdata.errors import CalibrationError, ShapeError, first_lines, near_matches
+from pcdata.errors import CalibrationError, ShapeError, first_lines, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
 from pcdata.geometry import rigid
@@ -52,6 +52,7 @@ class RobotPoses:
             raise CalibrationError(f"RobotPoses: names must be unique, got {', '.join(self.names)}")
 
 
+@locates_path
 def read_robot_poses(
     path: str | os.PathLike[str],
     *,

@@ -183,7 +183,7 @@ def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
 
 def skip_list(arguments: argparse.Namespace) -> list[str]:
     """Return the ids that the command line leaves out."""
-    from pcdata.io.sources.opening import read_skip_file
+    from pcdata.io.sources.open_source import read_skip_file
 
     listed = list(arguments.skip or [])
     return listed + (read_skip_file(arguments.skip_file) if arguments.skip_file else [])

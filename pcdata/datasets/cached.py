@@ -9,8 +9,8 @@ from typing import Literal
 from pcdata.datasets.samples import SampleDataset
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning
 from pcdata.imports import imported_files
+from pcdata.io.store.cloud_record import cloud_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
-from pcdata.io.store.record import cloud_from_record
 from pcdata.io.store.stores import STORES
 from pcdata.structures import PointCloud
 from pcdata.transforms import Compose, Transform

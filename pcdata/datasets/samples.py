@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, get_worker_info
 
 from pcdata.contracts.dispatch import warn_if_slow
+from pcdata.datasets.errors_in_workers import for_the_parent
 from pcdata.datasets.passes import PassWatch, shared
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
@@ -86,7 +87,9 @@ class SampleDataset(Dataset[PointCloud]):
                 )
             return data  # type: ignore[return-value]
         except Exception as error:
-            add_note(error, f"sample {sample_id!r} of {self!r}")
+            add_note(error, f"sample {sample_id!r} of {self!r}", sample_id=sample_id)
+            if get_worker_info() is not None:
+                raise for_the_parent(error) from error.__cause__
             raise
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -128,7 +128,7 @@ class _Run:
                 with recording(self.inputs):
                     data = self.source.load(sample_id)
             except PcdataError as error:
-                add_note(error, f"sample {sample_id!r} of {self.source!r}")
+                add_note(error, f"sample {sample_id!r} of {self.source!r}", sample_id=sample_id)
                 raise
             self.inputs.check_latest("export")
             yield sample_id, data

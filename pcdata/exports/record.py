@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, locate
 from pcdata.files.opening import read_bytes, replacing
 from pcdata.files.whole_folders import EXPORT
-from pcdata.io.store.record import parse_info
+from pcdata.io.store.cloud_record import parse_info
 
 _MAX_BYTES = 1 << 28  # about a million samples
 FILE_NAME = EXPORT
@@ -55,7 +55,9 @@ class ExportRecord:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}")
             return cls(**content)
         except (CacheError, OSError, TypeError) as error:
-            raise CacheError(f"{path}: cannot be read: {error}; choose another folder") from error
+            failed = CacheError(f"{path}: cannot be read: {error}; choose another folder")
+            locate(failed, path=path)
+            raise failed from error
 
     def difference(self, other: ExportRecord) -> str | None:
         """Say in what the plan of another export differs from this one, or None."""

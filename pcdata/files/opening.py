@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CacheError, CaptureError, PcdataError, WriteError, write_fault
+from pcdata.errors import CacheError, CaptureError, PcdataError, WriteError, locates_path, write_fault
 from pcdata.files.inputs import note_input
 from pcdata.files.interrupts import shielded
 from pcdata.files.npy import PREFIX, header_length, parse_header
@@ -32,6 +32,7 @@ _SPARSE_FROM = 1 << 26  # bytes: below, a file of holes takes no more memory tha
 _MOST_HOLES = 1000  # a file's size over what is stored of it: above, it is nearly all nothing
 
 
+@locates_path
 def open_input(
     where: str,
     path: str | os.PathLike[str],
@@ -130,6 +131,7 @@ def read_bytes(
     return content
 
 
+@locates_path
 def read_text(
     where: str,
     path: str | os.PathLike[str],

@@ -17,12 +17,12 @@ from pcdata.io.images.writing import write_color, write_depth, write_labels, wri
 from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.capture_source import CaptureSource, refused_captures
 from pcdata.io.sources.combine import CombinedSource, JoinedSource, SubsetSource
-from pcdata.io.sources.opening import open_source
+from pcdata.io.sources.open_source import open_source
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, register_combinator, register_layout
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
 from pcdata.io.store.volumes import read_volume, write_volume
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 
 __all__ = [
     "COMBINATORS",

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pcdata.datasets import CachedCloudDataset, SampleDataset
-from pcdata.errors import ContractError, DTypeError, PcdataError
+from pcdata.errors import ContractError, DTypeError, PcdataError, locates_path
 from pcdata.models.batch import ModelBatch
 from pcdata.models.batching import batch_of
 from pcdata.models.catalogue import contract as contract_named
@@ -69,6 +69,7 @@ def check(
     return summary
 
 
+@locates_path
 def check_files(
     path: str | Path,
     model: str,

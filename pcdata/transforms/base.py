@@ -128,7 +128,7 @@ class Transform(nn.Module):
             result = self.transform(data, params)
             return self.recorded(data, result, params)
         except Exception as error:
-            add_note(error, f"in {self!r} on {data!r}")
+            add_note(error, f"in {self!r} on {data!r}", step=type(self).__name__, sample_id=_sample_id(data))
             raise
 
     def config_fields(self) -> dict[str, Any]:
@@ -260,6 +260,13 @@ def unit_advice(step: Transform) -> str:
 def num_clouds(data: Data) -> int:
     """The number of independent clouds: B of a cloud, 1 of a capture."""
     return data.num_clouds if isinstance(data, PointCloud) else 1
+
+
+def _sample_id(data: Any) -> str | None:
+    """The sample id of one capture or one cloud; None = it has none, or there are several clouds."""
+    if isinstance(data, PointCloud):
+        return data.meta[0].get("sample_id") if data.num_clouds == 1 else None
+    return data.sample_id if isinstance(data, DepthFrame) else None
 
 
 def sample_name(cloud: PointCloud, b: int) -> str:

@@ -13,7 +13,7 @@ from pcdata.errors import CaptureError
 from pcdata.exports import export_dataset
 from pcdata.files.inputs import Inputs, recording
 from pcdata.files.opening import open_input, read_text
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from tests.build.test_builder import tree
 from tests.build.test_shared_names import meanwhile
 

@@ -276,7 +276,7 @@ def test_an_error_of_the_system_is_exit_1_without_traceback(capsys, captures, mo
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", "captures")
 
-    monkeypatch.setattr("pcdata.io.sources.selection.open_source", refuse)
+    monkeypatch.setattr("pcdata.io.open_source", refuse)
     code, out, err = run(capsys, "inspect", captures)
     assert (code, out) == (1, "")
     assert "Permission denied" in err
@@ -330,7 +330,7 @@ def test_ctrl_c_is_exit_130_in_words(capsys, captures, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pcdata.io.sources.selection.open_source", interrupt)
+    monkeypatch.setattr("pcdata.io.open_source", interrupt)
     code, _, err = run(capsys, "inspect", captures)
     assert code == 130
     assert "interrupted" in err

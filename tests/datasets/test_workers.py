@@ -14,8 +14,8 @@ from torch.utils.data import DataLoader
 
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud, collate_fixed, collate_packed, collate_padded
 from pcdata.errors import CacheError, CaptureError, ShapeError
+from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, checksum_of
-from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose, RandomJitter
 

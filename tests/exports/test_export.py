@@ -18,7 +18,7 @@ from pcdata.errors import CacheError, CaptureError, ConfigError
 from pcdata.exports import TARGETS, export_dataset
 from pcdata.exports.record import FILE_NAME
 from pcdata.exports.registry import target_named
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.synthetic import SyntheticSource
 from tests.exports.samples import Samples, cloud, frame, tree
 

@@ -17,8 +17,8 @@ from pcdata.exports.record import FILE_NAME, ExportRecord
 from pcdata.files.npz import write_npz
 from pcdata.files.strict_json import json_object, parse_json
 from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.store.cloud_record import Record, cloud_from_record, parse_info, record_from_cloud
 from pcdata.io.store.manifest import Manifest
-from pcdata.io.store.record import Record, cloud_from_record, parse_info, record_from_cloud
 
 WRONG = {
     "nesting": "[" * 100_000,

@@ -15,8 +15,8 @@ import torch
 from pcdata import PointCloud
 from pcdata.errors import CacheError, PcdataError
 from pcdata.io.arrays.stored_arrays import stored_arrays
+from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample
-from pcdata.io.store.record import record_from_cloud
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose
 from tests.io.memory import memory_limit

@@ -14,7 +14,7 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CaptureError, DTypeError
 from pcdata.functional import voxel_minimum
 from pcdata.io import read_confidence, read_pcd, read_ply, write_confidence, write_pcd, write_ply
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import Confidence, DepthFrame, Kind, PointCloud
 from pcdata.transforms import Deproject, KeepConfidence, MaskDepth, VoxelDownsample
 from tests.factories import frame_with_counts, tabletop_frame

@@ -9,7 +9,7 @@ from torch import Tensor
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.geometry import rigid
-from pcdata.io.store.record import cloud_from_record, record_from_cloud
+from pcdata.io.store.cloud_record import cloud_from_record, record_from_cloud
 from pcdata.rng import seeded
 from pcdata.structures import Kind, PointCloud
 from pcdata.structures.kinds import FIELDS, KINDS

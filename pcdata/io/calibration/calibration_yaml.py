@@ -9,7 +9,7 @@ from typing import Any, cast
 import yaml
 from torch import Tensor
 
-from pcdata.errors import CalibrationError, CaptureError, PcdataError
+from pcdata.errors import CalibrationError, CaptureError, PcdataError, locates_path
 from pcdata.files.opening import read_text, replacing
 from pcdata.geometry.lens import COEFFICIENT_COUNTS
 from pcdata.io.calibration.pose_nodes import (
@@ -33,6 +33,7 @@ _LARGEST_SIDE = 1 << 16  # pixels
 _MODELS = ("pinhole", "opencv")  # without and with OpenCV's polynomial distortion
 
 
+@locates_path
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Read a calibration file; ``docs/calibration.md`` describes every key.
 
@@ -43,6 +44,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     return calibration_from_yaml(read_text("read_calibration", path), name=str(path))
 
 
+@locates_path
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
     """Write the file that :func:`read_calibration` reads back exactly; equal calibrations give equal bytes.
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, near_matches
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, locates_path, near_matches
 from pcdata.files.opening import map_npy, read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
@@ -63,6 +63,7 @@ class CaptureCamera:
     folders: Mapping[str, str | None] | None = None  # names of the folders by role, where they are not the usual ones
 
 
+@locates_path
 def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     """Read the intrinsics of one camera from a JSON file.
 
@@ -119,6 +120,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     )
 
 
+@locates_path
 def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamera) -> None:
     """Write the JSON file from which :func:`read_capture_camera` returns the same numbers.
 
@@ -139,6 +141,7 @@ def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamer
         temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
+@locates_path
 def read_intrinsics(
     path: str | os.PathLike[str],
     *,
@@ -161,6 +164,7 @@ def read_intrinsics(
     return _camera(where, fx=fx, fy=fy, cx=cx, cy=cy, size=size)
 
 
+@locates_path
 def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
     """Read a rigid 4x4 pose from text (16 numbers, row by row) or ``.npy``. Its direction is the caller's to know.
 
@@ -184,6 +188,7 @@ def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
     return pose
 
 
+@locates_path
 def write_pose(path: str | os.PathLike[str], pose: Tensor) -> None:
     """Write a rigid (4, 4) pose as text that :func:`read_pose` reads back exactly."""
     where = f"write_pose: {path}"

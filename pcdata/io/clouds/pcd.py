@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, add_note, near_matches
+from pcdata.errors import CaptureError, add_note, locates_path, near_matches
 from pcdata.files.opening import read_bytes, replacing
 from pcdata.io.clouds import lzf
 from pcdata.io.clouds.arrays import CloudArrays, from_cloud, narrowest_int, to_cloud
@@ -27,6 +27,7 @@ _PAGE = 1 << 16  # PCL rounds compressed files up to a memory page and leaves ze
 _NORMALS = ("normal_x", "normal_y", "normal_z")
 
 
+@locates_path
 def read_pcd(
     path: str | os.PathLike[str],
     *,
@@ -79,6 +80,7 @@ def read_pcd(
     )
 
 
+@locates_path
 def write_pcd(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
     """Write one cloud as PCD 0.7; colours are rounded to 8 bits, as the format has them.
 

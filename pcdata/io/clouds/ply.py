@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, near_matches
+from pcdata.errors import CaptureError, locates_path, near_matches
 from pcdata.files.opening import read_bytes, replacing
 from pcdata.io.clouds.arrays import CloudArrays, from_cloud, narrowest_int, to_cloud
 from pcdata.io.clouds.numbers_as_text import format_rows
@@ -27,6 +27,7 @@ _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 _ENCODINGS = {"binary": "binary_little_endian", "binary_big_endian": "binary_big_endian", "ascii": "ascii"}
 
 
+@locates_path
 def read_ply(
     path: str | os.PathLike[str],
     *,
@@ -71,6 +72,7 @@ def read_ply(
     )
 
 
+@locates_path
 def write_ply(path: str | os.PathLike[str], cloud: PointCloud | SurfaceMesh, *, encoding: str = "binary") -> None:
     """Write one cloud, or a mesh, as PLY; colours are rounded to 8 bits.
 

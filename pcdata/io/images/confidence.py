@@ -9,12 +9,13 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, locates_path
 from pcdata.files.opening import replacing
 from pcdata.io.images.reading import read_labels
 from pcdata.structures import Confidence
 
 
+@locates_path
 def read_confidence(path: str | os.PathLike[str]) -> Tensor:  # (H, W) uint8
     """Read an 8-bit grey PNG of the values of :class:`Confidence`.
 

@@ -20,11 +20,11 @@ from PIL import Image
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, UnitError
+from pcdata.errors import CaptureError, UnitError, locates_path
 from pcdata.files.opening import map_npy, read_bytes
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
-from pcdata.io.images.structure import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
+from pcdata.io.images.file_wholeness import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30
@@ -34,6 +34,7 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
+@locates_path
 def read_depth(
     path: str | os.PathLike[str],
     *,
@@ -111,6 +112,7 @@ def _read_npy(where: str, path: Path) -> NDArray[Any]:
     return np.array(array, dtype=array.dtype.newbyteorder("="))
 
 
+@locates_path
 def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
     """Read an 8-bit colour PNG or JPEG as RGB; an alpha channel is dropped, orientation tags are not applied.
 
@@ -129,6 +131,7 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
     return torch.from_numpy(np.array(pixels[..., :3]))
 
 
+@locates_path
 def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
     """Read an 8-bit grey, 16-bit grey or palette PNG of object ids; of a palette the index is the id.
 
@@ -146,6 +149,7 @@ def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
     return torch.from_numpy(pixels.astype(np.int64))
 
 
+@locates_path
 def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
     """Read a 1-bit or 8-bit grey PNG as a mask; every value but 0 is inside.
 

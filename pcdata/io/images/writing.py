@@ -10,12 +10,13 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.contracts.tensors import check_tensors
-from pcdata.errors import CaptureError, DTypeError
+from pcdata.errors import CaptureError, DTypeError, locates_path
 from pcdata.files.opening import replacing
 from pcdata.functional.depth.stored_depth import metres_of_value
 from pcdata.io.images.reading import check_suffix
 
 
+@locates_path
 def write_depth(
     path: str | os.PathLike[str],
     depth: Tensor,  # (H, W) float32 metres, 0 = no reading
@@ -60,6 +61,7 @@ def write_depth(
         Image.fromarray(raw).save(temporary, format="PNG")
 
 
+@locates_path
 def write_color(
     path: str | os.PathLike[str],
     colors: Tensor,  # (H, W, 3) uint8
@@ -79,6 +81,7 @@ def write_color(
         Image.fromarray(colors.detach().cpu().numpy()).save(temporary, format="PNG")
 
 
+@locates_path
 def write_labels(
     path: str | os.PathLike[str],
     labels: Tensor,  # (H, W) int64, -1 = none
@@ -104,6 +107,7 @@ def write_labels(
         Image.fromarray(np.where(ids < 0, background_label, ids).astype(np.uint16)).save(temporary, format="PNG")
 
 
+@locates_path
 def write_mask(
     path: str | os.PathLike[str],
     mask: Tensor,  # (H, W) bool

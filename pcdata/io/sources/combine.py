@@ -279,7 +279,7 @@ class JoinedSource(CombinedSource):
         try:
             return _called(source.load(own), sample_id)
         except PcdataError as error:
-            add_note(error, f"while loading sample {sample_id!r} of {self}")
+            add_note(error, f"while loading sample {sample_id!r} of {self}", sample_id=sample_id)
             raise
 
     def __repr__(self) -> str:

@@ -126,7 +126,7 @@ class Source(Selectable["Source"], metaclass=_Recorded):
             self.check_links(sample_id)
             return self._load(sample_id)
         except PcdataError as error:
-            add_note(error, f"while loading sample {sample_id!r} of {self}")
+            add_note(error, f"while loading sample {sample_id!r} of {self}", sample_id=sample_id, path=self.path)
             raise
 
     def _part(self, ids: list[str], skipped: Mapping[str, str]) -> Source:

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pcdata.errors import CacheError, PcdataWarning
+from pcdata.errors import CacheError, PcdataWarning, locate
 from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import retired_of
 from pcdata.files.whole_folders import DATASET
-from pcdata.io.store.record import parse_info
+from pcdata.io.store.cloud_record import parse_info
 from pcdata.io.store.stores import COMPRESSIONS, STORES, Compression, Format
 
 SCHEMA = "pcdata.dataset/1"
@@ -73,6 +73,14 @@ class Manifest:
             CacheError: missing, damaged, hostile, or of another schema.
         """
         path = Path(folder) / FILE_NAME
+        try:
+            return cls._read(folder, path)
+        except CacheError as error:
+            locate(error, path=path)
+            raise
+
+    @classmethod
+    def _read(cls, folder: str | Path, path: Path) -> Manifest:
         if not path.is_file():
             if not os.path.lexists(folder) and (retired := retired_of(Path(os.path.realpath(folder)))):
                 raise CacheError(
@@ -106,7 +114,7 @@ class Manifest:
                 f"{path}: has no checksum, which every build writes, so it was made or changed by other means, and "
                 "edits cannot be told; rebuild the dataset to have one",
                 PcdataWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
         return manifest
 

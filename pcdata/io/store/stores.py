@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, ClassVar, Literal
 import numpy as np
 import torch
 
-from pcdata.errors import CacheError, write_fault
+from pcdata.errors import CacheError, locate, write_fault
 from pcdata.files.interrupts import shielded
 from pcdata.files.npz import array_names, read_array, write_npz
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
@@ -27,7 +27,7 @@ from pcdata.files.zip_archive import ZipArchive
 from pcdata.io.arrays.hdf5_arrays import hard_linked, open_hdf5, read_group
 from pcdata.io.arrays.hdf5_writing import FaultKeepingFile
 from pcdata.io.arrays.pt_tensors import read_pt
-from pcdata.io.store.record import Record, parse_info
+from pcdata.io.store.cloud_record import Record, parse_info
 
 Format = Literal["hdf5", "npz", "pt"]
 Compression = Literal["none", "lzf", "gzip"]
@@ -276,7 +276,9 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:  # h5py raises both
-        raise CacheError(f"{path}: cannot be written: {write_fault(error)}") from error
+        failed = CacheError(f"{path}: cannot be written: {write_fault(error)}")
+        locate(failed, path=path)
+        raise failed from error
 
 
 @contextmanager
@@ -295,16 +297,24 @@ def _damage_named(path: Path) -> Iterator[None]:
     """Turn whatever a damaged file makes a library raise into one error that names the file."""
     try:
         yield
-    except CacheError as error:
-        if str(path) in str(error):  # complete in itself: the file may be fine
-            raise
-        raise CacheError(f"{path}: {error}; the file is damaged or not pcdata's: rebuild the dataset") from error
-    except MemoryError as error:
-        raise CacheError(f"{path}: there is not enough memory to read it ({error}); the file may be fine") from error
     except Exception as error:  # numpy and h5py raise many types on damaged bytes
-        if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
-            raise CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine") from error
-        raise CacheError(
-            f"{path}: cannot be read ({type(error).__name__}: {error}); the file is damaged or truncated: "
-            "rebuild the dataset"
-        ) from error
+        told = _damage(path, error)
+        locate(told, path=path)
+        if told is error:
+            raise
+        raise told from error
+
+
+def _damage(path: Path, error: Exception) -> CacheError:
+    if isinstance(error, CacheError):
+        if str(path) in str(error):  # complete in itself: the file may be fine
+            return error
+        return CacheError(f"{path}: {error}; the file is damaged or not pcdata's: rebuild the dataset")
+    if isinstance(error, MemoryError):
+        return CacheError(f"{path}: there is not enough memory to read it ({error}); the file may be fine")
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
+        return CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine")
+    kind = type(error).__name__
+    return CacheError(
+        f"{path}: cannot be read ({kind}: {error}); the file is damaged or truncated: rebuild the dataset"
+    )

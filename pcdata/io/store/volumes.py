@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeError
+from pcdata.errors import CacheError, ConfigError, PcdataError, VolumeTooLargeError, locates_path
 from pcdata.files.npy import NpyHeader
 from pcdata.files.npz import npy_header, read_array
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input, replacing
@@ -28,6 +28,7 @@ _LONGEST_TEXT = 1 << 16  # bytes of the description
 _FIELDS = ("voxel_size", "truncation", "weighting", "carve", "frame_id")
 
 
+@locates_path
 def write_volume(path: str | os.PathLike[str], volume: TSDFVolume) -> None:
     """Write a fused volume to an ``.npz`` file, to go on with later; it appears complete or not at all.
 
@@ -51,6 +52,7 @@ def write_volume(path: str | os.PathLike[str], volume: TSDFVolume) -> None:
             _write_plane(archive, name, blocks)
 
 
+@locates_path
 def read_volume(path: str | os.PathLike[str], *, max_bytes: int = 4 << 30, device: str = "cpu") -> TSDFVolume:
     """Read what :func:`write_volume` wrote; sizes are checked before anything is allocated, nothing is unpickled.
 

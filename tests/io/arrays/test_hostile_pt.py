@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pcdata.io.store.record import record_from_cloud
+from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.stores import STORES
 from tests.io.forged import cloud, refused, stored, zip_of
 

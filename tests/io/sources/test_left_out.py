@@ -15,7 +15,7 @@ from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset
 from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
 from pcdata.io.sources.averaged import AveragedSource
-from pcdata.io.sources.opening import read_skip_file
+from pcdata.io.sources.open_source import read_skip_file
 from pcdata.io.store.manifest import Manifest
 from pcdata.report.inspection import skipped_text
 

@@ -23,7 +23,7 @@ from pcdata.io import (
 )
 from pcdata.io.calibration.capture_camera import CaptureCamera, read_capture_camera
 from pcdata.io.sources.rig import RigSource
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import Calibration, Camera, Confidence, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame

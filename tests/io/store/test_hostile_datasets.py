@@ -11,8 +11,8 @@ import pytest
 from pcdata import CachedCloudDataset, read_volume
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports.episodes import read_episodes
+from pcdata.io.store.cloud_record import Record, record_from_cloud
 from pcdata.io.store.manifest import FILE_NAME, Manifest, Sample
-from pcdata.io.store.record import Record, record_from_cloud
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose
 from tests.io.forged import cloud, dataset, foreign_refused, stored

@@ -22,7 +22,7 @@ import torch
 
 from pcdata import PointCloud
 from pcdata.errors import CacheError
-from pcdata.io.store.record import Record, cloud_from_record, record_from_cloud
+from pcdata.io.store.cloud_record import Record, cloud_from_record, record_from_cloud
 from pcdata.io.store.stores import COMPRESSIONS, INFO, STORES
 from tests.disk_limits import largest_file
 from tests.io.memory import memory_limit
@@ -304,7 +304,7 @@ def test_an_hdf5_store_that_is_left_open_lets_the_process_end(tmp_path, disk_is_
     code = f"""
 import numpy as np
 from pcdata.errors import CacheError
-from pcdata.io.store.record import Record
+from pcdata.io.store.cloud_record import Record
 from pcdata.io.store.stores import Hdf5Store
 from tests.disk_limits import limit_files
 store = Hdf5Store({str(tmp_path)!r})

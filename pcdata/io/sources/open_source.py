@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.errors import CaptureError, ConfigError, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
 from pcdata.io.sources.capture_source import kinds_of, refused_captures
@@ -23,6 +23,7 @@ from pcdata.io.sources.source import Source
 _WHERE = "open_source"
 
 
+@locates_path
 def open_source(
     path: str | os.PathLike[str],
     *,

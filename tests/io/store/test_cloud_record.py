@@ -11,7 +11,7 @@ import torch
 
 from pcdata import PointCloud
 from pcdata.errors import CacheError
-from pcdata.io.store.record import Record, cloud_from_record, parse_info, record_from_cloud
+from pcdata.io.store.cloud_record import Record, cloud_from_record, parse_info, record_from_cloud
 
 
 def _cloud(**changes: object) -> PointCloud:

@@ -9,7 +9,7 @@ import torch
 
 from pcdata import Camera, DepthFrame, open_source
 from pcdata.errors import CaptureError
-from pcdata.io.writers.capture import write_capture
+from pcdata.io.writers.capture_folder import write_capture
 from pcdata.synthetic import tabletop
 
 
