@@ -200,7 +200,7 @@ def inner_names() -> list[str]:
 def backends_of(name: str) -> list[str]:
     """The backends that the digests cover and that serve an operation here."""
     operation = OPERATIONS.get(name) or INNER[name]
-    live = why_unavailable("cpu") is None and "cpu" in operation.kernels
+    live = why_unavailable("cpu") is None and operation.serves("cpu")
     return ["torch", "cpu"] if live else ["torch"]
 
 

@@ -92,7 +92,7 @@ def compared(points: Any, ptr: Any, grid: Any) -> dict[str, Any]:
             with_grid = function(points, ptr, **options, grid=grid)
             without = function(points, ptr, **options)
             if with_grid.dtype is torch.bool:
-                reference = function(some, some_ptr, **options, backend="torch")
+                reference = function(some, some_ptr, **options, backend="torch_tree")
                 ours = function(some, some_ptr, **options, grid=some_grid)
                 differences += int((with_grid != without).sum()) + int((ours != reference).sum())
             else:

@@ -2,12 +2,15 @@
 
 ``@op`` marks the public function: its own body is the reference, plain torch on any device. ``@kernel`` registers a
 faster body beside it under a backend name; it receives arguments that already passed the contract, and must give the
-same result. ``backend="auto"`` takes the fastest live backend for the device, and the reference where a gradient is
-wanted and the operation gives one; naming an absent backend raises with the reason. Where the body that ``auto`` would
-take is absent, and a slow one serves, a :class:`~pcdata.errors.SlowBackendWarning` says so once.
+same result. ``backend="auto"`` takes the fastest live backend for the device, and no kernel where a gradient is wanted
+and the operation gives one; naming an absent backend raises with the reason. Where the body that ``auto`` would take is
+absent, and a slow one serves, a :class:`~pcdata.errors.SlowBackendWarning` says so once.
 
 ``@inner`` marks what only pcdata itself calls, with tensors that it has checked already (picking rows, moving points):
-kernels register beside it in the same way, but there is no contract to check and no ``backend`` to choose.
+kernels register beside it in the same way, but there is no contract to check.
+
+A reference may leave its work to ``steps``, inner functions that it tells its ``backend``: a backend that has a kernel
+for every step then serves the operation without one of its own.
 """
 
 from __future__ import annotations
@@ -33,10 +36,15 @@ R = TypeVar("R")
 REFERENCE = "torch"
 
 # Backend name -> module that registers its kernels when imported and defines `unavailable() -> str | None`.
-BACKEND_MODULES = {"cpu": "pcdata.kernels.cpu", "torch_cluster": "pcdata.kernels.torch_cluster"}
+BACKEND_MODULES = {
+    "cpu": "pcdata.kernels.cpu",
+    "torch_tree": "pcdata.kernels.torch_tree",
+    "torch_cluster": "pcdata.kernels.torch_cluster",
+}
 
 # What `auto` tries, best first. torch_cluster is chosen only by name: it covers few calls.
-AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": ("cpu", REFERENCE), "cuda": (REFERENCE,)}
+AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": ("cpu", "torch_tree", REFERENCE)}
+OTHER_DEVICES = ("torch_tree", REFERENCE)
 
 
 @dataclass
@@ -48,14 +56,25 @@ class Operation:
     public: Callable[..., Any]
     contract: Contract | None = None  # None for an inner function
     gradient: bool = True  # whether results carry one to the inputs
+    steps: tuple[str, ...] = ()  # inner functions that the reference tells its backend
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
+
+    def serves(self, backend: str) -> bool:
+        """Say whether a backend, once loaded, computes this operation."""
+        return backend in self.kernels or self.serves_by_steps(backend)
+
+    def serves_by_steps(self, backend: str) -> bool:
+        """Say whether a backend has kernels of all steps: the reference then runs on it, gradients and all."""
+        return bool(self.steps) and all(backend in INNER[step].kernels for step in self.steps)
 
 
 OPERATIONS: dict[str, Operation] = {}
 INNER: dict[str, Operation] = {}
 
 
-def op(*, gradient: bool = True, **specs: str | Spec) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def op(
+    *, gradient: bool = True, steps: tuple[Callable[..., Any], ...] = (), **specs: str | Spec
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register the decorated reference as a public operation with a contract per argument.
 
     Row pointers given as None mean "one cloud" and reach the body as ``[0, N]``; float inputs must be finite. Kernels
@@ -63,6 +82,7 @@ def op(*, gradient: bool = True, **specs: str | Spec) -> Callable[[Callable[P, R
 
     Args:
         gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
+        steps: inner functions that the reference calls with its ``backend``.
         specs: argument name -> contract: of tensors a string, see :mod:`pcdata.contracts.tensors`; of others an object,
             see :mod:`pcdata.contracts.numbers`.
     """
@@ -76,17 +96,18 @@ def op(*, gradient: bool = True, **specs: str | Spec) -> Callable[[Callable[P, R
             arguments = contract.bind(args, kwargs)
             contract.check(arguments)
             backend = arguments.pop("backend", "auto")
-            wants_gradient = _wants_gradient(arguments.values())
-            if backend == "auto" and wants_gradient and gradient:
-                backend = REFERENCE  # kernels know no derivative
+            wants_gradient = gradient and _wants_gradient(arguments.values())
             device = next(arguments[key].device for key in contract.tensors if arguments[key] is not None)
-            body: Callable[..., R] = _choose(operation, backend, device)
-            is_kernel = body is not operation.reference
-            if is_kernel or not gradient:
-                _detach(arguments, contiguous=is_kernel)
-            return body(**arguments)
+            backend = _choose(operation, backend, device, wants_gradient)
+            body: Callable[..., R] | None = operation.kernels.get(backend)
+            _tidy(arguments, detach=body is not None or not gradient, contiguous=backend != REFERENCE)
+            if body is None and steps:
+                arguments["backend"] = backend
+            return body(**arguments) if body is not None else operation.reference(**arguments)
 
-        operation = OPERATIONS[name] = Operation(name, reference, public, contract, gradient)
+        operation = OPERATIONS[name] = Operation(
+            name, reference, public, contract, gradient, tuple(step.__name__ for step in steps)
+        )
         return public
 
     return decorate
@@ -95,16 +116,20 @@ def op(*, gradient: bool = True, **specs: str | Spec) -> Callable[[Callable[P, R
 def inner(reference: Callable[P, R]) -> Callable[P, R]:
     """Register the decorated reference as a function without a contract: its callers pass what they have checked.
 
-    The first tensor among its arguments, or inside mappings and sequences among them, says the device.
+    The first tensor among its arguments, or inside mappings and sequences among them, says the device. A caller that
+    was told a backend passes it on as ``backend``.
     """
     name = reference.__name__
 
     @functools.wraps(reference)
     def function(*args: P.args, **kwargs: P.kwargs) -> R:
-        tensors = list(_tensors_in((*args, *kwargs.values())))
-        if not tensors or _wants_gradient(tensors):
-            return reference(*args, **kwargs)
-        body: Callable[P, R] = _choose(operation, "auto", tensors[0].device)
+        backend = str(kwargs.pop("backend", "auto"))
+        if backend == "auto":
+            tensors = list(_tensors_in((*args, *kwargs.values())))
+            backend = REFERENCE
+            if tensors and not _wants_gradient(tensors):
+                backend = _choose(operation, "auto", tensors[0].device)
+        body: Callable[P, R] = operation.kernels.get(backend, reference)
         return body(*args, **kwargs)
 
     operation = INNER[name] = Operation(name, reference, function)
@@ -147,14 +172,6 @@ def _wants_gradient(tensors: Iterable[Any]) -> bool:
     return wanted and torch.is_grad_enabled()
 
 
-def _detach(arguments: dict[str, Any], *, contiguous: bool) -> None:
-    """Take tensors out of every graph, and lay them out as kernels read memory: row after row, without gaps."""
-    for key, value in arguments.items():
-        if isinstance(value, Tensor):
-            value = value.detach() if value.requires_grad else value
-            arguments[key] = value.contiguous() if contiguous else value
-
-
 def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
     for one in arguments:
         if isinstance(one, Tensor):
@@ -165,13 +182,21 @@ def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
             yield from _tensors_in(one)
 
 
+def _tidy(arguments: dict[str, Any], *, detach: bool, contiguous: bool) -> None:
+    """Take tensors out of every graph, and lay them out as kernels read memory: row after row, without gaps."""
+    for key, value in arguments.items():
+        if isinstance(value, Tensor):
+            value = value.detach() if detach and value.requires_grad else value
+            arguments[key] = value.contiguous() if contiguous else value
+
+
 def first_live(device: torch.device, has_kernel: Callable[[str], bool]) -> str:
     """Return the backend that ``auto`` takes: the first for the device that is live and has a kernel.
 
     Warns:
         SlowBackendWarning: once, if a faster one has a kernel but is absent.
     """
-    for name in AUTO_ORDER.get(device.type, (REFERENCE,)):
+    for name in AUTO_ORDER.get(device.type, OTHER_DEVICES):
         if name == REFERENCE:
             break
         reason = why_unavailable(name)  # loads the kernels, if any
@@ -200,11 +225,12 @@ def warn_if_slow() -> None:
         _warn_of_slow_bodies(reason)
 
 
-def _choose(operation: Operation, backend: str, device: torch.device) -> Callable[..., Any]:
+def _choose(operation: Operation, backend: str, device: torch.device, wants_gradient: bool = False) -> str:
+    """Return the backend that computes a call; kernels of the operation itself know no derivative."""
     if backend == "auto":
-        backend = first_live(device, operation.kernels.__contains__)
+        return first_live(device, operation.serves_by_steps if wants_gradient else operation.serves)
     if backend == REFERENCE:
-        return operation.reference
+        return backend
     if backend not in BACKEND_MODULES:
         raise BackendError(
             f"{operation.name}: unknown backend {backend!r}; known: 'auto', {', '.join(map(repr, backends()))}"
@@ -213,6 +239,6 @@ def _choose(operation: Operation, backend: str, device: torch.device) -> Callabl
     reason = why_unavailable(backend)
     if reason is not None:
         raise BackendError(f"{operation.name}: backend {backend!r} is not available: {reason}")
-    if backend not in operation.kernels:
+    if not operation.serves(backend):
         raise BackendError(f"{operation.name}: backend {backend!r} has no kernel for it; use backend='auto'")
-    return operation.kernels[backend]
+    return backend

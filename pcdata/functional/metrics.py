@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.functional.boxtree import sum_of_squares
-from pcdata.functional.nearest import nearest_chunks
+from pcdata.functional.nearest import nearest_chunks, squared_distance
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
 
-@op(points_a="N 3", ptr_a="ptr N B >= 1", points_b="M 3", ptr_b="ptr M B >= 1")
+@op(points_a="N 3", ptr_a="ptr N B >= 1", points_b="M 3", ptr_b="ptr M B >= 1", steps=(nearest_chunks,))
 def chamfer_distance(
     points_a: Tensor,  # (N, 3) float32
     ptr_a: Tensor | None,  # (B+1,); None = one cloud
@@ -35,17 +34,19 @@ def chamfer_distance(
     """
     assert ptr_a is not None  # @op fills both
     assert ptr_b is not None
-    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
-    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
+    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared, backend)
+    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared, backend)).float()
 
 
-def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool) -> Tensor:
+def _mean_to_nearest(
+    queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool, backend: str
+) -> Tensor:
     """Return (B,) float64: the mean (squared) distance from every query to the nearest point of its cloud."""
     nearest = torch.empty(len(queries), dtype=torch.int64, device=queries.device)
     with torch.no_grad():
-        for near in nearest_chunks(points, ptr, 1, queries=queries, queries_ptr=queries_ptr):
+        for near in nearest_chunks(points, ptr, 1, queries=queries, queries_ptr=queries_ptr, backend=backend):
             nearest[near.query] = near.index[:, 0]
-    distance = sum_of_squares(queries - points[nearest])
+    distance = squared_distance(queries, points[nearest])
     if not squared:
         apart = distance > 0
         distance = torch.where(apart, torch.where(apart, distance, 1.0).sqrt(), 0.0)

@@ -1,24 +1,18 @@
-"""Exact k nearest neighbours by a walk down the box tree, in chunks of bounded memory.
-
-Queries are grouped like the points, 16 at a time. Each group takes a first bound from the leaves around it, walks the
-tree level by level with it, keeps per query the leaves within that query's own bound, and sorts only those points.
-Nothing is approximate: a box is dropped only when all of it is farther than k points already seen.
-"""
+"""Distances between points, and the nearest of them: every pair is looked at, a bounded number of pairs at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from pcdata.functional.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
-from pcdata.functional.rows import cloud_of_rows
+from pcdata.contracts.dispatch import inner
+from pcdata.functional.radius import squared_radius
 
-_GROUPS_PER_CHUNK = 512
-_MAX_PAIRS = 1 << 16  # (query, point) or (group, box) pairs alive at once: temporaries that stay in cache
+_PAIRS = 1 << 20  # looked at together: a few images of 4 MB
 
 
 @dataclass(frozen=True)
@@ -40,6 +34,7 @@ class Neighbors:
         return self.squared.double().sqrt().float()
 
 
+@inner
 def nearest_chunks(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor,  # (B+1,)
@@ -48,199 +43,55 @@ def nearest_chunks(
     queries: Tensor | None = None,  # (Q, 3) float32; None = the points
     queries_ptr: Tensor | None = None,  # (B+1,)
     radius: float | None = None,
+    backend: str = "auto",
 ) -> Iterator[Neighbors]:
     """Yield every query's k nearest points of its own cloud (with d < radius), each query once, in no fixed order.
 
-    A query that is one of the points counts itself. The radius test is ``d2 < float32(radius) * float32(radius)``.
+    A query that is one of the points counts itself.
     """
     points = points.detach()
-    foreign = queries is not None
-    leaves: Leaves | None = None
     if queries is None or queries_ptr is None:
         queries, queries_ptr = points, ptr
-        tree = BoxTree.build(points, ptr, spatial_order(points, cloud_of_rows(ptr)), max_copies=k)
-        if bool(tree.kept.all()):  # the queries are the leaves themselves
-            leaves, home = (
-                tree.leaves,
-                torch.arange(len(tree.leaves), dtype=torch.int64, device=ptr.device)[:, None].expand(-1, LEAF_SIZE),
-            )
-    if leaves is None:
-        tree, leaves, home = _build_together(points, ptr, queries.detach(), queries_ptr, max_copies=k)
-    yield from _Search(tree, leaves, home, foreign, k, largest_squared(radius, points.device)).run()
+    limit = squared_radius(radius, points.device)
+    infinity = torch.tensor(torch.inf, dtype=torch.float32, device=points.device)
+    missing = _order(infinity, torch.tensor(len(points), dtype=torch.int64, device=points.device))
+    for pairs in pair_chunks(points, ptr, queries.detach(), queries_ptr):
+        order = torch.where(pairs.squared < limit, _order(pairs.squared, pairs.row), missing)
+        nearest = order.topk(min(k, len(pairs.row)), largest=False).values
+        padded = torch.cat([nearest, missing.expand(len(nearest), k - nearest.shape[1])], dim=1)
+        yield Neighbors(pairs.query, (padded >> 32).int().view(torch.float32), padded & 0xFFFFFFFF)
 
 
-def largest_squared(radius: float | None, device: torch.device) -> Tensor:
-    """Return the largest float32 d2 that counts as d < radius; a finite maximum when there is no radius."""
-    if radius is None:
-        return torch.tensor(torch.finfo(torch.float32).max, dtype=torch.float32, device=device)
-    limit = torch.tensor(radius, dtype=torch.float32, device=device)
-    return torch.nextafter(limit * limit, torch.zeros_like(limit))
-
-
-def _build_together(
-    points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor, *, max_copies: int
-) -> tuple[BoxTree, Leaves, Tensor]:
-    """Sort points and queries along one curve; return the tree, the grouped queries and the leaf each query falls in.
-
-    The leaf is (G, 16), -1 where the cloud has no points.
-    """
-    cloud = torch.cat([cloud_of_rows(ptr), cloud_of_rows(queries_ptr)])
-    order = spatial_order(torch.cat([points, queries]), cloud)
-    is_point = order < len(points)
-    tree = BoxTree.build(points, ptr, order[is_point], max_copies=max_copies)
-    leaves = Leaves.of(queries, queries_ptr, order[~is_point] - len(points))
-    seen = torch.zeros_like(order)
-    seen[is_point] = tree.kept.long()
-    place = torch.cumsum(seen, 0)[~is_point] - 1  # the last point before each query on the curve
-    cloud = cloud_of_rows(queries_ptr)
-    first, end = tree.ptr[cloud], tree.ptr[cloud + 1]
-    home = tree.leaf_ptr[cloud] + torch.minimum(place.clamp(min=0), end - 1).sub_(first).clamp_(min=0) // LEAF_SIZE
-    home = torch.where(first < end, home, -1)
-    return tree, leaves, home[leaves.level.groups.table()[0]]
+def _order(squared: Tensor, row: Tensor) -> Tensor:
+    """Return integers that ascend by (squared distance, row): floats of one sign are ordered as their bits are."""
+    return (squared.view(torch.int32).long() << 32) | row
 
 
 @dataclass(frozen=True)
-class _Search:
-    tree: BoxTree
-    leaves: Leaves  # the queries, grouped
-    home: Tensor  # (G, 16) a leaf of points near each query, -1 for none
-    foreign: bool  # queries may lie far from all points
-    k: int
-    limit: Tensor  # () float32, neighbours have d2 <= limit
+class Pairs:
+    """Some queries of one cloud with all points of that cloud."""
 
-    @cached_property
-    def cloud(self) -> Tensor:
-        """(G,) int64: the cloud of every group of queries."""
-        return cloud_of_rows(self.leaves.level.groups.ptr)
-
-    def run(self) -> Iterator[Neighbors]:
-        window = self._window_size()
-        per_chunk = max(1, min(_GROUPS_PER_CHUNK, _MAX_PAIRS // (LEAF_SIZE * LEAF_SIZE * window)))
-        for begin in range(0, len(self.leaves), per_chunk):
-            groups = torch.arange(
-                begin, min(begin + per_chunk, len(self.leaves)), dtype=torch.int64, device=self.home.device
-            )
-            yield from self._walk(groups, torch.minimum(self._first_bound(groups, window), self.limit))
-
-    def _window_size(self) -> int:
-        """Leaves that surely hold k points wherever the cloud has them: only a cloud's last leaf may be short."""
-        return max(3, -(-self.k // LEAF_SIZE) + 2)
-
-    def _first_bound(self, groups: Tensor, window: int) -> Tensor:
-        """Return (g, 16): each query's k-th squared distance among the leaves around its own, inf below k points."""
-        points = self.leaves.points[groups]
-        cloud = self.cloud[groups, None]
-        bound = self._bound_around(points, self.home[groups], cloud, window)
-        if self.foreign:
-            bound = torch.minimum(bound, self._bound_around(points, self._descend(points, cloud), cloud, window))
-        return bound
-
-    def _descend(self, points: Tensor, cloud: Tensor) -> Tensor:
-        """Return (g, 16): the leaf that each query reaches by always taking the nearest box; -1 for an empty cloud.
-
-        For a query far from all points the curve is no guide, and a loose bound would let in every leaf.
-        """
-        root_ptr = self.tree.levels[-1].groups.ptr
-        empty = (root_ptr[cloud + 1] == root_ptr[cloud]).expand(points.shape[:2])
-        if len(self.tree.leaves) == 0:
-            return torch.full_like(empty, -1, dtype=torch.int64)
-        node = root_ptr[cloud].clamp(max=len(self.tree.levels[-1].low) - 1).expand(points.shape[:2])
-        for depth in range(len(self.tree.levels) - 1, 0, -1):
-            groups, below = self.tree.levels[depth].groups, self.tree.levels[depth - 1]
-            slot = torch.arange(groups.size, dtype=torch.int64, device=node.device)
-            children = groups.first[node][..., None] + torch.minimum(slot, groups.count[node][..., None] - 1)
-            gap = box_gap(points[:, :, None], points[:, :, None], below.low[children], below.high[children])
-            node = children.gather(-1, gap.argmin(-1, keepdim=True)).squeeze(-1)
-        return torch.where(empty, -1, node)
-
-    def _bound_around(self, points: Tensor, home: Tensor, cloud: Tensor, window: int) -> Tensor:
-        """Return (g, 16): the k-th squared distance among ``window`` leaves around ``home``."""
-        ptr = self.tree.leaf_ptr
-        begin, end = ptr[cloud], ptr[cloud + 1]
-        first = torch.maximum(torch.minimum(home - window // 2, end - window), begin)
-        around = first[..., None] + torch.arange(window, dtype=torch.int64, device=home.device)
-        around = torch.where(around < end[..., None], around, len(self.tree.leaves))
-        squared = self._squared(points, around)
-        if self.k > squared.shape[-1]:
-            return torch.full_like(squared[..., 0], torch.inf)
-        return squared.topk(self.k, largest=False, sorted=False).values.amax(-1)
-
-    def _squared(self, queries: Tensor, leaf: Tensor) -> Tensor:
-        """Return (..., w*16) squared distances from (..., 3) queries to the points of their (..., w) leaves."""
-        total: Tensor | None = None
-        for axis in range(3):
-            offset = self.tree.coordinates[axis][leaf].flatten(-2) - queries[..., axis, None]
-            offset *= offset
-            total = offset if total is None else total.add_(offset)
-        assert total is not None
-        return total
-
-    def _walk(self, groups: Tensor, bound: Tensor) -> Iterator[Neighbors]:
-        """Descend all levels at once with (group, node) pairs, from each group's root; ``bound`` is (g, 16)."""
-        root_ptr = self.tree.levels[-1].groups.ptr
-        cloud = self.cloud[groups]
-        group = (root_ptr[cloud + 1] > root_ptr[cloud]).nonzero().squeeze(1)  # counts within this chunk
-        node = root_ptr[cloud[group]]
-        group_bound = torch.where(self.leaves.real[groups], bound, -torch.inf).amax(1)
-        low, high = self.leaves.level.low[groups], self.leaves.level.high[groups]
-        for depth in range(len(self.tree.levels) - 1, -1, -1):
-            level = self.tree.levels[depth]
-            near = box_gap(low[group], high[group], level.low[node], level.high[node]) <= group_bound[group]
-            group, node = group[near], node[near]
-            if depth:
-                group, node = expand_ranges(level.groups.first[node], level.groups.count[node], group)
-            if len(group) > _MAX_PAIRS and len(groups) > 1:
-                # A bound too loose for so many groups at once: walk again with half of them, never with more memory.
-                half = len(groups) // 2
-                yield from self._walk(groups[:half], bound[:half])
-                yield from self._walk(groups[half:], bound[half:])
-                return
-        yield from self._finish(groups, bound, group, node)
-
-    def _finish(self, groups: Tensor, bound: Tensor, group: Tensor, leaf: Tensor) -> Iterator[Neighbors]:
-        """Refine (group, leaf) pairs to (query, leaf) pairs and rank the points in them."""
-        points = self.leaves.points[groups]
-        boxes = self.tree.levels[0]
-        gap = box_gap(points[group], points[group], boxes.low[leaf][:, None], boxes.high[leaf][:, None])
-        pair, slot = ((gap <= bound[group]) & self.leaves.real[groups][group]).nonzero(as_tuple=True)
-        query, by_query = torch.sort(group[pair] * LEAF_SIZE + slot, stable=True)
-        leaf = leaf[pair][by_query]
-        points, row = points.flatten(0, 1), self.leaves.row[groups].flatten()
-        counts = torch.bincount(query, minlength=len(row))
-        start = torch.cumsum(counts, 0) - counts
-        leaf = torch.cat([leaf, leaf.new_full((1,), len(self.tree.leaves))])  # what empty places of a table read
-        counts = torch.where(self.leaves.real[groups].flatten(), counts, -1)  # a repeated slot is no query
-        narrower = -1
-        for width in _widths(int(counts.max())):
-            chosen = ((counts > narrower) & (counts <= width)).nonzero().squeeze(1)
-            narrower = width
-            places = torch.arange(width, dtype=torch.int64, device=row.device)
-            per_part = max(1, _MAX_PAIRS // (width * LEAF_SIZE))
-            for begin in range(0, len(chosen), per_part):
-                part = chosen[begin : begin + per_part]
-                place = torch.where(places < counts[part, None], start[part, None] + places, len(leaf) - 1)
-                yield self._rank(row[part], points[part], leaf[place])
-
-    def _rank(self, row: Tensor, points: Tensor, candidates: Tensor) -> Neighbors:
-        """Sort the points of the (m, w) candidate leaves by (d2, row) and keep k."""
-        squared = self._squared(points, candidates)
-        index = self.tree.row[candidates].flatten(-2)
-        # Non-negative floats sort like their bits: one integer holds the total order.
-        key = (squared.view(torch.int32).long() << 32) | index
-        k = min(self.k, key.shape[1])
-        key = key.topk(k, largest=False).values
-        squared, index = (key >> 32).int().view(torch.float32), key & 0xFFFFFFFF
-        outside = squared > self.limit
-        squared, index = squared.masked_fill(outside, torch.inf), index.masked_fill(outside, self.tree.num_points)
-        if k < self.k:
-            squared = torch.nn.functional.pad(squared, (0, self.k - k), value=torch.inf)
-            index = torch.nn.functional.pad(index, (0, self.k - k), value=self.tree.num_points)
-        return Neighbors(row, squared, index)
+    query: Tensor  # (m,) int64, rows of the queries
+    row: Tensor  # (n,) int64, rows of the points
+    squared: Tensor  # (m, n) float32
 
 
-def _widths(largest: int) -> list[int]:
-    """Table widths that cover 1 to ``largest``, growing by a third to a half, so padding stays small."""
-    widths = [1, 2, 3, 4]
-    while widths[-1] < largest:
-        widths.append(widths[-2] * 2)
-    return widths
+def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor) -> Iterator[Pairs]:
+    """Yield all pairs of a query and a point of the same cloud; each query is in one chunk."""
+    for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):
+        row = torch.arange(start, stop, dtype=torch.int64, device=points.device)
+        at_once = max(1, _PAIRS // max(1, stop - start))
+        for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(at_once):
+            if len(query):
+                yield Pairs(query, row, squared_distance(queries[query, None], points[start:stop]))
+
+
+def squared_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Return the squared distance between (..., 3) points of two tensors that broadcast."""
+    return sum_of_squares(a - b)
+
+
+def sum_of_squares(offset: Tensor) -> Tensor:
+    """Return ((x*x)+(y*y))+(z*z) of (..., 3) offsets: separate operations in this order, so all backends agree."""
+    square = offset * offset
+    return (square[..., 0] + square[..., 1]) + square[..., 2]

@@ -17,7 +17,16 @@ from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 
 
-@op(points="N 3", ptr="ptr N B", queries="Q 3", queries_ptr="ptr Q B", k=Count(), grid=GridOfPoints(), gradient=False)
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    queries="Q 3",
+    queries_ptr="ptr Q B",
+    k=Count(),
+    grid=GridOfPoints(),
+    steps=(nearest_chunks,),
+    gradient=False,
+)
 def knn(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -49,7 +58,7 @@ def knn(
     num_queries = len(points if queries is None else queries)
     index = torch.empty((num_queries, k), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, k), dtype=torch.float32, device=points.device)
-    for near in nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr):
+    for near in nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, backend=backend):
         index[near.query] = near.index
         distance[near.query] = near.distance
     return index, distance
@@ -63,6 +72,7 @@ def knn(
     radius=Length(),
     max_neighbors=Count(),
     grid=GridOfPoints(),
+    steps=(nearest_chunks,),
     gradient=False,
 )
 def ball_query(
@@ -100,7 +110,9 @@ def ball_query(
     index = torch.empty((num_queries, max_neighbors), dtype=torch.int64, device=points.device)
     distance = torch.empty((num_queries, max_neighbors), dtype=torch.float32, device=points.device)
     count = torch.empty(num_queries, dtype=torch.int64, device=points.device)
-    for near in nearest_chunks(points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=radius):
+    for near in nearest_chunks(
+        points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=radius, backend=backend
+    ):
         index[near.query] = near.index
         distance[near.query] = near.distance
         count[near.query] = near.found.sum(1)

@@ -18,7 +18,15 @@ from pcdata.functional.image_grid import GridOfPoints, ImageGrid
 from pcdata.functional.nearest import nearest_chunks
 
 
-@op(points="N 3", ptr="ptr N B", radius=Length(), max_neighbors=Count(), grid=GridOfPoints(), gradient=False)
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    radius=Length(),
+    max_neighbors=Count(),
+    grid=GridOfPoints(),
+    steps=(nearest_chunks,),
+    gradient=False,
+)
 def estimate_normals(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -52,7 +60,7 @@ def estimate_normals(
     assert ptr is not None  # @op fills it
     normals = torch.empty_like(points)
     wide = points.double()
-    for near in nearest_chunks(points, ptr, max_neighbors, radius=radius):
+    for near in nearest_chunks(points, ptr, max_neighbors, radius=radius, backend=backend):
         count = near.found.sum(1)
         # A missing neighbour points at the query itself: offset 0 adds nothing to the sums below.
         index = torch.where(near.found, near.index, near.query[:, None])

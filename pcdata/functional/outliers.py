@@ -11,13 +11,21 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import Count, Length, Positive
-from pcdata.functional.cells import Cells
 from pcdata.functional.image_grid import GridOfPoints, ImageGrid
-from pcdata.functional.nearest import nearest_chunks
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.functional.nearest import nearest_chunks, pair_chunks
+from pcdata.functional.radius import require_extent, squared_radius
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
 
-@op(points="N 3", ptr="ptr N B", num_neighbors=Count(), std_ratio=Positive(), grid=GridOfPoints(), gradient=False)
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    num_neighbors=Count(),
+    std_ratio=Positive(),
+    grid=GridOfPoints(),
+    steps=(nearest_chunks,),
+    gradient=False,
+)
 def statistical_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
@@ -43,7 +51,7 @@ def statistical_outlier_mask(
     """
     assert ptr is not None  # @op fills it
     mean = torch.zeros(len(points), dtype=torch.float64, device=points.device)
-    for near in nearest_chunks(points, ptr, num_neighbors):
+    for near in nearest_chunks(points, ptr, num_neighbors, backend=backend):
         distance = torch.where(near.found, near.squared.double().sqrt(), 0.0)
         mean[near.query] = distance.sum(1) / near.found.sum(1)
     cloud, counts = cloud_of_rows(ptr), counts_from_ptr(ptr).double()
@@ -95,22 +103,12 @@ def radius_outlier_mask(
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
         ConfigError: min_neighbors is less than 1, the radius is not a positive length, or it is too small for the
-            extent of the cloud (see :class:`pcdata.functional.cells.Cells`).
+            extent of the cloud (see :mod:`pcdata.functional.radius`).
     """
     assert ptr is not None  # @op fills it
-    # All points of a cell are within the radius of each other: a full cell needs no distances.
-    outlier = Cells.within("radius_outlier_mask", points, ptr, radius).crowd() <= min_neighbors
-    undecided = outlier.nonzero().squeeze(1)
-    if len(undecided) == 0:
-        return outlier
-    searches = nearest_chunks(
-        points,
-        ptr,
-        min_neighbors + 1,
-        queries=points[undecided],
-        queries_ptr=ptr_after_mask(outlier, ptr),
-        radius=radius,
-    )
-    for near in searches:
-        outlier[undecided[near.query]] = ~near.found.all(1)
+    require_extent("radius_outlier_mask", points, ptr, radius)
+    limit = squared_radius(radius, points.device)
+    outlier = torch.empty(len(points), dtype=torch.bool, device=points.device)
+    for pairs in pair_chunks(points, ptr, points, ptr):
+        outlier[pairs.query] = (pairs.squared < limit).sum(1) <= min_neighbors
     return outlier

@@ -26,7 +26,7 @@ def health_text() -> str:
     backends = []
     for name in dispatch.backends():
         reason = dispatch.why_unavailable(name)
-        operations = [op for op, entry in sorted(dispatch.OPERATIONS.items()) if name in entry.kernels]
+        operations = [op for op, entry in sorted(dispatch.OPERATIONS.items()) if entry.serves(name)]
         serves = "every operation, on any device" if name == dispatch.REFERENCE else ", ".join(operations)
         backends.append([name, "live" if reason is None else "absent", serves if reason is None else reason])
     optional = []

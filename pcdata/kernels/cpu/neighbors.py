@@ -14,7 +14,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud
-from pcdata.functional.nearest import largest_squared
+from pcdata.functional.radius import largest_squared
 from pcdata.kernels.cpu.image_grid import grid_arguments
 from pcdata.kernels.cpu.native import call, room
 

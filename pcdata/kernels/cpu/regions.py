@@ -9,8 +9,8 @@ from torch import Tensor
 import pcdata.functional.clusters
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import kernel
-from pcdata.functional.cells import require_cells
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.radius import require_cells
 from pcdata.kernels.cpu.image_grid import grid_arguments
 from pcdata.kernels.cpu.native import call, room
 

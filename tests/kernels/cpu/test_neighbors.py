@@ -82,14 +82,15 @@ MANY_PTR = ptr_from_counts([len(cloud) for cloud in CLOUDS.values()])
 
 
 def assert_neighbors(points: Tensor, ptr: Tensor | None = None, *, k: int, **options: object) -> None:
-    ours, theirs = (F.knn(points, ptr, k=k, backend=name, **options) for name in ("cpu", "torch"))
+    ours, theirs = (F.knn(points, ptr, k=k, backend=name, **options) for name in ("cpu", "torch_tree"))
     assert torch.equal(ours[0], theirs[0])
     assert torch.equal(ours[1], theirs[1])
 
 
 def assert_balls(points: Tensor, ptr: Tensor | None = None, *, radius: float, k: int, **options: object) -> None:
     results = [
-        F.ball_query(points, ptr, radius=radius, max_neighbors=k, backend=name, **options) for name in ("cpu", "torch")
+        F.ball_query(points, ptr, radius=radius, max_neighbors=k, backend=name, **options)
+        for name in ("cpu", "torch_tree")
     ]
     for ours, theirs in zip(*results, strict=True):
         assert torch.equal(ours, theirs)
@@ -97,7 +98,8 @@ def assert_balls(points: Tensor, ptr: Tensor | None = None, *, radius: float, k:
 
 def assert_masks(points: Tensor, ptr: Tensor | None = None, *, k: int, grid: ImageGrid | None = None) -> None:
     ours, theirs = (
-        F.statistical_outlier_mask(points, ptr, num_neighbors=k, grid=grid, backend=name) for name in ("cpu", "torch")
+        F.statistical_outlier_mask(points, ptr, num_neighbors=k, grid=grid, backend=name)
+        for name in ("cpu", "torch_tree")
     )
     assert torch.equal(ours, theirs)
 
@@ -108,9 +110,9 @@ def assert_normals(
     """Equal to the reference, also where none stands out; a true smallest eigenvector everywhere."""
     ours, theirs = (
         F.estimate_normals(points, ptr, radius=radius, max_neighbors=k, grid=grid, backend=name).double()
-        for name in ("cpu", "torch")
+        for name in ("cpu", "torch_tree")
     )
-    index, _, count = F.ball_query(points, ptr, radius=radius, max_neighbors=k, backend="torch")
+    index, _, count = F.ball_query(points, ptr, radius=radius, max_neighbors=k, backend="torch_tree")
     real = (torch.arange(k) < count[:, None]).double()[..., None]
     near = torch.cat([points, points.new_zeros(1, 3)]).double()[index] * real
     offset = (near - near.sum(1, keepdim=True) / count[:, None, None]) * real
@@ -220,7 +222,9 @@ def test_chamfer_equals_the_reference(squared: bool):
     kept = [name for name, cloud in CLOUDS.items() if len(cloud)]
     a, ptr_a = torch.cat([CLOUDS[n] for n in kept]), ptr_from_counts([len(CLOUDS[n]) for n in kept])
     b, ptr_b = a.flip(0) * 1.01, ptr_from_counts([len(CLOUDS[n]) for n in reversed(kept)])
-    ours, theirs = (F.chamfer_distance(a, ptr_a, b, ptr_b, squared=squared, backend=name) for name in ("cpu", "torch"))
+    ours, theirs = (
+        F.chamfer_distance(a, ptr_a, b, ptr_b, squared=squared, backend=name) for name in ("cpu", "torch_tree")
+    )
     torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=0)
 
 
@@ -312,7 +316,7 @@ def test_a_wrong_grid_never_gives_a_wrong_answer(name: str):
 def test_a_motion_that_is_not_rigid_is_refused():
     points, grid = depth_image()
     scaled = torch.diag(torch.tensor([2.0, 2, 2, 1]))[None]
-    for name in ("cpu", "torch"):
+    for name in ("cpu", "torch_tree"):
         with pytest.raises(ConfigError, match="not rigid"):
             F.knn(points, k=3, grid=replace(grid, camera_from_points=scaled), backend=name)
         with pytest.raises(ShapeError, match="camera_from_points"):
@@ -321,7 +325,7 @@ def test_a_motion_that_is_not_rigid_is_refused():
 
 def test_bad_numbers_are_refused_like_by_the_reference():
     points = random_cloud(10)
-    for name in ("cpu", "torch"):
+    for name in ("cpu", "torch_tree"):
         with pytest.raises(ConfigError):
             F.knn(points, k=0, backend=name)
         with pytest.raises(ConfigError):
@@ -336,7 +340,7 @@ def test_bad_numbers_are_refused_like_by_the_reference():
 
 def test_flushing_denormals_does_not_disturb_the_order():
     points = torch.cat([torch.full((40, 3), 0.25), random_cloud(200)])
-    expected = F.knn(points, k=20, backend="torch")
+    expected = F.knn(points, k=20, backend="torch_tree")
     torch.set_flush_denormal(True)
     try:
         found = F.knn(points, k=20, backend="cpu")

@@ -40,11 +40,12 @@ def assert_same(points: Tensor, ptr: Tensor | None = None, *, radius: float, cou
     for grids in {None: (None,)}.get(grid, (None, grid)):
         masks = [
             radius_outlier_mask(points, ptr, min_neighbors=count, radius=radius, grid=grids, backend=name)
-            for name in ("cpu", "torch")
+            for name in ("cpu", "torch_tree")
         ]
         assert torch.equal(*masks)
         labels = [
-            dbscan(points, ptr, eps=radius, min_points=count, grid=grids, backend=name) for name in ("cpu", "torch")
+            dbscan(points, ptr, eps=radius, min_points=count, grid=grids, backend=name)
+            for name in ("cpu", "torch_tree")
         ]
         assert torch.equal(*labels)
 
@@ -157,7 +158,7 @@ def test_wide_keys_serve_crowded_cells_and_many_rows_too():
 def test_too_many_cells_is_the_error_of_the_reference():
     points = torch.tensor([[0.0, 0, 0], [1e6, 0, 0]])
     messages = []
-    for name in ("cpu", "torch"):
+    for name in ("cpu", "torch_tree"):
         for function, length in ((radius_outlier_mask, "radius"), (dbscan, "eps")):
             with pytest.raises(ConfigError, match="same unit") as caught:
                 function(points, **{length: 1e-7}, backend=name)
@@ -167,7 +168,7 @@ def test_too_many_cells_is_the_error_of_the_reference():
 
 def test_bad_arguments_are_the_errors_of_the_reference():
     points, grid = depth_image()
-    for name in ("cpu", "torch"):
+    for name in ("cpu", "torch_tree"):
         with pytest.raises(ConfigError, match="min_neighbors"):
             radius_outlier_mask(points, min_neighbors=0, backend=name)
         with pytest.raises(ConfigError, match="radius"):
@@ -239,8 +240,8 @@ def scattered() -> list[tuple[Tensor, Tensor, Tensor]]:
     for seed, spread in enumerate((0.02, 0.3, 1e5)):
         points = normal(4000, seed, spread)
         for ordered in (points, points[points[:, 0].argsort()]):
-            mask = radius_outlier_mask(ordered, radius=0.02, backend="torch")
-            found.append((ordered, mask, dbscan(ordered, eps=0.02, min_points=5, backend="torch")))
+            mask = radius_outlier_mask(ordered, radius=0.02, backend="torch_tree")
+            found.append((ordered, mask, dbscan(ordered, eps=0.02, min_points=5, backend="torch_tree")))
     return found
 
 

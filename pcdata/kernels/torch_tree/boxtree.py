@@ -15,17 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.functional.nearest import sum_of_squares
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask, ptr_from_counts
 
 LEAF_SIZE = 16
 FAN_OUT = 8
 _BITS = 21  # per axis, three axes fill 63 bits
-
-
-def sum_of_squares(offset: Tensor) -> Tensor:
-    """Return ((x*x)+(y*y))+(z*z) of (..., 3) offsets: separate operations in this order, so all backends agree."""
-    square = offset * offset
-    return (square[..., 0] + square[..., 1]) + square[..., 2]
 
 
 @dataclass(frozen=True)

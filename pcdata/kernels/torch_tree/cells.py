@@ -5,22 +5,17 @@ A cell's side is the radius over sqrt(3), so its diagonal is just under the radi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError
-from pcdata.functional.boxtree import expand_ranges
+from pcdata.functional.radius import cell_side, require_cells
 from pcdata.functional.rows import cloud_of_rows
+from pcdata.kernels.torch_tree.boxtree import expand_ranges
 
-# The diagonal stays under the radius by far more than float32 distances (2e-7) and cell borders (2e-6) can err.
-_MARGIN = 1e-4
-# Up to here a float64 cell coordinate errs by less than 2^-16 of a cell, and (column, coordinate) fits in 64 bits.
-_MAX_CELLS_PER_AXIS = 2**36
-_REACH = 2  # ceil(sqrt(3) * (1 + margin)): neighbours within the radius are at most two cells away on every axis
+_REACH = 2  # ceil(sqrt(3)), and a margin: neighbours within the radius are at most two cells away on every axis
 
 
 @dataclass(frozen=True)
@@ -46,8 +41,7 @@ class Cells:
         cloud = cloud_of_rows(ptr)
         index = cloud[:, None].expand(-1, 3)
         low = points.new_full((len(ptr) - 1, 3), torch.inf).scatter_reduce_(0, index, points, "amin").double()
-        side = float(torch.tensor(radius, dtype=torch.float32, device="cpu")) / math.sqrt(3.0) * (1 - _MARGIN)
-        scaled = (points - low[cloud]) / side
+        scaled = (points - low[cloud]) / cell_side(radius)
         if len(points):
             require_cells(where, radius, float(scaled.max()))
         # Room of _REACH on both sides, so that a neighbour's coordinate never runs into the next column.
@@ -82,19 +76,6 @@ class Cells:
             first = torch.searchsorted(self.keys[2], base + lowest)
             last = torch.searchsorted(self.keys[2], base + _REACH, right=True)
             yield expand_ranges(first, last - first, owner)
-
-
-def require_cells(where: str, radius: float, largest: float) -> None:
-    """Require that the largest cell coordinate of a cloud is one that cells can have.
-
-    Raises:
-        ConfigError: a cloud is more than 2^36 cells wide.
-    """
-    if largest >= _MAX_CELLS_PER_AXIS:
-        raise ConfigError(
-            f"{where}: a radius of {radius:g} cuts a cloud into {largest:.2g} cells along an axis, "
-            f"more than {_MAX_CELLS_PER_AXIS:.2g}; are both in the same unit, or is a stray point far out?"
-        )
 
 
 def _find(keys: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:

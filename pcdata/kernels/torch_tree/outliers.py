@@ -1,0 +1,35 @@
+"""Radius outliers: a crowded cell needs no distances, the rest asks the tree."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+import pcdata.functional.outliers  # noqa: F401 - the operation must be registered before its kernel
+from pcdata.contracts.dispatch import kernel
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.rows import ptr_after_mask
+from pcdata.kernels.torch_tree.cells import Cells
+from pcdata.kernels.torch_tree.search import nearest_chunks
+
+
+@kernel("radius_outlier_mask", "torch_tree")
+def radius_outlier_mask(
+    points: Tensor, ptr: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
+) -> Tensor:
+    """Count the points of every cell, then search around those in cells that are not full."""
+    # All points of a cell are within the radius of each other: a full cell needs no distances.
+    outlier = Cells.within("radius_outlier_mask", points, ptr, radius).crowd() <= min_neighbors
+    undecided = outlier.nonzero().squeeze(1)
+    if len(undecided) == 0:
+        return outlier
+    searches = nearest_chunks(
+        points,
+        ptr,
+        min_neighbors + 1,
+        queries=points[undecided],
+        queries_ptr=ptr_after_mask(outlier, ptr),
+        radius=radius,
+    )
+    for near in searches:
+        outlier[undecided[near.query]] = ~near.found.all(1)
+    return outlier
