@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 from pcdata.errors import PcdataError
 
 _MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
 _CONTAINERS = (dict, list)
+# What could be more than a float or an int can hold: only then is every number looked at.
+_LARGE_NUMBER = re.compile(r"(?<![\w\"])\d[\d.]*[eE]\+?\d{3}|\d{200}")
 _MAX_DEPTH = 100  # a pipeline may have 50 levels as YAML, and each is two here
 
 
@@ -24,13 +27,20 @@ def parse_json(text: str | bytes) -> Any:
         ValueError: no JSON, a name given twice, a number that is not finite, nested too deeply, or more lists and
             objects than numbers and names in them could fill.
     """
-    brackets = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    if not isinstance(text, str):
+        text = text.decode(json.detect_encoding(text), "surrogatepass")
+    brackets = text.count("[") + text.count("{")
     # An empty one takes 60 bytes of memory for 3 of text; facts have a name or several numbers in each.
     if brackets > 10_000 + len(text) // 6:
         raise ValueError(f"it has {brackets} lists and objects in {len(text)} bytes: damaged or hostile")
     try:
+        is_large = _LARGE_NUMBER.search(text) is not None
         data = json.loads(
-            text, object_pairs_hook=_unique, parse_constant=_refused, parse_float=_finite, parse_int=_whole
+            text,
+            object_pairs_hook=_unique,
+            parse_constant=_refused,
+            parse_float=_finite if is_large else None,
+            parse_int=_whole if is_large else None,
         )
     except RecursionError as cause:
         raise ValueError("nested too deeply") from cause
@@ -40,8 +50,11 @@ def parse_json(text: str | bytes) -> Any:
     for _ in range(_MAX_DEPTH + 1):
         if not level:
             return data
-        values = (parent.values() if type(parent) is dict else parent for parent in level)
-        level = [part for some in values for part in some if type(part) in _CONTAINERS]
+        parents, level = level, []
+        for parent in parents:
+            for part in parent.values() if type(parent) is dict else parent:
+                if type(part) in _CONTAINERS:
+                    level.append(part)
     raise ValueError(f"nested too deeply, more than {_MAX_DEPTH} levels")
 
 

@@ -118,4 +118,4 @@ def _as_plain(value: Any) -> Any:
     """Turn arrays into numbers and lists into tuples, so that fields cannot change under a transform."""
     if isinstance(value, (Tensor, np.ndarray, np.generic)):
         value = value.tolist()
-    return tuple(_as_plain(item) for item in value) if isinstance(value, (list, tuple)) else value
+    return tuple(map(_as_plain, value)) if isinstance(value, (list, tuple)) else value

@@ -30,6 +30,10 @@ WRONG = {
     "not a number": '{"a": NaN}',
     "no end": '{"a": Infinity}',
     "beyond a float": '{"a": 1e999}',
+    "far below a float": '{"a": [2, -1.5E+0309]}',
+    "beyond a float by its digits": '{"a":' + "7" * 250 + "e60}",
+    "beyond a float in UTF-16": '{"a":1e999}'.encode("utf-16"),
+    "four hundred digits and a point": '{"a": ' + "1" * 400 + ".0}",
     "five thousand digits": '{"a": ' + "1" * 5000 + "}",
     "a list": "[1]",
     "nothing": "",
@@ -47,6 +51,11 @@ def test_json_that_says_nothing_certain_is_refused(name):
     assert len(str(caught.value)) < 1000
     with pytest.raises(CacheError):
         parse_info(WRONG[name])
+
+
+def test_what_only_looks_like_a_large_number_is_read():
+    text = '{"a": ["1e999", "x 1e999", 1e308, 1e-999, -2E+0007], "b": ' + "1" * 400 + ', "5e123": 3}'
+    assert parse_json(text) == {"a": ["1e999", "x 1e999", 1e308, 0.0, -2e7], "b": int("1" * 400), "5e123": 3}
 
 
 def test_plain_json_is_read():

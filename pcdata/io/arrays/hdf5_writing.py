@@ -92,8 +92,11 @@ class FaultKeepingFile:
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to an offset; HDF5 also asks for the end."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end()}[whence]
-        self._position = start + offset
+        if whence == os.SEEK_END:
+            offset += self._end()
+        elif whence == os.SEEK_CUR:
+            offset += self._position
+        self._position = offset
         return self._position
 
     def tell(self) -> int:

@@ -1,0 +1,31 @@
+"""How many Python calls the three paths take: a reader steps through them, and a loop pays for each."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from pcdata.contracts.dispatch import why_unavailable
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
+    "points": (400, 32),
+    "build": (2300, 72),
+    "open": (1120, 28),
+}
+
+
+@pytest.fixture
+def found(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    calls = importlib.import_module("calls")
+    return calls.summary(calls.measure())
+
+
+@pytest.mark.skipif(why_unavailable("cpu") is not None, reason="without the compiled core other bodies run")
+def test_no_path_takes_more_calls_or_files_than_it_did(found):
+    for name, (calls, files) in LIMITS.items():
+        assert found[name]["calls"] <= calls, name
+        assert found[name]["files"] <= files, name
