@@ -374,4 +374,4 @@ def test_the_stored_yaml_makes_the_same_pipeline(tmp_path, source, configure):
     config = configure()
     build_dataset(config, source, tmp_path / "out")
     again = Compose.load(str(tmp_path / "out" / "pipeline.yaml"))
-    assert again.to_config() == config.pipeline.sections()
+    assert again.sections() == config.pipeline.sections()
