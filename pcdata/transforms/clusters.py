@@ -14,7 +14,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
-from pcdata.transforms.fields import Count, Metres
+from pcdata.transforms.field_types import Count, Metres
 
 
 class LeftOutWarning(PcdataWarning):

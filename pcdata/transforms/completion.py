@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from pcdata.errors import CaptureError, ConfigError, DTypeError, NonFiniteError, ShapeError, near_matches
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count
-from pcdata.transforms.inpainting import NearestCompletion, SmoothCompletion
+from pcdata.transforms.field_types import Count
+from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
 
 BUILT_IN: dict[str, type[nn.Module]] = {"nearest": NearestCompletion, "smooth": SmoothCompletion}
 _IDENTITY = re.compile(r"[\w.<>]+ sha256:[0-9a-f]{16}")

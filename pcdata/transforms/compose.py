@@ -15,10 +15,10 @@ from pcdata.files.opening import read_text
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Data, GeneratorLike, Transform, num_clouds
-from pcdata.transforms.capture import find_capture, run_capture
 from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
 from pcdata.transforms.chain_rules import check_chain, takes_clouds, warn_of_order
 from pcdata.transforms.field_checks import FaultyConfigError, validated_fields
+from pcdata.transforms.fused_beginning import find_beginning, run_beginning
 from pcdata.transforms.plain_document import PlainDocument
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
@@ -52,7 +52,7 @@ class Compose(Transform):
         return part
 
     def _hold(self, steps: Sequence[Transform]) -> None:
-        self._capture = find_capture(steps)
+        self._beginning = find_beginning(steps)
         entry = next((i for i, step in enumerate(steps) if takes_clouds(step)), len(steps))
         # A chain of images alone has no place for a cloud: its first step says so.
         self._cloud_entry = 0 if steps and not issubclass(steps[-1].gives, PointCloud) else entry
@@ -85,14 +85,14 @@ class Compose(Transform):
         """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
         position, generator = self._enter(data, generator)
         steps = list(self.steps)
-        capture = self._capture
-        if capture is not None and position <= capture.start:
-            for step in steps[position : capture.start]:
+        beginning = self._beginning
+        if beginning is not None and position <= beginning.start:
+            for step in steps[position : beginning.start]:
                 data, generator = _step(step, data, generator)
-            cloud = run_capture(steps[capture], data)
-            position = capture.start
+            cloud = run_beginning(steps[beginning], data)
+            position = beginning.start
             if cloud is not None:
-                data, position = cloud, capture.stop
+                data, position = cloud, beginning.stop
         for step in steps[position:]:
             data, generator = _step(step, data, generator)
         return data

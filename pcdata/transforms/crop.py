@@ -11,7 +11,7 @@ from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import Matrix4, Name, Vec3
+from pcdata.transforms.field_types import Matrix4, Name, Vec3
 
 
 class CropWorkspace(SelectTransform):

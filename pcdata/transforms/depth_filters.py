@@ -14,7 +14,7 @@ from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.structures.filled_depth import with_filled_depth
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
+from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
 class SpatialFilterDepth(Transform):

@@ -14,7 +14,7 @@ from pcdata.extras import require
 from pcdata.structures import DepthFrame
 from pcdata.structures.filled_depth import with_filled_depth
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count
+from pcdata.transforms.field_types import Count
 
 _RADIUS = 1  # pixels around a hole's rim that its filling follows
 

@@ -14,7 +14,7 @@ from pcdata.errors import ShapeError
 from pcdata.functional.depth.resampling import MAX_FACTOR, decimate_depth, resize_depth
 from pcdata.structures import DepthFrame
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count, Positive
+from pcdata.transforms.field_types import Count, Positive
 
 
 class CropCenter(Transform):

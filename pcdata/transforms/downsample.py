@@ -16,7 +16,7 @@ from pcdata.sensors import SensorProfile
 from pcdata.structures import METRE, PointCloud
 from pcdata.structures.kinds import fillers
 from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
-from pcdata.transforms.fields import Count, Fraction, FromSensor, IfShort, Metres, Unit
+from pcdata.transforms.field_types import Count, Fraction, FromSensor, IfShort, Metres, Unit
 
 
 class VoxelDownsample(Transform):

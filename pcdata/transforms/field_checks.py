@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.transforms.fields import LengthIn
+from pcdata.transforms.field_types import LengthIn
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -17,7 +17,7 @@ from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
 from pcdata.transforms.base import Params, SpatialTransform, Transform
-from pcdata.transforms.fields import Matrix4, Metres, Name
+from pcdata.transforms.field_types import Matrix4, Metres, Name
 
 
 class ToFrame(SpatialTransform):

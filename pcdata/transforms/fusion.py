@@ -10,7 +10,7 @@ from pcdata.functional.tsdf import Carving, Weighting
 from pcdata.sensors import SensorProfile
 from pcdata.structures import DepthFrame, PointCloud, TSDFVolume
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import ConfidenceName, Count, FromSensor, Metres, Name, NonNegative, confidence_named
+from pcdata.transforms.field_types import ConfidenceName, Count, FromSensor, Metres, Name, NonNegative, confidence_named
 
 
 class FuseTSDF(Transform):

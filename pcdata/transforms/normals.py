@@ -9,7 +9,7 @@ from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Count, Metres
+from pcdata.transforms.field_types import Count, Metres
 
 
 class EstimateNormals(Transform):

@@ -13,7 +13,7 @@ from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import Count, FromSensor, Metres, Positive
+from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
 class RemoveStatisticalOutliers(SelectTransform):

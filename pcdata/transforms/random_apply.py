@@ -8,7 +8,7 @@ from pcdata.errors import ConfigError
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Fraction
+from pcdata.transforms.field_types import Fraction
 
 
 class RandomApply(Transform):

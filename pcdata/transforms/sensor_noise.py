@@ -23,7 +23,7 @@ from pcdata.rng import Streams, child_seed, seeded
 from pcdata.sensors import SensorProfile, StereoNoise, sensor_profile
 from pcdata.structures import DepthFrame
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import Fraction, FromSensor, Name, NonNegative
+from pcdata.transforms.field_types import Fraction, FromSensor, Name, NonNegative
 
 
 def depth_camera(where: str, name: str) -> SensorProfile:

@@ -17,7 +17,7 @@ from pcdata.sensors import sensor_profile
 from pcdata.structures import METRE
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.field_checks import field_types
-from pcdata.transforms.fields import FromSensor
+from pcdata.transforms.field_types import FromSensor
 from pcdata.yaml_nodes import Document, SensorChoice
 
 SENSOR = "sensor"

@@ -13,7 +13,7 @@ from torch import Tensor
 from pcdata.functional.depth.roughness import depth_roughness
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import FromSensor, Name
+from pcdata.transforms.field_types import FromSensor, Name
 from pcdata.transforms.sensor_noise import depth_camera
 
 _SIGMAS = 3.0  # times the expected noise: 99.7 % of a normal error lies within

@@ -11,7 +11,7 @@ from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import Positive, Unit
+from pcdata.transforms.field_types import Positive, Unit
 
 
 def voxel_cells(points: Tensor, voxel_size: float) -> Tensor:

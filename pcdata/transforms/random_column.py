@@ -1,57 +1,18 @@
-"""Where a scene's origin lies, and square columns of it: ShiftToOrigin, RandomColumn."""
+"""RandomColumn: a square column of a scene about a random point."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pcdata.errors import TooFewPointsError
 from pcdata.functional.rows import ptr_after_mask
-from pcdata.geometry import rigid
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SpatialTransform, Transform, sample_name
-from pcdata.transforms.fields import Count, Metres
+from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.field_types import Count, Metres
 
 _TRIALS = 100  # columns drawn before a scene counts as too sparse
-
-
-class ShiftToOrigin(SpatialTransform):
-    """Move the box around every cloud: its lowest corner, or the middle of its floor, becomes the origin.
-
-    The z axis must point up. The box's extents go into meta as ``extent``; the frame becomes ``<frame>/corner`` or
-    ``<frame>/floor``.
-
-    Args:
-        anchor: corner: smallest x, y, z; floor: middle of x and y, smallest z.
-    """
-
-    anchor: Literal["corner", "floor"]
-
-    def frame_after(self, frame: str | None) -> str | None:
-        """Name the shifted frame."""
-        return None if frame is None else f"{frame}/{self.anchor}"
-
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Measure the box of every cloud."""
-        parts = torch.tensor_split(data.points.double(), data.ptr[1:-1].cpu())
-        zero = data.points.new_zeros(3, dtype=torch.float64)
-        lower = torch.stack([part.amin(dim=0) if len(part) else zero for part in parts])
-        upper = torch.stack([part.amax(dim=0) if len(part) else zero for part in parts])
-        origin = lower.clone()
-        if self.anchor == "floor":
-            origin[:, :2] = (lower + upper)[:, :2] / 2
-        return {
-            "matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device=data.device), -origin),
-            "extent": upper - lower,
-        }
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Move the cloud and note its extents."""
-        moved = super().transform(data, params)
-        return moved.with_meta([{"extent": extent} for extent in params["extent"].tolist()])
 
 
 class RandomColumn(Transform):

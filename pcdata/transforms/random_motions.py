@@ -14,7 +14,7 @@ from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SpatialTransform
-from pcdata.transforms.fields import Fraction, NonNegative, Positive, Vec3
+from pcdata.transforms.field_types import Fraction, NonNegative, Positive, Vec3
 
 About = Literal["origin", "centroid"]
 

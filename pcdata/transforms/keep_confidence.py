@@ -10,7 +10,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import SelectTransform
-from pcdata.transforms.fields import ConfidenceName, confidence_named
+from pcdata.transforms.field_types import ConfidenceName, confidence_named
 
 
 class KeepConfidence(SelectTransform):

@@ -13,7 +13,7 @@ from pcdata.functional.depth.deproject import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
-from pcdata.transforms.fields import ConfidenceName, FromSensor, Metres, confidence_named
+from pcdata.transforms.field_types import ConfidenceName, FromSensor, Metres, confidence_named
 
 
 class MaskDepth(Transform):

@@ -17,11 +17,11 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.structure import derived
 from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace
-from pcdata.transforms.depth import Deproject, MaskDepth
+from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.frames import ToFrame
 
 
-def find_capture(steps: Sequence[Transform]) -> slice | None:
+def find_beginning(steps: Sequence[Transform]) -> slice | None:
     """Return where [MaskDepth,] Deproject, [ToFrame,] CropWorkspace stand in a chain; None if they do not."""
     # Exact types: a subclass may do something else.
     kinds = [type(step) for step in steps]
@@ -38,8 +38,8 @@ def find_capture(steps: Sequence[Transform]) -> slice | None:
     return slice(start, stop + 1)
 
 
-def run_capture(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
-    """Run the steps that :func:`find_capture` found; None where they must be run one by one."""
+def run_beginning(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
+    """Run the steps that :func:`find_beginning` found; None where they must be run one by one."""
     if not isinstance(frame, DepthFrame):
         return None
     for step in steps:

@@ -12,7 +12,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, SelectTransform, Transform
-from pcdata.transforms.fields import Fraction, NonNegative, Positive
+from pcdata.transforms.field_types import Fraction, NonNegative, Positive
 
 
 class RandomJitter(Transform):

@@ -13,7 +13,7 @@ from pcdata.contracts.dispatch import why_unavailable
 from pcdata.structures import Camera, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import Compose, CropWorkspace, Deproject, MaskDepth, RandomJitter, ToFrame
-from pcdata.transforms import capture as fused
+from pcdata.transforms import fused_beginning as fused
 from tests.factories import assert_same, frame_with_counts
 
 SCENE = tabletop(2, num_objects=3, num_views=3, size=(60, 80)).frame
@@ -75,10 +75,10 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[PointCloud | None]:
     given: list[PointCloud | None] = []
 
     def noted(*args: Any) -> PointCloud | None:
-        given.append(fused.run_capture(*args))
+        given.append(fused.run_beginning(*args))
         return given[-1]
 
-    monkeypatch.setattr("pcdata.transforms.compose.run_capture", noted)
+    monkeypatch.setattr("pcdata.transforms.compose.run_beginning", noted)
     return given
 
 
