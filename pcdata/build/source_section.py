@@ -73,7 +73,7 @@ class SourceSettings:
             raise ConfigError("source: nothing says where the captures are; give --source PATH, or source: {path: ...}")
         limits = [number for number in (limit, self.limit) if number is not None]
         merged = self._merged({"kind": kind, "only": list(only) or None, **options})
-        is_combined = any(name in COMBINATORS for name in merged)
+        is_combined = any(name in COMBINATORS and value is not False for name, value in merged.items())
         return open_source(
             where,
             limit=min(limits, default=None),

@@ -90,17 +90,7 @@ def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: b
         help=f"capture layout, where it cannot be told from the files: {', '.join(KINDS)}",
     )
     add_layout_options(command, tuple(_FLAGS))
-    command.add_argument(
-        "--option",
-        action="append",
-        default=[],
-        type=name_and_value,
-        metavar="NAME=VALUE",
-        help="any option of the layout by its name in Python, or a field of a combinator, such as "
-        "averaged.max_jump=0.05; repeatable",
-    )
-    for name, told in _COMBINED.items():
-        command.add_argument(f"--{name}", type=positive, metavar="N", help=told)
+    add_combinator_options(command)
     add_skip_options(command, can_skip_refused=can_skip_refused)
     add_import_option(command)
 
@@ -122,6 +112,21 @@ def add_layout_options(command: argparse.ArgumentParser, names: tuple[str, ...])
     for name in names:
         flag, settings = _FLAGS[name]
         command.add_argument(flag, **settings)
+
+
+def add_combinator_options(command: argparse.ArgumentParser) -> None:
+    """Add what says how captures are combined, and any option by its name."""
+    command.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        type=name_and_value,
+        metavar="NAME=VALUE",
+        help="any option of the layout by its name in Python, or a field of a combinator, such as "
+        "averaged.max_jump=0.05; repeatable",
+    )
+    for name, told in _COMBINED.items():
+        command.add_argument(f"--{name}", type=positive, metavar="N", help=told)
 
 
 def add_skip_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from pcdata.cli.known_names import REFINERS
 from pcdata.cli.options import (
     RIG_OPTIONS,
+    add_combinator_options,
     add_layout_options,
     add_skip_options,
     given_options,
@@ -19,7 +20,6 @@ from pcdata.cli.options import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from pcdata.io.sources.rig import RigSource
     from pcdata.structures import Calibration
 
 FAILED = 1  # exit code of a step whose limits do not hold
@@ -54,6 +54,7 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
         "--frame", metavar="NAME", help="frame they meet in (default: base with a calibration, else the captures' own)"
     )
     add_layout_options(command, RIG_OPTIONS)
+    add_combinator_options(command)
     add_skip_options(command)
     command.add_argument("--limit", type=positive, default=5, metavar="N", help="only the first N captures (default 5)")
 
@@ -66,7 +67,7 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
 
     rig = _open(arguments, arguments.calibration)
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
-    result = verify_overlap(*captures, names=rig.names)
+    result = verify_overlap(*captures, names=captures[0].provenance["cameras"])
     print(result.text())
     if arguments.json:
         with replacing("overlap --json", arguments.json) as temporary:
@@ -88,7 +89,7 @@ def _refine(arguments: argparse.Namespace) -> None:
     captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
     refinement = refine_extrinsics(
         captures,
-        names=rig.names,
+        names=captures[0].provenance["cameras"],
         fixed=arguments.fixed,
         method=arguments.method,
         max_shift=arguments.max_shift,
@@ -99,7 +100,7 @@ def _refine(arguments: argparse.Namespace) -> None:
     print(f"\nwritten to {arguments.out}; {arguments.calibration} is unchanged")
 
 
-def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> RigSource:
+def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) -> Any:
     from pcdata.io import open_source
 
     options = given_options(arguments)
@@ -115,4 +116,4 @@ def _open(arguments: argparse.Namespace, calibration: Calibration | str | None) 
         **options,
     )
     tell_skipped(source.skipped)
-    return cast("RigSource", source)
+    return source

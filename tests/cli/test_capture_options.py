@@ -14,11 +14,11 @@ from PIL import Image
 
 from pcdata import open_source
 from pcdata.cli.main import main
-from pcdata.cli.options import _COMBINED, _FLAGS, KINDS, add_capture_options, attribute_of, given_options
+from pcdata.cli.options import _COMBINED, _FLAGS, _NO_OPTIONS, KINDS, add_capture_options, attribute_of, given_options
 from pcdata.errors import CaptureError, ConfigError, PcdataError, UnitError
 from pcdata.io import COMBINATORS, LAYOUTS, CaptureCamera, read_capture_camera, write_capture_camera
 from pcdata.io.calibration.capture_camera import _STATED
-from pcdata.io.sources.registry import fields_of, options_of
+from pcdata.io.sources.registry import OPENING, fields_of, options_of
 
 SIZE = (6, 8)
 
@@ -49,6 +49,7 @@ def test_flags_and_kinds_are_those_of_the_layouts() -> None:
     options = {name for layout in LAYOUTS.values() for name in inspect.signature(layout).parameters} - {"path"}
     assert set(_FLAGS) <= options
     assert options - set(_FLAGS) == set(), "give the new option a flag, so that --help tells of it"
+    assert {*_NO_OPTIONS, "skip_file"} == {*OPENING}
     assert tuple(LAYOUTS) == KINDS
     assert tuple(_COMBINED) == tuple(COMBINATORS), "give the new combinator a flag, so that --help tells of it"
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError, PoseError
-from pcdata.geometry import rigid
+from pcdata.errors import CalibrationError, CaptureError, ConfigError, FrameError
 from pcdata.io import open_source, read_calibration, write_calibration, write_depth
-from pcdata.structures import Calibration, Camera, Evidence
+from pcdata.structures import Calibration, Evidence
+from tests.calibrations import camera, cell
 
 GOOD = """\
 format: pcdata-calibration
@@ -26,29 +25,6 @@ transforms:
     quaternion_xyzw: [0, 0, 0, 1]
     evidence: {method: by hand, num_observations: 12, residuals: {translation_rms_m: 1e-3}, date: 2026-01-31}
 """
-
-
-def pose(seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    quaternion = torch.randn(4, dtype=torch.float64, generator=generator)
-    translation = torch.randn(3, dtype=torch.float64, generator=generator)
-    return rigid.from_rotation_translation(rigid.rotation_from_quaternion(quaternion), translation)
-
-
-def camera(**changes: object) -> Camera:
-    values = {"fx": 1000 / 3, "fy": 601.1, "cx": 3.1, "cy": 2.2, "size": (6, 8), "distortion": [0.1, 1 / 3, 1e-17, 0.0]}
-    return Camera.pinhole(**(values | changes))  # type: ignore[arg-type]
-
-
-def cell() -> Calibration:
-    return Calibration(
-        cameras={"left": camera(), "right": camera(distortion=None)},
-        transforms={"base_from_left": pose(1), "right_from_left": pose(2), "base_from_table": pose(3)},
-        evidence={
-            "left": Evidence(method="chessboard 9x6: squares of 0.025 m", num_observations=20, date="2026-01-31"),
-            "base_from_left": Evidence(method="hand-eye", residuals={"translation_rms_m": 1 / 3000}, notes="cold"),
-        },
-    )
 
 
 # -- file ----------------------------------------------------------------------------------------------------------
@@ -165,64 +141,11 @@ def test_a_file_that_is_not_there_is_a_capture_error(tmp_path: Path) -> None:
         read_calibration(tmp_path / "none.yaml")
 
 
-# -- frames --------------------------------------------------------------------------------------------------------
-
-
-def test_transforms_chain_and_invert_through_the_frames_between() -> None:
-    found = cell().transform("table", "right")
-    expected = torch.linalg.inv(pose(3)) @ pose(1) @ torch.linalg.inv(pose(2))
-    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
-    torch.testing.assert_close(
-        cell().transform("right", "table") @ found, torch.eye(4, dtype=torch.float64), atol=1e-12, rtol=0
-    )
-
-
-def test_a_frame_seen_from_itself_is_the_identity() -> None:
-    assert torch.equal(cell().transform("left", "left"), torch.eye(4, dtype=torch.float64))
-
-
-def test_unknown_and_unconnected_frames_are_refused() -> None:
-    with pytest.raises(FrameError, match="no frame 'bas'; did you mean 'base'"):
-        cell().transform("bas", "left")
-    apart = Calibration(cameras={"left": camera()}, transforms={"base_from_table": pose(1)})
-    with pytest.raises(FrameError, match=r"nothing joins 'base' and 'left'; .* no other frame"):
-        apart.transform("base", "left")
-
-
-@pytest.mark.parametrize("name", ["base_from_right", "left_from_base", "right_from_table"])
-def test_a_second_way_between_frames_is_refused(name: str) -> None:
-    with pytest.raises(CalibrationError, match=f"{name}: .* two ways would give two answers"):
-        Calibration(transforms={**cell().transforms, name: pose(9)})
-
-
 def test_a_loop_in_a_file_is_named_with_its_place(tmp_path: Path) -> None:
     again = "  wrist_from_gripper: {translation: [0, 0, 0], rotation_vector: [0, 0, 0]}\n"
     (tmp_path / "c.yaml").write_text(GOOD + again)
     with pytest.raises(CalibrationError, match=r"c\.yaml:11:3: wrist_from_gripper: .* two ways"):
         read_calibration(tmp_path / "c.yaml")
-
-
-def test_replacing_a_transform_drops_the_evidence_of_the_old_one() -> None:
-    changed = cell().with_transform("left_from_base", pose(7), Evidence(method="tape"))
-    assert torch.equal(changed.transforms["left_from_base"], pose(7))
-    assert "base_from_left" not in changed.transforms
-    assert set(changed.evidence) == {"left", "left_from_base"}
-    assert set(cell().with_camera("left", camera()).evidence) == {"base_from_left"}
-
-
-def test_what_is_no_calibration_is_refused() -> None:
-    with pytest.raises(PoseError, match="not rigid"):
-        Calibration(transforms={"a_from_b": 2 * torch.eye(4, dtype=torch.float64)})
-    far = torch.eye(4, dtype=torch.float64)
-    far[0, 3] = 500
-    with pytest.raises(PoseError, match="in millimetres"):
-        Calibration(transforms={"a_from_b": far})
-    with pytest.raises(CalibrationError, match="evidence for 'x'"):
-        Calibration(evidence={"x": Evidence(method="none")})
-    with pytest.raises(CalibrationError, match="no camera 'lef'; did you mean 'left'"):
-        cell().camera("lef")
-    with pytest.raises(CalibrationError, match="say which camera; it has left, right"):
-        cell().camera()
 
 
 # -- captures ------------------------------------------------------------------------------------------------------
