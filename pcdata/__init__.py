@@ -99,6 +99,8 @@ _HOMES = {
         "collate_fixed",
         "collate_packed",
         "collate_padded",
+        "register_collate",
+        "COLLATES",
     ],
     "pcdata.models": ["ModelBatch", "ModelContract", "check", "preset", "to_frame", "to_source"],
     "pcdata.build": ["build_dataset", "load_config"],

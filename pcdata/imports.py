@@ -39,6 +39,11 @@ class ImportedFile:
         # The content, not the path alone: a worker must run what its parent ran.
         return _imported, (self.path, self.content)
 
+    @property
+    def module(self) -> str:
+        """The name of the private module that it was run as."""
+        return _module_name(self.sha256)
+
     def to_json(self) -> dict[str, Any]:
         """Return what a dataset remembers: no folder, no content."""
         named = {name: list(getattr(self, name)) for name in ("transforms", "layouts", "combinators")}
@@ -80,7 +85,7 @@ def _imported(path: str, content: bytes) -> ImportedFile:
     digest = hashlib.sha256(content).hexdigest()
     if digest in _FILES:
         return _FILES[digest]
-    module = ModuleType(f"_pcdata_import_{digest[:16]}")
+    module = ModuleType(_module_name(digest))
     module.__file__ = path
     sys.modules[module.__name__] = module  # pickles and type hints look it up there
     try:
@@ -98,6 +103,10 @@ def _imported(path: str, content: bytes) -> ImportedFile:
     )
     _FILES[digest] = ImportedFile(os.path.basename(path), digest, transforms, layouts, combinators, path, content)
     return _FILES[digest]
+
+
+def _module_name(digest: str) -> str:
+    return f"_pcdata_import_{digest[:16]}"
 
 
 def _forget(module: str) -> None:

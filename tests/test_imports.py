@@ -284,6 +284,55 @@ def test_a_layout_of_ones_own_serves_every_command(capsys, tmp_path):
     assert "--import" not in (tmp_path / "d" / "load.py").read_text()
 
 
+OTHERS = """
+from dataclasses import dataclass
+from pcdata.datasets import register_collate
+from pcdata.exports import Target, register_target
+from pcdata.exports.target import Item
+from pcdata.io import register_store
+from pcdata.io.store.stores import NpzStore
+
+@register_store
+class OwnStore(NpzStore):
+    format, suffix = "own", ".own"
+
+@register_collate
+def collate_counts(clouds):
+    return [cloud.num_points for cloud in clouds]
+
+@register_target
+@dataclass(frozen=True, kw_only=True)
+class OwnTarget(Target):
+    name, takes, layout, model = "own_target", "clouds", "one count a file", "pointnet_cls"
+    def items(self, ids):
+        return [Item((one,), (f"{one}.txt",)) for one in ids]
+    def write(self, item, samples, folder, note):
+        for _, cloud in samples:
+            (folder / item.paths[0]).write_text(str(cloud.num_points))
+"""
+
+
+def test_stores_collates_and_targets_of_ones_own_are_used_by_their_names(tmp_path):
+    own = written(tmp_path / "others.py", OTHERS)
+    text = "depth: [Deproject]\noutput: {format: own}\nloader: {collate: counts}\n"
+    with pytest.raises(ConfigError, match=r"(?s)output.format: .*hdf5, npz, pt.*--import.*loader.collate: .*packed"):
+        config_from_yaml(text)
+    pcdata.import_file(own)
+    source = SyntheticSource(num_scenes=1, num_objects=1, size=(24, 32))
+    out = build_dataset(config_from_yaml(text), source, tmp_path / "d").folder
+    assert [one["file"] for one in Manifest.read(out).imports] == ["others.py"]
+    assert list((out / "clouds").glob("*.own"))
+    count = pcdata.CachedCloudDataset(out)[0].num_points
+    assert pcdata.export_dataset(out, "own_target", tmp_path / "e").written == 1
+    assert (tmp_path / "e" / "tabletop-0000.txt").read_text() == str(count)
+    script = (out / "load.py").read_text()
+    assert 'collate_fn=COLLATES["counts"]' in script.replace("'", '"')
+    assert "--import FILE.py, for others.py" in script
+    forget()
+    with pytest.raises(CacheError, match=r"format must be one of hdf5, npz, pt, got 'own'.*--import"):
+        Manifest.read(out)
+
+
 @pytest.mark.slow
 def test_the_script_of_a_dataset_asks_for_the_file(tmp_path, step):
     script = built(tmp_path, step, RANDOM) / "load.py"

@@ -17,7 +17,7 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"rng", "threads", "extras", "files", "registry"},
+    {"rng", "threads", "extras", "files", "registry", "progress"},
     {"contracts"},
     {"geometry"},
     {"functional"},
@@ -50,6 +50,7 @@ OUTSIDE = {
     "functional": {"torch", "numpy"},
     "kernels": {"torch", "numpy"},
     "registry": set(),
+    "progress": set(),
     "verdicts": set(),
     "structures": {"torch", "numpy"},
     "alignment": {"torch", "numpy"},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import pcdata
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
+from pcdata.datasets.collate import COLLATES
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, WriteError, add_note, write_fault
 from pcdata.files.inputs import recording
 from pcdata.files.whole_folders import complete_or_nothing
@@ -34,9 +34,8 @@ from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.manifest import Manifest, Sample, key_of
 from pcdata.io.store.stores import STORES
 from pcdata.io.writers.capture_folder import write_capture
+from pcdata.progress import Progress
 from pcdata.structures import DepthFrame, PointCloud
-
-Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
 
 
 @dataclass(frozen=True)
@@ -100,11 +99,10 @@ def build_dataset(
         sections = config.pipeline.sections()
         steps = {name for file in imported_files() for name in file.transforms} & step_names(sections)
         kinds = {*kinds_of(source)}
-        imports = [
-            file
-            for file in imported_files()
-            if steps & {*file.transforms} or kinds & {*file.layouts, *file.combinators}
-        ]
+        # What loads the dataset must know where its steps, its store and its batches are at home.
+        modules = {STORES[config.output.format].__module__, COLLATES[config.loader.collate].__module__}
+        loading = [file for file in imported_files() if steps & {*file.transforms} or file.module in modules]
+        imports = [file for file in imported_files() if file in loading or kinds & {*file.layouts, *file.combinators}]
         samples = _write_samples(config, source, partial, report, skip_refused, progress)
         manifest = Manifest(
             format=config.output.format,
@@ -126,9 +124,7 @@ def build_dataset(
         try:
             (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
             (partial / "load.py").write_text(
-                loading_script(
-                    config.loader, config.model, [file.name for file in imports if steps & {*file.transforms}]
-                ),
+                loading_script(config.loader, config.model, [file.name for file in loading]),
                 encoding="utf-8",
             )
             manifest.write(partial)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from annotated_types import Ge
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from pcdata.build.model_section import preset_of_section, stored_preset
 from pcdata.build.source_section import SourceSettings, source_settings
+from pcdata.datasets.collate import COLLATES
 from pcdata.errors import ConfigError, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.io.store.manifest import FILE_NAME, Manifest
-from pcdata.io.store.stores import COMPRESSIONS, Compression, Format
+from pcdata.io.store.stores import STORES, Compression
 from pcdata.models import Preset
+from pcdata.registry import Registry
 from pcdata.structures import PointCloud
 from pcdata.transforms import Compose
 from pcdata.transforms.chain_reading import SECTIONS
@@ -23,7 +25,21 @@ from pcdata.transforms.plain_document import PlainDocument
 from pcdata.transforms.sensor_words import SENSOR
 from pcdata.yaml_nodes import Document, YamlDocument
 
-Collate = Literal["packed", "padded", "fixed"]
+
+def _registered(registry: Registry[Any]) -> AfterValidator:
+    """Accept the names of a registry, of one's own too."""
+
+    def check(name: str) -> str:
+        if name not in registry:
+            hint = near_matches(name, registry)
+            raise ValueError(f"must be one of {', '.join(registry)}{hint}; one of your own needs --import FILE.py")
+        return name
+
+    return AfterValidator(check)
+
+
+Format = Annotated[str, _registered(STORES)]
+Collate = Annotated[str, _registered(COLLATES)]
 
 
 class Output(BaseModel):
@@ -73,17 +89,16 @@ class BuildConfig:
             raise ConfigError("loader.collate: the model's preset makes its own batches; leave it out")
         return replace(self, pipeline=stored_preset(made).pipeline, model=made)
 
-    def stored_as(self, format: Format) -> BuildConfig:
+    def stored_as(self, format: str) -> BuildConfig:
         """Return this configuration with another format of storage.
 
         Raises:
-            ConfigError: the format does not know the compression.
+            ConfigError: there is no such format, or it does not know the compression.
         """
+        known = STORES.named("output.format", format).compressions
         output = self.output.model_copy(update={"format": format})
-        if output.compression not in COMPRESSIONS[format]:
-            raise ConfigError(
-                f"format {format} knows the compression {', '.join(COMPRESSIONS[format])}, not {output.compression}"
-            )
+        if output.compression not in known:
+            raise ConfigError(f"format {format} knows the compression {', '.join(known)}, not {output.compression}")
         return replace(self, output=output)
 
 
@@ -131,8 +146,8 @@ def _config_of(document: Document, folder: Path | None = None) -> BuildConfig:
         for section, model in _SETTINGS.items()
     }
     output = settings["output"]
-    if output is not None and output.compression not in COMPRESSIONS[output.format]:
-        known_here = ", ".join(COMPRESSIONS[output.format])
+    if output is not None and output.compression not in STORES[output.format].compressions:
+        known_here = ", ".join(STORES[output.format].compressions)
         document.fault(
             document.at(entries["output"][1], ["compression"]),
             f"output.compression: format {output.format} knows {known_here}, not {output.compression}",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pcdata.datasets
 from pcdata.build.config import Loader
+from pcdata.datasets.collate import COLLATES
 from pcdata.models import Preset
 
 _TEMPLATE = '''"""Load this dataset, batch by batch: python load.py{usage}"""
@@ -60,7 +62,9 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         code = _IMPORTS.format(files=files.replace("%", "%%"), missing=missing)
         settings |= {"usage": " --import FILE.py", "argparse": "import argparse\n", "imports": code}
     if made is None:
-        name = collate = f"collate_{loader.collate}"
+        name = collate = COLLATES[loader.collate].__name__
+        if not hasattr(pcdata.datasets, name):  # one of the user's own
+            name, collate = "COLLATES", f"COLLATES[{loader.collate!r}]"
         shapes = ", points {tuple(batch.points.shape)}"
         return _TEMPLATE.format(**settings, names=_names(name, imports), collate=collate, preset="", shapes=shapes)
     line = f"    model = {made!r}  # what the dataset was built for\n"

@@ -8,7 +8,7 @@ from typing import Any
 from pcdata.cli.choices import add_model_options, given_preset
 from pcdata.cli.known_names import FORMATS
 from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, skip_list
-from pcdata.cli.progress import Progress
+from pcdata.cli.progress import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -32,7 +32,11 @@ def add_to(commands: Any) -> None:
         help="folder of captures, or of several cameras' folders, or one cloud file (default: that of CONFIG)",
     )
     build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
-    build.add_argument("--format", choices=FORMATS, help="of the stored clouds (default: that of CONFIG, or hdf5)")
+    build.add_argument(
+        "--format",
+        metavar="FORMAT",
+        help=f"of the stored clouds: {', '.join(FORMATS)} (default: that of CONFIG, or hdf5)",
+    )
     add_capture_options(build)
     build.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     build.add_argument("--overwrite", action="store_true", help="replace the dataset that is in DIR")
@@ -50,7 +54,7 @@ def add_to(commands: Any) -> None:
 def _demo(arguments: argparse.Namespace) -> None:
     from pcdata.cli.demo import run_demo
 
-    with Progress("demo") as progress:
+    with ProgressBar("demo") as progress:
         result = run_demo(arguments.out, num_scenes=arguments.scenes, progress=progress)
     print(_build_table(result.report))
     points = sum(int(batch.mask.sum()) for batch in result.batches)
@@ -81,7 +85,7 @@ def _build(arguments: argparse.Namespace) -> None:
         skip_refused=arguments.skip_refused,
         **given_options(arguments),
     )
-    with Progress("build") as progress:
+    with ProgressBar("build") as progress:
         report = build_dataset(
             config,
             source,

@@ -10,10 +10,10 @@ from torch.utils.data import DataLoader
 
 from pcdata import extras
 from pcdata.build import BuildReport, build_dataset, config_from_yaml
-from pcdata.build.builder import Progress
 from pcdata.datasets import CachedCloudDataset, collate_padded
 from pcdata.errors import CacheError
 from pcdata.files.interrupts import deaf_children
+from pcdata.progress import Progress
 from pcdata.report import save_pipeline_figure
 from pcdata.structures import PaddedClouds
 from pcdata.synthetic import SensorNoise, SyntheticSource

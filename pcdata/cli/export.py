@@ -7,7 +7,7 @@ from typing import Any
 
 from pcdata.cli.known_names import TARGETS
 from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
-from pcdata.cli.progress import Progress
+from pcdata.cli.progress import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -57,7 +57,7 @@ def _export(arguments: argparse.Namespace) -> None:
     elif given := given_flags(arguments, "--limit"):
         flags = ", ".join(given)
         raise ConfigError(f"export: {source} is a built dataset, which {flags} cannot change; leave that out")
-    with Progress("export") as progress:
+    with ProgressBar("export") as progress:
         report = export_dataset(
             source,
             arguments.to,

@@ -8,7 +8,7 @@ from typing import Any
 
 from pcdata.cli.known_names import CARVINGS, WEIGHTINGS
 from pcdata.cli.options import add_capture_options, open_captures, positive
-from pcdata.cli.progress import Progress
+from pcdata.cli.progress import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -54,7 +54,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
         max_bytes=arguments.max_megabytes << 20,
     )
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
-    with Progress("fuse") as progress:
+    with ProgressBar("fuse") as progress:
         for done, sample_id in enumerate(source.ids, 1):
             volume.integrate(source.load(sample_id))
             progress(done, len(source), sample_id)

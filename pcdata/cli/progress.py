@@ -10,7 +10,7 @@ from pcdata.cli import signals
 from pcdata.cli.printable import printable, terminal
 
 
-class Progress:
+class ProgressBar:
     """A bar on a terminal, plain lines elsewhere; also the place where a lost Ctrl-C is heard."""
 
     def __init__(self, what: str) -> None:
@@ -18,7 +18,7 @@ class Progress:
         self.bar: Any = None
         self.started = time.perf_counter()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressBar:
         return self
 
     def __exit__(self, *_: object) -> None:

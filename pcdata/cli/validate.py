@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from pcdata.cli.known_names import CHECKS, SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
-from pcdata.cli.progress import Progress
+from pcdata.cli.progress import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -58,7 +58,7 @@ def _validate(arguments: argparse.Namespace) -> int:
             raise
         reports = iter([SampleReport(WHOLE, (check_of_error(error),))])
     target = replacing("validate --json", arguments.json) if arguments.json else nullcontext()
-    with target as temporary, Progress("validate") as progress:
+    with target as temporary, ProgressBar("validate") as progress:
         writer = None if temporary is None else _Writer(temporary, arguments.path, asdict(limits))
         for done, report in enumerate(reports, 1):
             summary.add(report)

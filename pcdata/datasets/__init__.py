@@ -2,12 +2,13 @@
 
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.datasets.clouds import CloudDataset
-from pcdata.datasets.collate import collate_fixed, collate_packed, collate_padded
+from pcdata.datasets.collate import COLLATES, collate_fixed, collate_packed, collate_padded, register_collate
 from pcdata.datasets.copies import CountedSampler
 from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.datasets.samples import SampleDataset
 
 __all__ = [
+    "COLLATES",
     "CachedCloudDataset",
     "CloudDataset",
     "CountedSampler",
@@ -16,4 +17,5 @@ __all__ = [
     "collate_fixed",
     "collate_packed",
     "collate_padded",
+    "register_collate",
 ]

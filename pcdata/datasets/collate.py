@@ -2,24 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from pcdata.errors import DTypeError, ShapeError
+from pcdata.errors import ConfigError, DTypeError, ShapeError
+from pcdata.registry import Registry
 from pcdata.structures import PaddedClouds, PointCloud
 
+Collate = Callable[[Sequence[PointCloud]], Any]
 
+COLLATES: Registry[Collate] = Registry("collate function")
+
+_PREFIX = "collate_"
+
+
+def register_collate(collate: Collate) -> Collate:
+    """Make a function ``collate_NAME`` known to ``loader: {collate: NAME}``; a decorator.
+
+    Raises:
+        ConfigError: it is no function of that name, or the name exists.
+    """
+    name = getattr(collate, "__name__", "")
+    if not (callable(collate) and name.startswith(_PREFIX) and name != _PREFIX):
+        raise ConfigError(f"register_collate: must be a function called {_PREFIX}NAME, got {collate!r:.100}")
+    COLLATES.add(name.removeprefix(_PREFIX), collate)
+    return collate
+
+
+@register_collate
 def collate_packed(clouds: Sequence[PointCloud]) -> PointCloud:
     """Pack clouds of any lengths into one batch, cut by ``ptr``; nothing is padded or lost."""
     _check("collate_packed", clouds)
     return PointCloud.cat(clouds)
 
 
+@register_collate
 def collate_padded(clouds: Sequence[PointCloud]) -> PaddedClouds:
     """Pad clouds to the longest of the batch; ``mask`` says which rows are real."""
     _check("collate_padded", clouds)
     return PointCloud.cat_padded(clouds)
 
 
+@register_collate
 def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
     """Stack clouds that all have the same number of points.
 

@@ -2,7 +2,16 @@
 
 from pcdata.exports.check import check_export, is_export
 from pcdata.exports.export import ExportReport, export_dataset
-from pcdata.exports.registry import TARGETS
-from pcdata.exports.target import Target
+from pcdata.exports.registry import TARGETS, register_target
+from pcdata.exports.target import Item, Target
 
-__all__ = ["TARGETS", "ExportReport", "Target", "check_export", "export_dataset", "is_export"]
+__all__ = [
+    "TARGETS",
+    "ExportReport",
+    "Item",
+    "Target",
+    "check_export",
+    "export_dataset",
+    "is_export",
+    "register_target",
+]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,8 +20,7 @@ from pcdata.files.interrupts import shielded
 from pcdata.files.scratch import scratch_beside
 from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
 from pcdata.io.sources.capture_source import CaptureSource, inputs_of
-
-Progress = Callable[[int, int, str], None]  # samples done, samples in all, id of the last one
+from pcdata.progress import Progress
 
 
 @dataclass

@@ -17,21 +17,45 @@ from pcdata.exports.pointcept import Pointcept
 from pcdata.exports.pointnet import PointNet
 from pcdata.exports.pointnet_part import PointNetPart
 from pcdata.exports.target import Target
+from pcdata.models import contract as contract_named
+from pcdata.registry import Registry
 
-TARGETS: dict[str, type[Target]] = {
-    target.name: target
-    for target in (
-        DP3,
-        ContactGraspNet,
-        GraspNetFrames,
-        GraspNetScenes,
-        PointNet,
-        PointNetPart,
-        ModelNet,
-        Pointcept,
-        GGCNN,
-    )
-}
+TARGETS: Registry[type[Target]] = Registry("target")
+
+
+def register_target(target: type[Target]) -> type[Target]:
+    """Make an export known by its ``name``, to :func:`export_dataset` and ``pcdata export``; a decorator.
+
+    Raises:
+        ConfigError: it is no complete dataclass of :class:`Target`, or the name exists.
+    """
+    where = "register_target"
+    if not (isinstance(target, type) and issubclass(target, Target)):
+        raise ConfigError(f"{where}: must be a subclass of pcdata.exports.Target, got {target!r:.100}")
+    if missing := ", ".join(sorted(target.__abstractmethods__)):
+        raise ConfigError(f"{where}: {target.__name__} does not say {missing}; define that")
+    for name in ("name", "takes", "layout", "model"):
+        if not isinstance(getattr(target, name, None), str):
+            raise ConfigError(f"{where}: {target.__name__}.{name} must be a text; see pcdata.exports.Target")
+    if target.takes not in ("clouds", "captures"):
+        raise ConfigError(f"{where}: {target.__name__}.takes must be 'clouds' or 'captures', got {target.takes!r}")
+    contract_named(target.model)
+    TARGETS.add(target.name, target)
+    return target
+
+
+for _target in (
+    DP3,
+    ContactGraspNet,
+    GraspNetFrames,
+    GraspNetScenes,
+    PointNet,
+    PointNetPart,
+    ModelNet,
+    Pointcept,
+    GGCNN,
+):
+    register_target(_target)
 
 
 def target_named(name: str, options: Mapping[str, Any]) -> Target:

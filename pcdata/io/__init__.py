@@ -21,18 +21,21 @@ from pcdata.io.sources.open_source import open_source
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, register_combinator, register_layout
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSource
+from pcdata.io.store.stores import STORES, Store, register_store
 from pcdata.io.store.volumes import read_volume, write_volume
 from pcdata.io.writers.capture_folder import write_capture
 
 __all__ = [
     "COMBINATORS",
     "LAYOUTS",
+    "STORES",
     "AveragedSource",
     "CaptureCamera",
     "CaptureSource",
     "CombinedSource",
     "JoinedSource",
     "Source",
+    "Store",
     "SubsetSource",
     "TemporalFilterDepth",
     "TemporallyFilteredSource",
@@ -52,6 +55,7 @@ __all__ = [
     "refused_captures",
     "register_combinator",
     "register_layout",
+    "register_store",
     "write_calibration",
     "write_capture",
     "write_capture_camera",

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from pcdata import PointCloud, collate_fixed, collate_packed, collate_padded
-from pcdata.errors import DTypeError, FrameError, ShapeError
+from pcdata.datasets import COLLATES, register_collate
+from pcdata.errors import ConfigError, DTypeError, FrameError, ShapeError
 from tests.factories import assert_same
 
-ALL = [collate_packed, collate_padded, collate_fixed]
+ALL = list(COLLATES.values())
 
 
 def cloud(count: int, start: float = 0.0, **changes: object) -> PointCloud:
@@ -92,3 +93,15 @@ def test_clouds_with_different_fields_are_named(collate):
 def test_anything_but_clouds_is_refused_by_the_name_of_its_type(collate, wrong):
     with pytest.raises(DTypeError, match=f"{collate.__name__}.*{type(wrong).__name__}"):
         collate([cloud(3), wrong])
+
+
+def test_a_collate_function_is_known_by_its_name_and_none_takes_that_of_another():
+    assert {name: one.__name__ for name, one in COLLATES.items()} == {name: f"collate_{name}" for name in COLLATES}
+    with pytest.raises(ConfigError, match="must be a function called collate_NAME"):
+        register_collate(lambda clouds: clouds)
+
+    def collate_packed(clouds):
+        return clouds
+
+    with pytest.raises(ConfigError, match="a collate function called packed is registered already"):
+        register_collate(collate_packed)

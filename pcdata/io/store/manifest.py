@@ -17,7 +17,7 @@ from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import retired_of
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
-from pcdata.io.store.stores import COMPRESSIONS, STORES, Compression, Format
+from pcdata.io.store.stores import STORES, Compression
 
 SCHEMA = "pcdata.dataset/1"
 FILE_NAME = DATASET
@@ -42,7 +42,7 @@ class Sample:
 class Manifest:
     """The contents of ``dataset.json``."""
 
-    format: Format
+    format: str
     compression: Compression
     fingerprint: str  # of the deterministic steps that made the stored clouds
     pipeline: Mapping[str, Any]  # section -> list of {transform: fields}
@@ -127,8 +127,11 @@ def checksum_of(content: Mapping[str, Any]) -> str:
 
 def _check(manifest: Manifest) -> None:
     if manifest.format not in STORES:
-        raise CacheError(f"format must be one of {', '.join(STORES)}, got {manifest.format!r:.100}")
-    if manifest.compression not in COMPRESSIONS[manifest.format]:
+        raise CacheError(
+            f"format must be one of {', '.join(STORES)}, got {manifest.format!r:.100}; one of your own needs "
+            "--import FILE.py"
+        )
+    if manifest.compression not in STORES[manifest.format].compressions:
         raise CacheError(f"compression {manifest.compression!r:.100} does not exist for format {manifest.format}")
     for name, kind in (
         ("fingerprint", str),

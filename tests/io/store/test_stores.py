@@ -23,12 +23,12 @@ import torch
 from pcdata import PointCloud
 from pcdata.errors import CacheError
 from pcdata.io.store.cloud_record import Record, cloud_from_record, record_from_cloud
-from pcdata.io.store.stores import COMPRESSIONS, INFO, STORES
+from pcdata.io.store.stores import INFO, STORES
 from tests.disk_limits import largest_file
 from tests.io.memory import memory_limit
 from tests.warm import run_python
 
-KINDS = [(form, compression) for form, known in COMPRESSIONS.items() for compression in known]
+KINDS = [(form, compression) for form, store in STORES.items() for compression in store.compressions]
 FORMATS = list(STORES)
 
 
@@ -172,7 +172,7 @@ def test_two_writes_at_different_times_are_byte_identical(tmp_path):
 # -- what plain users see ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compression", COMPRESSIONS["npz"])
+@pytest.mark.parametrize("compression", STORES["npz"].compressions)
 def test_numpy_alone_reads_an_npz(tmp_path, compression):
     cloud = full_cloud()
     with np.load(write(tmp_path, cloud, "npz", compression)) as stored:  # allow_pickle is off by default

@@ -1,0 +1,156 @@
+"""Where the records of a dataset live: what every store does, and the registry of them.
+
+Readers hold a path, not a handle: files are opened on first use in each process, so a dataset may be pickled, forked or
+spawned at any time. Nothing is ever unpickled, and sizes that a file claims are checked against what it holds.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar, Literal
+
+from pcdata.errors import CacheError, ConfigError, locate, write_fault
+from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
+from pcdata.files.zip_archive import ZipArchive
+from pcdata.io.store.cloud_record import Record
+from pcdata.registry import Registry
+
+Compression = Literal["none", "lzf", "gzip"]
+
+INFO = "pcdata"  # the name that the JSON text is stored under
+
+
+class Store:
+    """Records by key inside one dataset folder; subclass it and :func:`register_store` for a format of your own."""
+
+    format: ClassVar[str]  # its name in ``output: {format: ...}``
+    compressions: ClassVar[tuple[Compression, ...]]  # that it knows, "none" among them
+    suffix: ClassVar[str]  # of its files
+
+    def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
+        self.folder = Path(folder)
+        self.compression = compression
+
+    def path_of(self, key: str) -> Path:
+        """Return the file that holds a record."""
+        return self.folder / "clouds" / f"{key}{self.suffix}"
+
+    def write(self, key: str, record: Record) -> None:
+        """Add one record; keys are file-name safe and unique.
+
+        Raises:
+            CacheError: the file cannot be written.
+        """
+        raise NotImplementedError
+
+    def read(self, key: str) -> Record:
+        """Read one record.
+
+        Raises:
+            CacheError: missing, damaged or hostile; says which file.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Flush to disk and close any handle of this process."""
+
+    @contextmanager
+    def _archive(self, path: Path) -> Iterator[ZipArchive]:
+        with self._opened(path) as file:
+            yield ZipArchive(file, os.fstat(file.fileno()).st_size)
+
+    def _opened(self, path: Path) -> BinaryIO:
+        """Open a file of the dataset; links may lead to other files of it."""
+        if not os.path.lexists(path):
+            raise CacheError(f"{path}: the file is missing; rebuild the dataset, or copy it again")
+        # Links are followed only where there is one: that takes longer than opening does.
+        if path.is_symlink() or path.parent.is_symlink():
+            try:
+                check_inside("dataset", path, [self.folder], CacheError)
+            except CacheError as error:
+                raise CacheError(f"{path}: is a link out of the dataset's folder; put the file itself there") from error
+        try:
+            return open_input("dataset", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)
+        except CacheError as error:
+            if isinstance(error.__cause__, PermissionError):
+                raise CacheError(f"{error}; the file itself may be fine") from error
+            raise CacheError(f"{error}; rebuild the dataset, or copy it again") from error
+
+
+STORES: Registry[type[Store]] = Registry("store")
+
+
+def register_store(store: type[Store]) -> type[Store]:
+    """Make a store known by its ``format``, to builds, to datasets and to ``--format``; a decorator.
+
+    Raises:
+        ConfigError: it is no :class:`Store`, does not say its format and compressions, cannot read or write, or its
+            name is taken.
+    """
+    where = "register_store"
+    if not (isinstance(store, type) and issubclass(store, Store)):
+        raise ConfigError(f"{where}: must be a subclass of pcdata.io.Store, got {store!r:.100}")
+    for name in ("format", "suffix"):
+        if not isinstance(getattr(store, name, None), str):
+            raise ConfigError(f"{where}: {store.__name__}.{name} must be a text; see pcdata.io.Store")
+    if "none" not in getattr(store, "compressions", ()):
+        raise ConfigError(f'{where}: {store.__name__}.compressions must be a tuple with "none" in it')
+    for method in ("read", "write"):
+        if getattr(store, method) is getattr(Store, method):
+            raise ConfigError(f"{where}: {store.__name__} has no method {method}; write it")
+    STORES.add(store.format, store)
+    return store
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Name the file in what a full disk or a missing permission makes a library raise."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:  # h5py raises both
+        failed = CacheError(f"{path}: cannot be written: {write_fault(error)}")
+        locate(failed, path=path)
+        raise failed from error
+
+
+@contextmanager
+def synced(path: Path) -> Iterator[Any]:
+    """Open a new file for writing and force it to disk."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes a library raise into one error that names the file."""
+    try:
+        yield
+    except Exception as error:  # numpy and h5py raise many types on damaged bytes
+        told = _damage(path, error)
+        locate(told, path=path)
+        if told is error:
+            raise
+        raise told from error
+
+
+def _damage(path: Path, error: Exception) -> CacheError:
+    if isinstance(error, CacheError):
+        if str(path) in str(error):  # complete in itself: the file may be fine
+            return error
+        return CacheError(f"{path}: {error}; the file is damaged or not pcdata's: rebuild the dataset")
+    if isinstance(error, MemoryError):
+        return CacheError(f"{path}: there is not enough memory to read it ({error}); the file may be fine")
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
+        return CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine")
+    kind = type(error).__name__
+    return CacheError(
+        f"{path}: cannot be read ({kind}: {error}); the file is damaged or truncated: rebuild the dataset"
+    )
