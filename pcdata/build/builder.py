@@ -97,7 +97,8 @@ def build_dataset(
         folder, overwrite=overwrite, owned=check_only_dataset, note=report.notes.append
     ) as partial:
         sections = config.pipeline.sections()
-        steps = {name for file in imported_files() for name in file.transforms} & step_names(sections)
+        steps = {name for file in imported_files() for name in file.transforms}
+        steps &= step_names(sections) if steps else set()
         kinds = {*kinds_of(source)}
         # What loads the dataset must know where its steps, its store and its batches are at home.
         modules = {STORES[config.output.format].__module__, COLLATES[config.loader.collate].__module__}

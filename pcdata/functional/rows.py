@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
-from pcdata.contracts.host import all_finite, count_true
+from pcdata.contracts.host import all_finite
 from pcdata.geometry.rigid import from_rotation_translation
 
 # Up to here a look at each cloud by itself costs less than running totals of all rows.
@@ -49,7 +50,8 @@ def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
 def count_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the (B,) number of true rows of every cloud for a (N,) bool mask."""
     if mask.device.type == "cpu" and len(ptr) <= _FEW_CLOUDS:
-        counts = [count_true(mask[start:stop]) for start, stop in pairwise(ptr.tolist())]
+        flags = mask.numpy()
+        counts = [np.count_nonzero(flags[start:stop]) for start, stop in pairwise(ptr.tolist())]
         return torch.tensor(counts, dtype=torch.int64, device="cpu")
     before = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return counts_from_ptr(before[ptr])

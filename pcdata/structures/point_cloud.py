@@ -14,7 +14,7 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, join_rows, pad_rows, pick_rows, ptr_from_counts
 from pcdata.structures.cloud_batch import CloudBatch, Step, joined_facts
 from pcdata.structures.cloud_checks import check_cloud
 from pcdata.structures.image_layout import within_image
@@ -131,7 +131,7 @@ class PointCloud(CloudBatch):
     @property
     def counts(self) -> Tensor:
         """(B,) int64 points per cloud."""
-        return counts_from_ptr(self.ptr)
+        return self.ptr[1:] - self.ptr[:-1]
 
     @property
     def device(self) -> torch.device:

@@ -65,7 +65,7 @@ def record_from_cloud(cloud: PointCloud) -> Record:
         CacheError: a label does not fit into int32, a dtype has no NumPy counterpart, or meta or history hold what JSON
             cannot.
     """
-    cloud = cloud.to("cpu")
+    cloud = cloud if cloud.device.type == "cpu" else cloud.cpu()
     arrays = {name: _array(name, value) for name in FIELDS if (value := getattr(cloud, name)) is not None}
     if cloud.labels is not None:
         arrays["labels"] = _labels_as_int32(arrays["labels"])

@@ -128,20 +128,21 @@ def address(tensor: Tensor) -> int:
 
 
 def _pointers(tensors: Iterable[Tensor]) -> list[int]:
-    """Return where tensors lie in memory, never 0.
-
-    Raises:
-        ValueError: one is not contiguous or not in the memory of the CPU; the core would read or write astray.
-    """
+    """Return where tensors lie in memory, never 0."""
     found = []
     for tensor in tensors:
         if not tensor.is_contiguous() or not tensor.is_cpu:
-            raise ValueError(
-                f"the compiled core takes contiguous tensors in the memory of the CPU, not one of shape "
-                f"{tuple(tensor.shape)} with strides {tensor.stride()} on {tensor.device}; please report this"
-            )
+            raise _astray(tensor)
         found.append(tensor.data_ptr() or _NOWHERE)
     return found
+
+
+def _astray(tensor: Tensor) -> ValueError:
+    """Say why a tensor has no place in memory that the core could read or write."""
+    return ValueError(
+        f"the compiled core takes contiguous tensors in the memory of the CPU, not one of shape "
+        f"{tuple(tensor.shape)} with strides {tensor.stride()} on {tensor.device}; please report this"
+    )
 
 
 def _polls(raised: list[BaseException]) -> Iterator[int]:
@@ -163,11 +164,12 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
 
 def _arguments(values: Sequence[Any]) -> list[Any]:
     """Return values as ctypes passes them; in one loop, as a kernel has up to twenty."""
-    pointers = iter(_pointers([value for value in values if isinstance(value, Tensor)]))
     passed: list[Any] = []
     for value in values:
         if isinstance(value, Tensor):
-            passed.append(ctypes.c_void_p(next(pointers)))
+            if not value.is_contiguous() or not value.is_cpu:
+                raise _astray(value)
+            passed.append(ctypes.c_void_p(value.data_ptr() or _NOWHERE))
         elif isinstance(value, float):
             passed.append(ctypes.c_double(value))
         elif value is None:
