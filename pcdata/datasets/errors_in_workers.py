@@ -1,8 +1,8 @@
 """Errors of DataLoader workers that keep their step, sample id and path on the way to the parent.
 
 torch sends the *class* of an error and its text from a worker, and makes a new error of these in the parent: attributes
-of the instance are lost. So the worker raises an error of a class of its own, which has them, and which is pickled as
-the class it stands for and what it has.
+of the instance are lost. So the worker raises an error of a class of its own. What pickle sends in place of that class
+makes an error of the usual class with those attributes, when torch calls it in the parent.
 """
 
 from __future__ import annotations
@@ -30,13 +30,34 @@ def for_the_parent(error: Exception) -> Exception:
 
 def _located(kind: type[Exception], place: dict[str, Any]) -> Any:
     names: dict[str, Any] = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__doc__": kind.__doc__}
-    if issubclass(kind, KeyError):  # which shows its text with escapes, unless torch knows the class by itself
-        names["__str__"] = Exception.__str__
     return _Located(kind.__name__, (kind,), {**names, **place})
 
 
+class _Maker:
+    """Stands for the class in the parent: called with the text, it makes the error."""
+
+    def __init__(self, kind: type[Exception], place: dict[str, Any]) -> None:
+        self.__name__ = kind.__name__  # torch's text begins with it
+        self._kind, self._place = kind, place
+
+    def __call__(self, text: str) -> Exception:
+        # KeyError shows its text as a literal, all in one line, unless that says itself how it looks.
+        error = self._kind(_AsItIs(text) if issubclass(self._kind, KeyError) else text)
+        error.__dict__.update(self._place)
+        return error
+
+
+class _AsItIs(str):
+    """A text that looks like itself where Python would show a literal."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
 def _as_pickled(kind: type) -> tuple[Any, ...]:
-    return _located, (kind.__bases__[0], {name: vars(kind)[name] for name in _PLACE})
+    return _Maker, (kind.__bases__[0], {name: vars(kind)[name] for name in _PLACE})
 
 
 copyreg.pickle(_Located, _as_pickled)
