@@ -13,7 +13,7 @@
 #include <new>
 #include <vector>
 
-#include "pc/crew.hpp"
+#include "pc/threads.hpp"
 
 #define PC_EXPORT extern "C" __attribute__((visibility("default")))
 

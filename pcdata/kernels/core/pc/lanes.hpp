@@ -4,7 +4,7 @@
 #pragma once
 
 #include "pc/common.hpp"
-#include "pc/geometry.hpp"
+#include "pc/math/distance.hpp"
 
 #if defined(__SSE2__)
 #include <immintrin.h>

@@ -2,8 +2,8 @@
 //
 // Source: Wang, Gu and Shun, Theoretically-efficient and practical parallel DBSCAN, SIGMOD 2020; the numbering of
 // clusters and the border points follow Open3D.
-#include "pc/cells.hpp"
-#include "pc/union_find.hpp"
+#include "pc/cells/cells.hpp"
+#include "pc/cells/union_find.hpp"
 
 namespace {
 

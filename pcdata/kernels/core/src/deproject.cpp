@@ -1,8 +1,8 @@
 // Depth images to points, with what other images say about the same pixels. Two passes: the first decides which pixels
 // become points and counts them, the second writes.
-#include "pc/affine.hpp"
+#include "pc/math/affine.hpp"
 #include "pc/common.hpp"
-#include "pc/runs.hpp"
+#include "pc/rows/runs.hpp"
 
 namespace pc {
 namespace {

@@ -1,6 +1,6 @@
 // Sums over chosen points, for the least-squares plane through them.
 #include "pc/pieces.hpp"
-#include "pc/plane_sums.hpp"
+#include "pc/planes/plane_sums.hpp"
 
 namespace pc {
 namespace {

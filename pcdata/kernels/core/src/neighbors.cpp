@@ -1,5 +1,5 @@
 // Nearest neighbours and neighbours within a radius, exact, on ragged batches.
-#include "pc/search.hpp"
+#include "pc/neighbors/batch_search.hpp"
 
 namespace pc {
 namespace {

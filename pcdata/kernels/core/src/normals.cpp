@@ -1,8 +1,8 @@
 // Surface normals from the covariance of the nearest points within a radius.
 //
 // Source: Hoppe et al., Surface reconstruction from unorganized points, 1992.
-#include "pc/eigen.hpp"
-#include "pc/search.hpp"
+#include "pc/math/eigen.hpp"
+#include "pc/neighbors/batch_search.hpp"
 
 namespace pc {
 namespace {

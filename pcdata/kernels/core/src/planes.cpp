@@ -2,7 +2,7 @@
 #include <cmath>
 
 #include "pc/pieces.hpp"
-#include "pc/plane_sums.hpp"
+#include "pc/planes/plane_sums.hpp"
 
 namespace pc {
 namespace {

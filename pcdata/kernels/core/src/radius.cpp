@@ -7,7 +7,7 @@
 // 3. Those are sorted into cells; a cell with enough points decides itself, other points count the cells around them.
 //
 // Points in no order skip to the third step.
-#include "pc/cells.hpp"
+#include "pc/cells/cells.hpp"
 
 namespace {
 

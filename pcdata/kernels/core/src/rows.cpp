@@ -2,7 +2,7 @@
 #include <type_traits>
 
 #include "pc/common.hpp"
-#include "pc/runs.hpp"
+#include "pc/rows/runs.hpp"
 
 namespace pc {
 namespace {

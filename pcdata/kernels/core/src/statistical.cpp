@@ -1,7 +1,7 @@
 // Statistical outliers: the mean distance to the nearest neighbours, and which means are unusual for their cloud.
 //
 // Source: Rusu et al., Towards 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
-#include "pc/search.hpp"
+#include "pc/neighbors/batch_search.hpp"
 
 namespace pc {
 namespace {

@@ -1,6 +1,6 @@
 // Finding the rows of blocks by their keys, and packing colours as voxels store them.
-#include "pc/tsdf.hpp"
-#include "pc/voxel_table.hpp"
+#include "pc/tsdf/grid.hpp"
+#include "pc/voxels/table.hpp"
 
 namespace pc {
 namespace {

@@ -3,7 +3,7 @@
 //
 // Eight words of 64 bits hold one property of a block's voxels, one word per z: the corners of all cubes of a slab are
 // words shifted by a voxel, a line or a slab.
-#include "pc/tsdf_walk.hpp"
+#include "pc/tsdf/walk.hpp"
 
 namespace pc {
 namespace {

@@ -1,6 +1,6 @@
 // Zero crossings of a truncated signed distance field: the same numbers as pcdata/functional/tsdf/surface.py, the
 // normals up to the last bit of a square root.
-#include "pc/tsdf_field.hpp"
+#include "pc/tsdf/field.hpp"
 
 namespace pc {
 namespace {

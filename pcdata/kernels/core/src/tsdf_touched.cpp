@@ -1,8 +1,8 @@
 // The blocks that a depth image touches.
-#include "pc/radix_sort.hpp"
+#include "pc/sort/radix.hpp"
 #include "pc/truth.hpp"
-#include "pc/tsdf.hpp"
-#include "pc/voxel_table.hpp"
+#include "pc/tsdf/grid.hpp"
+#include "pc/voxels/table.hpp"
 
 namespace pc {
 namespace {

@@ -3,7 +3,7 @@
 #include <optional>
 
 #include "pc/lanes.hpp"
-#include "pc/voxel_table.hpp"
+#include "pc/voxels/table.hpp"
 
 namespace pc {
 namespace {

@@ -3,7 +3,7 @@
 
 #include <limits>
 
-#include "pc/tsdf.hpp"
+#include "pc/tsdf/grid.hpp"
 #include "pc/truth.hpp"
 
 namespace pc {

@@ -1,5 +1,5 @@
 // Averaging depth images into a truncated signed distance field.
-#include "pc/tsdf_pixels.hpp"
+#include "pc/tsdf/pixels.hpp"
 
 namespace pc {
 namespace {

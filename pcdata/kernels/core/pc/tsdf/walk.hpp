@@ -1,7 +1,7 @@
 // Walking through the blocks of a field in the order of their keys, with the blocks around each at hand.
 #pragma once
 
-#include "pc/tsdf.hpp"
+#include "pc/tsdf/grid.hpp"
 
 namespace pc {
 

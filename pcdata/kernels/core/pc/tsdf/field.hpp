@@ -1,7 +1,7 @@
 // The distances of a block and of what is around it: which edges of the grid cross zero, and the slopes there.
 #pragma once
 
-#include "pc/tsdf_walk.hpp"
+#include "pc/tsdf/walk.hpp"
 
 namespace pc {
 

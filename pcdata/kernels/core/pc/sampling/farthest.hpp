@@ -2,9 +2,9 @@
 #pragma once
 
 #include "pc/common.hpp"
-#include "pc/geometry.hpp"
+#include "pc/math/distance.hpp"
 #include "pc/lanes.hpp"
-#include "pc/spatial_sort.hpp"
+#include "pc/sort/morton_points.hpp"
 
 namespace pc {
 

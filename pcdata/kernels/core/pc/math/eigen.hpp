@@ -5,7 +5,7 @@
 // rotation in its second half from square roots. All selections are conditional moves, so loops over it vectorise.
 #pragma once
 
-#include "pc/geometry.hpp"
+#include "pc/math/distance.hpp"
 
 #if !defined(__CUDACC__)
 #include <cmath>

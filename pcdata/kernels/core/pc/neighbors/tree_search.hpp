@@ -1,9 +1,9 @@
 // The search of a box tree for sixteen queries at once.
 #pragma once
 
-#include "pc/boxtree.hpp"
+#include "pc/neighbors/box_tree.hpp"
 #include "pc/sixteen.hpp"
-#include "pc/nearest.hpp"
+#include "pc/neighbors/nearest.hpp"
 
 namespace pc {
 

@@ -6,8 +6,8 @@
 
 #include "pc/common.hpp"
 #include "pc/sixteen.hpp"
-#include "pc/morton.hpp"
-#include "pc/nearest.hpp"
+#include "pc/sort/morton_rows.hpp"
+#include "pc/neighbors/nearest.hpp"
 
 namespace pc {
 

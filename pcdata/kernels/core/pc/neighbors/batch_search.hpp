@@ -1,8 +1,8 @@
 // Every query of a batch searched: by windows where there is a depth image and a proof, else by the box tree.
 #pragma once
 
-#include "pc/organised.hpp"
-#include "pc/treesearch.hpp"
+#include "pc/neighbors/organized_cloud.hpp"
+#include "pc/neighbors/tree_search.hpp"
 
 namespace pc {
 

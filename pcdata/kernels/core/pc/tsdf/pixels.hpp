@@ -2,7 +2,7 @@
 // image, which finds them by these numbers.
 #pragma once
 
-#include "pc/tsdf_view.hpp"
+#include "pc/tsdf/view.hpp"
 
 namespace pc {
 

@@ -1,5 +1,5 @@
 // Farthest point sampling of ragged batches.
-#include "pc/farthest.hpp"
+#include "pc/sampling/farthest.hpp"
 
 namespace pc {
 namespace {

@@ -4,7 +4,7 @@
 #include <limits>
 
 #include "pc/common.hpp"
-#include "pc/projection.hpp"
+#include "pc/images/projection.hpp"
 
 namespace pc {
 namespace {

@@ -1,7 +1,7 @@
 // Points under affine maps, and inside a box.
 #include <cmath>
 
-#include "pc/affine.hpp"
+#include "pc/math/affine.hpp"
 #include "pc/common.hpp"
 
 namespace pc {

@@ -9,8 +9,8 @@
 #include <limits>
 
 #include "pc/common.hpp"
-#include "pc/geometry.hpp"
-#include "pc/radix_sort.hpp"
+#include "pc/math/distance.hpp"
+#include "pc/sort/radix.hpp"
 
 namespace pc {
 

@@ -11,8 +11,8 @@
 
 #include "pc/common.hpp"
 #include "pc/sixteen.hpp"
-#include "pc/nearest.hpp"
-#include "pc/treesearch.hpp"
+#include "pc/neighbors/nearest.hpp"
+#include "pc/neighbors/tree_search.hpp"
 
 namespace pc {
 
