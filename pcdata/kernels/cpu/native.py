@@ -12,14 +12,14 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from pcdata.kernels.signatures import DECLARATIONS, INTERFACE_NUMBER
 from pcdata.threads import core_threads
 
-INTERFACE_VERSION = 6
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 # Names an instruction set to use instead of the best one; for tests and for measuring.
@@ -36,6 +36,31 @@ class _Context(ctypes.Structure):
     _fields_ = [("threads", ctypes.c_int32), ("poll", _Poll)]
 
 
+# The dtypes of tensors for a pointer of each type; True and False are bytes too.
+_DTYPES = {
+    "float*": (torch.float32,),
+    "double*": (torch.float64,),
+    "bool*": (torch.bool,),
+    "uint8*": (torch.uint8, torch.bool),
+    "int32*": (torch.int32,),
+    "int64*": (torch.int64,),
+}
+_NUMBERS = {"int64": ctypes.c_int64, "double": ctypes.c_double}
+
+
+class _Parameter(NamedTuple):
+    name: str
+    dtypes: tuple[torch.dtype, ...]  # that a tensor may have; none: a number
+
+
+class _Function(NamedTuple):
+    entry: Any  # of ctypes, with the types of its arguments
+    parameters: tuple[_Parameter, ...]
+
+
+Library = dict[str, _Function]  # the functions by their names
+
+
 def unavailable() -> str | None:
     """Return None when the core can be called, else why not and what to do."""
     try:
@@ -46,41 +71,77 @@ def unavailable() -> str | None:
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library() -> Library:
     """Load the best library that this processor runs.
 
     Raises:
         OSError: there is none, or it belongs to another version of pcdata.
     """
     folder = _folder()
-    baseline = ctypes.CDLL(str(folder / "libpcdata_baseline.so"))
-    best = INSTRUCTION_SETS[baseline.pc_best_instruction_set()]
+    best = best_instruction_set()
     name = os.environ.get(FORCE_VARIABLE, best)
     if name not in INSTRUCTION_SETS or INSTRUCTION_SETS.index(name) > INSTRUCTION_SETS.index(best):
         raise OSError(f"{FORCE_VARIABLE}={name!r}: this processor runs {', '.join(_runnable(best))}")
     path = folder / f"libpcdata_{name}.so"
-    chosen = ctypes.CDLL(str(path)) if path.exists() else baseline
-    if chosen.pc_interface_version() != INTERFACE_VERSION:
-        raise OSError(f"{path} belongs to another version of pcdata; reinstall pcdata")
-    return chosen
+    return load(path if path.exists() else folder / "libpcdata_baseline.so")
+
+
+def best_instruction_set() -> str:
+    """Return the most capable of the instruction sets that this processor runs.
+
+    Raises:
+        OSError: the core is not installed.
+    """
+    return INSTRUCTION_SETS[ctypes.CDLL(str(_folder() / "libpcdata_baseline.so")).pc_best_instruction_set()]
+
+
+def load(path: Path) -> Library:
+    """Load one library of the core, with the types of its functions' arguments as this version of pcdata has them.
+
+    Raises:
+        OSError: it cannot be loaded, or it was built from other declarations.
+    """
+    compiled = ctypes.CDLL(str(path))
+    number = getattr(compiled, "pc_interface_number", None)
+    if number is not None:
+        number.restype = ctypes.c_int64
+    if number is None or number() != INTERFACE_NUMBER:
+        raise OSError(
+            f"{path} was built from other declarations than this version of pcdata has; reinstall pcdata "
+            f"(in a source tree: pip install -e .)"
+        )
+    functions = {}
+    for line in DECLARATIONS.replace("\n    ", " ").strip().splitlines():
+        name, _, declared = line.partition(": ")
+        arguments = [argument.split() for argument in declared.split(", ")]
+        entry = getattr(compiled, name)
+        entry.argtypes = [ctypes.c_void_p, *(_NUMBERS.get(kind, ctypes.c_void_p) for kind, _ in arguments)]
+        functions[name] = _Function(entry, tuple(_Parameter(at, _DTYPES.get(kind, ())) for kind, at in arguments))
+    return functions
 
 
 def call(function: str, *arguments: Any) -> None:
-    """Call ``function(context, *arguments)``; tensors go as pointers, ints as int64, floats as double.
+    """Call ``function(context, *arguments)``; tensors go as pointers, numbers as the core declares them.
 
     None goes as the null pointer and means "not given". No tensor does, not even an empty one, whose own pointer is
     null: the core may tell the two apart.
 
     Raises:
+        TypeError: an argument is not what the core's header declares.
         ValueError: a tensor is not contiguous or not in the memory of the CPU.
         MemoryError: the core could not get memory.
         KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
     """
+    entry, parameters = library()[function]
+    values = _values(function, parameters, arguments)
     raised: list[BaseException] = []
     polls = _polls(raised)
     next(polls)
     context = _Context(core_threads(), _Poll(polls.__next__))
-    status = getattr(library(), function)(ctypes.byref(context), *_arguments(arguments))
+    try:
+        status = entry(ctypes.byref(context), *values)
+    except ctypes.ArgumentError as error:
+        raise TypeError(f"{function}: {error}, in its order after the context; please report this") from error
     if raised:
         raise raised[0]
     if status == _OUT_OF_MEMORY:
@@ -162,20 +223,21 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
             stop = 1
 
 
-def _arguments(values: Sequence[Any]) -> list[Any]:
-    """Return values as ctypes passes them; in one loop, as a kernel has up to twenty."""
+def _values(function: str, parameters: Sequence[_Parameter], arguments: Sequence[Any]) -> list[Any]:
+    """Return arguments as ctypes passes them, checked; in one loop, as a kernel has up to twenty."""
+    if len(arguments) != len(parameters):
+        raise TypeError(f"{function} takes {len(parameters)} arguments, got {len(arguments)}; please report this")
     passed: list[Any] = []
-    for value in values:
-        if isinstance(value, Tensor):
-            if not value.is_contiguous() or not value.is_cpu:
-                raise _astray(value)
-            passed.append(ctypes.c_void_p(value.data_ptr() or _NOWHERE))
-        elif isinstance(value, float):
-            passed.append(ctypes.c_double(value))
-        elif value is None:
-            passed.append(ctypes.c_void_p(None))
+    for (name, dtypes), value in zip(parameters, arguments):
+        if not dtypes or value is None:
+            passed.append(value)
+        elif not isinstance(value, Tensor) or value.dtype not in dtypes:
+            given = value.dtype if isinstance(value, Tensor) else type(value).__name__
+            raise TypeError(f"{function}: {name} takes a tensor of {dtypes[0]}, got {given}; please report this")
+        elif not value.is_contiguous() or not value.is_cpu:
+            raise _astray(value)
         else:
-            passed.append(ctypes.c_int64(int(value)))
+            passed.append(value.data_ptr() or _NOWHERE)
     return passed
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import math
 import signal
@@ -38,17 +37,19 @@ def machine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     """A number of threads, and the library of one instruction set (None: the best)."""
     threads, name = request.param
     if name is not None:
-        folder = native._folder()
-        best = ctypes.CDLL(str(folder / "libpcdata_baseline.so")).pc_best_instruction_set()
-        path = folder / f"libpcdata_{name}.so"
-        if native.INSTRUCTION_SETS.index(name) > best or not path.exists():
-            pytest.skip(f"this processor does not run {name}")
-        library = ctypes.CDLL(str(path))
-        monkeypatch.setattr(native, "library", lambda: library)
+        monkeypatch.setenv(native.FORCE_VARIABLE, name)
+        native.library.cache_clear()
+        try:
+            native.library()
+        except OSError as error:
+            pytest.skip(str(error))
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     yield
     torch.set_num_threads(before)
+    if name is not None:
+        monkeypatch.undo()
+        native.library.cache_clear()
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

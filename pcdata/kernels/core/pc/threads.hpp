@@ -1,125 +1,105 @@
-// The threads of one kernel call.
+// The threads of a kernel call: how a call begins and ends, and how its work is shared out.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
-#include <condition_variable>
 #include <cstdint>
-#include <mutex>
-#include <thread>
+#include <exception>
+#include <type_traits>
+#include <utility>
 #include <vector>
 
-#if defined(__linux__)
-#include <pthread.h>
-#include <sched.h>
-#endif
+#include "pc/exports.hpp"
 
 namespace pc {
 
-// Helpers of the thread that made it, from the first job until the end of the call: between calls no thread lives that
-// a fork could break. A kernel has several short jobs, so helpers wait for the next one awake, for a while; and a job
-// never waits for a helper that has not come yet, because starting a thread may take a millisecond.
-class Crew {
+using std::int32_t;
+using std::int64_t;
+using std::uint32_t;
+using std::uint64_t;
+using std::uint8_t;
+
+// -- a call -------------------------------------------------------------------------------------------------------
+
+enum Status : int32_t { kOk = 0, kOutOfMemory = 1, kInterrupted = 2, kFailed = 3 };
+
+struct Interrupted : std::exception {};
+
+int32_t run_call(void* body, void (*call)(void*)) noexcept;
+
+// Run a kernel's body and turn its end into a status: no exception crosses the C interface.
+template <class Body>
+int32_t guarded(Body&& body) noexcept {
+  using Plain = std::remove_reference_t<Body>;
+  return run_call(&body, [](void* object) { (*static_cast<Plain*>(object))(); });
+}
+
+// Asks Python for an interrupt at most every 20 ms; used by the calling thread only.
+class Poll {
  public:
-  Crew() : outer_(current()) { current() = this; }
-  Crew(const Crew&) = delete;
-  Crew& operator=(const Crew&) = delete;
-  ~Crew() {
-    current() = outer_;
-    wake(kQuit);
-    for (auto& helper : helpers_) helper.join();
-  }
+  explicit Poll(const pc_context& context);
 
-  // The crew of the call that this thread is in; null in helpers.
-  static Crew*& current() {
-    static thread_local Crew* crew = nullptr;
-    return crew;
-  }
-
-  // Call work(thread) here as thread 0 and, as far as they come in time, by helpers 1 to threads-1. Returns when nobody
-  // works any more. `work` must not throw.
-  template <class Work>
-  void run(int64_t threads, Work& work) {
-    work_ = [](void* object, int64_t thread) { (*static_cast<Work*>(object))(thread); };
-    object_ = &work;
-    wanted_ = threads;
-    hire(threads - 1);
-    present_.fetch_and(~kClosed);
-    wake(kNext);
-    work(0);
-    present_.fetch_or(kClosed);
-    while (present_.load() != kClosed) std::this_thread::yield();
-  }
+  void check();  // throws Interrupted
 
  private:
-  static constexpr uint64_t kQuit = 1, kNext = 2;  // what to add to signal_
-  static constexpr uint32_t kClosed = uint32_t{1} << 31;
-  static constexpr int kLooks = 20000;  // some tens of microseconds
-
-  void hire(int64_t wanted) {
-    try {
-      while (static_cast<int64_t>(helpers_.size()) < wanted) {
-        const auto thread = static_cast<int64_t>(helpers_.size()) + 1;
-        helpers_.emplace_back([this, thread, seen = signal_.load()] { serve(thread, seen); });
-        move_elsewhere(helpers_.back());
-      }
-    } catch (...) {
-      // No more threads to be had: the ones there are do the work.
-    }
-  }
-
-  void serve(int64_t thread, uint64_t seen) {
-    for (;;) {
-      seen = next_signal(seen);
-      if (seen & kQuit) return;
-      // A job that is over, or being replaced, is closed: nothing of it is read then.
-      if (!(present_.fetch_add(1) & kClosed) && thread < wanted_) work_(object_, thread);
-      present_.fetch_sub(1);
-    }
-  }
-
-  void wake(uint64_t change) {
-    signal_.fetch_add(change);
-    if (asleep_.load() == 0) return;
-    { const std::lock_guard<std::mutex> lock(mutex_); }
-    bell_.notify_all();
-  }
-
-  uint64_t next_signal(uint64_t seen) {
-    for (int look = 0; look < kLooks; ++look)
-      if (const uint64_t now = signal_.load(); now != seen) return now;
-    std::unique_lock<std::mutex> lock(mutex_);
-    asleep_.fetch_add(1);
-    bell_.wait(lock, [&] { return signal_.load() != seen; });
-    asleep_.fetch_sub(1);
-    return signal_.load();
-  }
-
-  // Left to itself, Linux often starts a thread on its maker's processor, where it waits for the maker to pause.
-  static void move_elsewhere(std::thread& helper) {
-#if defined(__linux__)
-    cpu_set_t allowed, others;
-    const int here = sched_getcpu();
-    if (here < 0 || sched_getaffinity(0, sizeof(allowed), &allowed) != 0) return;
-    others = allowed;
-    CPU_CLR(here, &others);
-    if (CPU_COUNT(&others) == 0) return;
-    pthread_setaffinity_np(helper.native_handle(), sizeof(others), &others);
-    pthread_setaffinity_np(helper.native_handle(), sizeof(allowed), &allowed);  // free to go where it likes from there
-#else
-    (void)helper;
-#endif
-  }
-
-  std::vector<std::thread> helpers_;
-  std::mutex mutex_;
-  std::condition_variable bell_;
-  std::atomic<uint64_t> signal_{0};
-  std::atomic<uint32_t> present_{kClosed};  // helpers at work, and whether others may still join
-  std::atomic<int> asleep_{0};
-  void (*work_)(void*, int64_t) = nullptr;
-  void* object_ = nullptr;
-  int64_t wanted_ = 0;
-  Crew* outer_;
+  const pc_context& context_;
+  int64_t next_;  // nanoseconds
 };
+
+// -- sharing out work ---------------------------------------------------------------------------------------------
+
+// A body to call for pieces of work, without its type: what shares work out is compiled once, not for every body.
+struct PieceBody {
+  void* object;
+  void (*call)(void* object, int64_t begin, int64_t end, int64_t thread);
+
+  void operator()(int64_t begin, int64_t end, int64_t thread) const { call(object, begin, end, thread); }
+};
+
+void run_pieces(const pc_context& context, int64_t count, int64_t grain, PieceBody body);
+
+// Call body(begin, end, thread) over [0, count) in pieces of `grain` by up to context.threads threads. Pieces may run in
+// any order, so bodies write disjoint results. A long piece delays Ctrl-C: keep it well under a second.
+//
+// Every thread has a stretch of its own, the same in every loop over the same pieces, so that it meets what it has in its
+// cache; one that is done helps the others.
+template <class Body>
+void parallel_for(const pc_context& context, int64_t count, int64_t grain, Body&& body) {
+  using Plain = std::remove_const_t<std::remove_reference_t<Body>>;
+  auto* object = const_cast<Plain*>(&body);
+  run_pieces(context, count, grain, {object, [](void* it, int64_t begin, int64_t end, int64_t thread) {
+                                       (*static_cast<Plain*>(it))(begin, end, thread);
+                                     }});
+}
+
+struct Range {
+  int64_t begin, end;
+  int64_t size() const { return end - begin; }
+};
+
+// Cut [0, count) into a few equal pieces per thread, so that a slow core does not hold the others up. Pieces too small
+// for a thread of their own are not made; very large ones are cut further, for Ctrl-C.
+std::vector<Range> even_pieces(const pc_context& context, int64_t count);
+
+// -- ragged batches: long clouds cut into several pieces, short ones whole ----------------------------------------
+
+// A run of rows of one cloud.
+struct CloudPiece {
+  int64_t cloud, begin, end;
+};
+
+// All clouds cut into pieces of at most `rows` rows, in order; an empty cloud has none.
+std::vector<CloudPiece> cut_clouds(const int64_t* ptr, int64_t num_clouds, int64_t rows);
+
+// Call body(piece, its number) for all pieces, about `rows` rows at a time.
+template <class Body>
+void for_each_piece(const pc_context& context, const std::vector<CloudPiece>& pieces, int64_t rows, Body&& body) {
+  if (pieces.empty()) return;
+  const auto count = static_cast<int64_t>(pieces.size());
+  const int64_t mean = std::max<int64_t>(1, (pieces.back().end - pieces.front().begin) / count);
+  parallel_for(context, count, std::max<int64_t>(1, rows / mean), [&](int64_t first, int64_t last, int64_t) {
+    for (int64_t p = first; p < last; ++p) body(pieces[static_cast<size_t>(p)], p);
+  });
+}
 
 }  // namespace pc

@@ -1,10 +1,8 @@
 // What this library is and whether the processor runs it.
-#include "pc/common.hpp"
+#include "pc/exports.hpp"
 
-// Raised whenever a signature below or in another source changes: Python refuses a library of another number.
-PC_EXPORT int32_t pc_interface_version() { return 6; }
+PC_EXPORT int64_t pc_interface_number() { return PCDATA_INTERFACE; }
 
-// Only meaningful in the baseline library, which runs everywhere: 0 baseline, 1 avx2, 2 avx512.
 PC_EXPORT int32_t pc_best_instruction_set() {
 #if defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
   __builtin_cpu_init();

@@ -2,110 +2,12 @@
 //
 // Source: Wang, Gu and Shun, Theoretically-efficient and practical parallel DBSCAN, SIGMOD 2020; the numbering of
 // clusters and the border points follow Open3D.
-#include "pc/cells/cells.hpp"
+#include "pc/bounds.hpp"
+#include "pc/cells/pair_search.hpp"
 #include "pc/cells/union_find.hpp"
 
+namespace pc::cells {
 namespace {
-
-using namespace pc;
-
-struct Point {
-  float coordinate[3];
-};
-
-Box box_of(const std::vector<Point>& points, Range range) {
-  Box box;
-  for (int axis = 0; axis < 3; ++axis) {
-    float low = points[range.begin].coordinate[axis], high = low;
-    for (int64_t i = range.begin + 1; i < range.end; ++i) {
-      low = std::min(low, points[i].coordinate[axis]);
-      high = std::max(high, points[i].coordinate[axis]);
-    }
-    box.low[axis] = low;
-    box.high[axis] = high;
-  }
-  return box;
-}
-
-// Squared distance between boxes, never more than that of any two points in them as computed: rounding is monotone and
-// the operations are those of squared_distance in the same order.
-float gap(const Box& a, const Box& b) {
-  float apart[3];
-  for (int axis = 0; axis < 3; ++axis)
-    apart[axis] = std::max(0.0f, std::max(a.low[axis] - b.high[axis], b.low[axis] - a.high[axis]));
-  return squared_distance(apart[0], apart[1], apart[2], 0, 0, 0);
-}
-
-int longest_axis(const Box& box) {
-  int longest = 0;
-  for (int axis = 1; axis < 3; ++axis)
-    if (box.high[axis] - box.low[axis] > box.high[longest] - box.low[longest]) longest = axis;
-  return longest;
-}
-
-// Whether some point of one set is nearer than sqrt(limit) to some point of another. Halves the wider set until boxes
-// or few enough pairs decide, so that two dense cells just out of reach do not cost the product of their sizes.
-class PairSearch {
- public:
-  explicit PairSearch(float limit) : limit_(limit) {}
-
-  template <class Key>
-  bool any(const Cells<Key>& cells, Range a, Range b) {
-    if (a.size() * b.size() <= kFewPairs) {
-      for (int64_t i = a.begin; i < a.end; ++i) {
-        const float q[3] = {cells.x[i], cells.y[i], cells.z[i]};
-        if (count_near(cells, b, q, limit_, 1)) return true;
-      }
-      return false;
-    }
-    copy(cells, a, a_);
-    copy(cells, b, b_);
-    return any({0, a.size()}, {0, b.size()});
-  }
-
- private:
-  static constexpr int64_t kFewPairs = 1024;
-
-  template <class Key>
-  static void copy(const Cells<Key>& cells, Range range, std::vector<Point>& points) {
-    points.clear();
-    for (int64_t i = range.begin; i < range.end; ++i) points.push_back({{cells.x[i], cells.y[i], cells.z[i]}});
-  }
-
-  bool any(Range a, Range b) {
-    const Box box_a = box_of(a_, a), box_b = box_of(b_, b);
-    if (!(gap(box_a, box_b) < limit_)) return false;
-    if (a.size() * b.size() <= kFewPairs) return any_of_all(a, b);
-    const int axis_a = longest_axis(box_a), axis_b = longest_axis(box_b);
-    const float width_a = box_a.high[axis_a] - box_a.low[axis_a], width_b = box_b.high[axis_b] - box_b.low[axis_b];
-    if (width_a == 0 && width_b == 0) return true;  // copies of one point on both sides: the gap is their distance
-    if (width_a >= width_b) {
-      const int64_t middle = halve(a_, a, axis_a);
-      return any({a.begin, middle}, b) || any({middle, a.end}, b);
-    }
-    const int64_t middle = halve(b_, b, axis_b);
-    return any(a, {b.begin, middle}) || any(a, {middle, b.end});
-  }
-
-  bool any_of_all(Range a, Range b) const {
-    for (int64_t i = a.begin; i < a.end; ++i)
-      for (int64_t j = b.begin; j < b.end; ++j) {
-        const float *p = a_[i].coordinate, *q = b_[j].coordinate;
-        if (squared_distance(p[0], p[1], p[2], q[0], q[1], q[2]) < limit_) return true;
-      }
-    return false;
-  }
-
-  static int64_t halve(std::vector<Point>& points, Range range, int axis) {
-    const int64_t middle = range.begin + range.size() / 2;
-    std::nth_element(points.begin() + range.begin, points.begin() + middle, points.begin() + range.end,
-                     [axis](const Point& p, const Point& q) { return p.coordinate[axis] < q.coordinate[axis]; });
-    return middle;
-  }
-
-  const float limit_;
-  std::vector<Point> a_, b_;
-};
 
 template <class Key>
 class Clustering {
@@ -200,7 +102,7 @@ class Clustering {
       const int64_t i = of_a.begin + of_a.size() * s / kSamples;
       for (int64_t t = 0; t < kSamples; ++t) {
         const int64_t j = of_b.begin + of_b.size() * t / kSamples;
-        if (squared_distance(cells_.x[i], cells_.y[i], cells_.z[i], cells_.x[j], cells_.y[j], cells_.z[j]) < limit_)
+        if (math::squared_distance(cells_.x[i], cells_.y[i], cells_.z[i], cells_.x[j], cells_.y[j], cells_.z[j]) < limit_)
           return true;
       }
     }
@@ -281,7 +183,7 @@ void cluster(const pc_context& context, ScratchFrame& scratch, const Lattice& la
 double cluster_cloud(const pc_context& context, const float* points, int64_t count, float eps, int64_t min_points,
                      int64_t* labels) {
   ScratchFrame scratch;
-  const Box box = parallel_bounds(context, points, count);
+  const math::Bounds box = parallel_bounds(context, points, count);
   const double side = cell_side(eps);
   const double largest = largest_coordinate(box, side);
   if (largest >= kMostCellsPerAxis) return largest;
@@ -294,15 +196,16 @@ double cluster_cloud(const pc_context& context, const float* points, int64_t cou
 }
 
 }  // namespace
+}  // namespace pc::cells
 
-// points (N, 3); ptr (B+1,); labels (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The labels
-// are complete only if that is below 2^36.
 PC_EXPORT int32_t pc_dbscan(const pc_context* context, const float* points, const int64_t* ptr, int64_t clouds,
                             double eps, int64_t min_points, int64_t* labels, double* largest) {
+  using namespace pc;
+  using namespace pc::cells;
   return guarded([&] {
     std::atomic<double> most{0};
-    for_each_cloud(*context, ptr, clouds, [&](const pc_context& crew, int64_t first, int64_t count) {
-      raise_to(most, cluster_cloud(crew, points + 3 * first, count, static_cast<float>(eps), min_points,
+    for_each_cloud(*context, ptr, clouds, [&](const pc_context& own, int64_t first, int64_t count) {
+      raise_to(most, cluster_cloud(own, points + 3 * first, count, static_cast<float>(eps), min_points,
                                    labels + first));
     });
     *largest = most.load();

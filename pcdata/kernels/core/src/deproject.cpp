@@ -1,10 +1,13 @@
 // Depth images to points, with what other images say about the same pixels. Two passes: the first decides which pixels
 // become points and counts them, the second writes.
-#include "pc/math/affine.hpp"
-#include "pc/common.hpp"
-#include "pc/rows/runs.hpp"
+#include <cstring>
 
-namespace pc {
+#include "pc/math/affine.hpp"
+#include "pc/memory.hpp"
+#include "pc/rows/runs.hpp"
+#include "pc/threads.hpp"
+
+namespace pc::images {
 namespace {
 
 constexpr int64_t kRowsPerPiece = 16;
@@ -27,11 +30,11 @@ struct Images {
   void with_points_of_row(int64_t row, const Body& body) const {
     if (rays != nullptr) {
       const float* ray = rays + 2 * row * width;
-      body([ray](int64_t u, float z) { return Point{ray[2 * u] * z, ray[2 * u + 1] * z, z}; });
+      body([ray](int64_t u, float z) { return math::Point{ray[2 * u] * z, ray[2 * u + 1] * z, z}; });
     } else {
       const float* x = column_rays + row / height * width;
       const float y = row_rays[row];
-      body([x, y](int64_t u, float z) { return Point{x[u] * z, y * z, z}; });
+      body([x, y](int64_t u, float z) { return math::Point{x[u] * z, y * z, z}; });
     }
   }
   // The same with the points moved by the matrix (4, 4) of their view; matrices may be null.
@@ -39,7 +42,7 @@ struct Images {
   void with_moved_points_of_row(int64_t row, const double* matrices, const Body& body) const {
     with_points_of_row(row, [&](const auto& point) {
       if (matrices == nullptr) return body(point);
-      const Affine move(matrices + 16 * (row / height));
+      const math::Affine move(matrices + 16 * (row / height));
       body([&](int64_t u, float z) { return move(point(u, z)); });
     });
   }
@@ -50,11 +53,11 @@ struct Choice {
   float near, far;
   const uint8_t* mask;     // (views, height, width) or null
   const double* matrices;  // (views, 4, 4) or null: what brings points to the box
-  const Box* box;          // or null
+  const math::CropBox* box;          // or null
 };
 
 // Decide about one image row: keep (width,) becomes 1 where a pixel becomes a point. Returns the number of readings
-// that the box decided about, or -1 for a depth, a ray or a point that cannot be. Separate plain loops: they vectorise.
+// that the box decided about, or -1 for a depth, a ray or a point that cannot be. Separate plain loops: they vectorize.
 int64_t choose_row(const Images& images, int64_t row, const Choice& choice, uint8_t* __restrict keep) {
   const int64_t width = images.width;
   const float* __restrict depth = images.row_depth(row);
@@ -72,12 +75,12 @@ int64_t choose_row(const Images& images, int64_t row, const Choice& choice, uint
     for (int64_t u = 0; u < width; ++u) wrong |= keep[u] & (ray[2 * u] != ray[2 * u]);
   }
   if (choice.box != nullptr) {
-    const Box box = *choice.box;
+    const math::CropBox box = *choice.box;
     images.with_moved_points_of_row(row, choice.matrices, [&](const auto& point) {
       int32_t infinite = 0;
       for (int64_t u = 0; u < width; ++u) {
-        const Point p = point(u, depth[u]);
-        infinite |= keep[u] & !is_finite(p);
+        const math::Point p = point(u, depth[u]);
+        infinite |= keep[u] & !math::is_finite(p);
         keep[u] &= box.contains(p);
       }
       wrong |= infinite;
@@ -86,7 +89,7 @@ int64_t choose_row(const Images& images, int64_t row, const Choice& choice, uint
   return wrong != 0 ? -1 : readings;
 }
 
-// What goes along with the points: RGB images become float colours, other images are copied pixel by pixel. All images
+// What goes along with the points: RGB images become float colors, other images are copied pixel by pixel. All images
 // are (views, height, width, ...).
 struct Companions {
   const uint8_t* rgb;  // or null
@@ -121,17 +124,17 @@ struct Output {
 
 // Write the points of one image row, run by run: within a run there is nothing to decide. `runs` has room for a row's.
 void write_row(const Images& images, int64_t row, const uint8_t* keep, const double* matrices, const Output& out,
-               Run* runs) {
+               rows::Run* runs) {
   const float* depth = images.row_depth(row);
   const int64_t first_pixel = row * images.width;
   const int64_t first_index = (out.over_all_views ? row : row % images.height) * images.width;
-  const int64_t num_runs = find_runs(keep, 0, images.width, runs);
+  const int64_t num_runs = rows::find_runs(keep, 0, images.width, runs);
   images.with_moved_points_of_row(row, matrices, [&](const auto& point) {
     int64_t next = out.starts[row];
     for (int64_t r = 0; r < num_runs; ++r) {
       const int64_t start = runs[r].start, length = runs[r].length;
       for (int64_t i = 0; i < length; ++i) {
-        const Point p = point(start + i, depth[start + i]);
+        const math::Point p = point(start + i, depth[start + i]);
         out.points[3 * (next + i)] = p.x;
         out.points[3 * (next + i) + 1] = p.y;
         out.points[3 * (next + i) + 2] = p.z;
@@ -144,35 +147,31 @@ void write_row(const Images& images, int64_t row, const uint8_t* keep, const dou
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::images
 
-// Which pixels of depth (views, height, width) become points: keep (views, height, width) becomes 1 there. A pixel does
-// if its depth is positive, within [near, far], inside the mask, and its point, moved by the matrix of its view, inside
-// the box lower, upper (3,); the last three may be null. The rays are described at `Images`. Also counted: readings
-// (views,) are the pixels that the box decided about, and starts (views * height + 1,) where the points of each image row
-// start. *possible becomes 0, and nothing else is certain, if a depth is negative or not a number, or if a reading has no
-// ray or no finite point.
 PC_EXPORT int32_t pc_choose_pixels(const pc_context* context, const float* depth, int64_t views, int64_t height,
                                    int64_t width, const float* column_rays, const float* row_rays, const float* rays,
                                    double near, double far, const uint8_t* mask, const double* matrices,
                                    const float* lower, const float* upper, uint8_t* keep, int64_t* readings,
                                    int64_t* starts, int64_t* possible) {
-  return pc::guarded([&] {
-    const pc::Images images{depth, views, height, width, column_rays, row_rays, rays};
-    pc::Box box{};
+  using namespace pc;
+  using namespace pc::images;
+  return guarded([&] {
+    const Images images{depth, views, height, width, column_rays, row_rays, rays};
+    math::CropBox box{};
     for (int axis = 0; axis < 3 && lower != nullptr; ++axis) {
       box.lower[axis] = lower[axis];
       box.upper[axis] = upper[axis];
     }
-    const pc::Choice choice{static_cast<float>(near), static_cast<float>(far), mask, matrices,
+    const Choice choice{static_cast<float>(near), static_cast<float>(far), mask, matrices,
                             lower == nullptr ? nullptr : &box};
-    pc::ScratchFrame scratch;
+    ScratchFrame scratch;
     auto* row_readings = scratch.take<int64_t>(images.rows());
     std::atomic<bool> all_possible{true};
-    pc::parallel_for(*context, images.rows(), pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+    parallel_for(*context, images.rows(), kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       for (int64_t row = first; row < last; ++row) {
         uint8_t* own = keep + row * width;
-        row_readings[row] = pc::choose_row(images, row, choice, own);
+        row_readings[row] = choose_row(images, row, choice, own);
         if (row_readings[row] < 0) all_possible.store(false, std::memory_order_relaxed);
         int64_t kept = 0;
         for (int64_t u = 0; u < width; ++u) kept += own[u];
@@ -189,32 +188,33 @@ PC_EXPORT int32_t pc_choose_pixels(const pc_context* context, const float* depth
   });
 }
 
-// The pixels that pc_choose_pixels kept -> points (M, 3) moved by the matrices, pixel_index (M,), and the rows of the
-// companions. Takes its rays and matrices.
 PC_EXPORT int32_t pc_deproject(const pc_context* context, const float* depth, int64_t views, int64_t height,
                                int64_t width, const float* column_rays, const float* row_rays, const float* rays,
                                const double* matrices, const uint8_t* keep, const int64_t* starts, float* points,
                                int64_t* pixel_index, int64_t over_all_views, const uint8_t* rgb, float* colors,
                                int64_t num_copied, const int64_t* sources, const int64_t* pixel_bytes,
                                const int64_t* copies) {
-  return pc::guarded([&] {
-    const pc::Images images{depth, views, height, width, column_rays, row_rays, rays};
-    const pc::Output out{starts, points, pixel_index, over_all_views != 0,
+  using namespace pc;
+  using namespace pc::images;
+  return guarded([&] {
+    const Images images{depth, views, height, width, column_rays, row_rays, rays};
+    const Output out{starts, points, pixel_index, over_all_views != 0,
                          {rgb, colors, num_copied, sources, pixel_bytes, copies}};
-    pc::parallel_for(*context, images.rows(), pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      std::vector<pc::Run> runs(static_cast<size_t>(width + 1) / 2 + 1);
+    parallel_for(*context, images.rows(), kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      std::vector<rows::Run> runs(static_cast<size_t>(width + 1) / 2 + 1);
       for (int64_t row = first; row < last; ++row)
-        pc::write_row(images, row, keep + row * width, matrices, out, runs.data());
+        write_row(images, row, keep + row * width, matrices, out, runs.data());
     });
   });
 }
 
-// masked (count,) = depth where it is positive, within [near, far] and inside the mask, which may be null; 0 elsewhere.
 PC_EXPORT int32_t pc_mask_depth(const pc_context* context, const float* depth, int64_t count, double near, double far,
                                 const uint8_t* mask, float* masked) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::images;
+  return guarded([&] {
     const float low = static_cast<float>(near), high = static_cast<float>(far);
-    pc::parallel_for(*context, count, 1 << 16, [&](int64_t first, int64_t last, int64_t) {
+    parallel_for(*context, count, 1 << 16, [&](int64_t first, int64_t last, int64_t) {
       for (int64_t i = first; i < last; ++i) {
         const float z = depth[i];
         const bool keep = (z > 0) & (z >= low) & (z <= high) & (mask == nullptr || mask[i] != 0);

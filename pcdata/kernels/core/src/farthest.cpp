@@ -1,7 +1,7 @@
 // Farthest point sampling of ragged batches.
 #include "pc/sampling/farthest.hpp"
 
-namespace pc {
+namespace pc::sampling {
 namespace {
 
 constexpr int64_t kGroupsPerPiece = 32;
@@ -16,17 +16,17 @@ struct Task {
   int64_t taken;
 };
 
-void start(Task& task, SpatialSort& sort) {
+void start(Task& task, sort::MortonPoints& sort) {
   FarthestSampler& sampler = task.sampler;
   sort.serial(sampler.points(), sampler.count(), task.room,
-              [&](const Placed* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+              [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   sampler.start_leaf_groups(0, sampler.num_leaf_groups());
   sampler.start_levels();
 }
 
-void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, SpatialSort& sort) {
+void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, sort::MortonPoints& sort) {
   sort.parallel(context, scratch, sampler.points(), sampler.count(),
-                [&](const Placed* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+                [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
   sampler.start_levels();
@@ -43,7 +43,7 @@ void sample(const pc_context& context, const float* points, const int64_t* ptr, 
     open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), room, picks, wanted[cloud], 0});
     room += count;
   }
-  SpatialSort sort(scratch, room);
+  sort::MortonPoints sort(scratch, room);
   if (open.size() == 1)
     start_in_parallel(context, scratch, open[0].sampler, sort);
   else
@@ -59,11 +59,11 @@ void sample(const pc_context& context, const float* points, const int64_t* ptr, 
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::sampling
 
-// points (N, 3); ptr, (num_clouds+1,); wanted (num_clouds,), at most the points there are; picks (sum of wanted,): rows
-// within each pick's own cloud. A cloud holds less than 2^31 points.
 PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
                                      int64_t num_clouds, const int64_t* wanted, int64_t* picks) {
-  return pc::guarded([&] { pc::sample(*context, points, ptr, num_clouds, wanted, picks); });
+  using namespace pc;
+  using namespace pc::sampling;
+  return guarded([&] { sample(*context, points, ptr, num_clouds, wanted, picks); });
 }

@@ -1,14 +1,10 @@
 // What the system should know about large results.
-#include "pc/common.hpp"
+#include "pc/threads.hpp"
 
 #ifdef __linux__
 #include <sys/mman.h>
 #endif
 
-// Ask for huge pages in blocks that are about to be filled: a page fault costs more than filling its 4 KB, and a huge
-// page takes one for 2 MB. Advice only, content stays. The huge pages at both ends count as well, or blocks of a few
-// megabytes, one behind the other in the heap, would get half of theirs: what else lies there is already in memory, and
-// stays as it is, or is free.
 PC_EXPORT int32_t pc_advise_huge_pages(const pc_context*, int64_t count, const int64_t* addresses,
                                        const int64_t* bytes) {
   return pc::guarded([&] {

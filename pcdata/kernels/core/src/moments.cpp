@@ -1,11 +1,11 @@
 // Sums over chosen points, for the least-squares plane through them.
-#include "pc/pieces.hpp"
 #include "pc/planes/plane_sums.hpp"
+#include "pc/threads.hpp"
 
-namespace pc {
+namespace pc::planes {
 namespace {
 
-constexpr int64_t kPiece = 8192;  // points summed on their own; pieces are added in order
+constexpr int64_t kSummedPiece = 8192;  // points summed on their own; pieces are added in order
 constexpr int kBlock = 512;       // points with one array per coordinate at a time
 
 typedef float Float8 __attribute__((vector_size(32)));
@@ -18,7 +18,7 @@ struct Sums {
 };
 
 // Add the chosen points of [begin, end), at most kBlock.
-void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t end, const double* centre, Sums& sums) {
+void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t end, const double* center, Sums& sums) {
   alignas(64) float axes[3][kBlock];
   alignas(64) int64_t taken[kBlock];  // all ones where chosen
   const int count = static_cast<int>(end - begin);
@@ -41,7 +41,7 @@ void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t 
     const auto mine = load<Long8>(taken + i);
     Double8 offset[3];
     for (int axis = 0; axis < 3; ++axis) {
-      const Double8 value = __builtin_convertvector(load<Float8>(axes[axis] + i), Double8) - centre[axis];
+      const Double8 value = __builtin_convertvector(load<Float8>(axes[axis] + i), Double8) - center[axis];
       offset[axis] = reinterpret_cast<Double8>(reinterpret_cast<Long8>(value) & mine);
     }
     sums.moments.add(offset[0], offset[1], offset[2]);
@@ -49,28 +49,26 @@ void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t 
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::planes
 
-// points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centres (num_clouds, 3) -> sums (num_clouds, 11) over the
-// chosen points of each cloud, with p their offsets from its centre: count, largest absolute coordinate, x, y, z, xx, xy,
-// xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every eighth
-// point of a piece, and pieces are added in order.
 PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                             const uint8_t* mask, const double* centres, double* sums) {
-  return pc::guarded([&] {
-    const auto pieces = pc::cut_clouds(ptr, num_clouds, pc::kPiece);
-    std::vector<pc::Sums> found(pieces.size());
-    pc::for_each_piece(*context, pieces, pc::kPiece, [&](const pc::CloudPiece& piece, int64_t number) {
-      pc::Sums own;
-      for (int64_t first = piece.begin; first < piece.end; first += pc::kBlock)
-        pc::add_block(points, mask, first, std::min<int64_t>(piece.end, first + pc::kBlock), centres + 3 * piece.cloud,
+                             const uint8_t* mask, const double* centers, double* sums) {
+  using namespace pc;
+  using namespace pc::planes;
+  return guarded([&] {
+    const auto pieces = cut_clouds(ptr, num_clouds, kSummedPiece);
+    std::vector<Sums> found(pieces.size());
+    for_each_piece(*context, pieces, kSummedPiece, [&](const CloudPiece& piece, int64_t number) {
+      Sums own;
+      for (int64_t first = piece.begin; first < piece.end; first += kBlock)
+        add_block(points, mask, first, std::min<int64_t>(piece.end, first + kBlock), centers + 3 * piece.cloud,
                       own);
       found[static_cast<size_t>(number)] = own;
     });
     std::fill_n(sums, 11 * num_clouds, 0.0);
     for (size_t p = 0; p < pieces.size(); ++p) {
-      const pc::PlaneMoments& m = found[p].moments;
-      const pc::Double8 lanes[9] = {m.x, m.y, m.z, m.xx, m.xy, m.xz, m.yy, m.yz, m.zz};
+      const PlaneMoments& m = found[p].moments;
+      const Double8 lanes[9] = {m.x, m.y, m.z, m.xx, m.xy, m.xz, m.yy, m.yz, m.zz};
       double* to = sums + 11 * pieces[p].cloud;
       float largest;
       std::memcpy(&largest, &found[p].largest, 4);

@@ -1,10 +1,11 @@
-// Nearest neighbours and neighbours within a radius, exact, on ragged batches.
+// Nearest neighbors and neighbors within a radius, exact, on ragged batches.
 #include "pc/neighbors/batch_search.hpp"
+#include "pc/neighbors/nearest_keys.hpp"
 
-namespace pc {
+namespace pc::neighbors {
 namespace {
 
-// Writes neighbours ascending by (squared distance, row); missing ones are (num_points, infinity).
+// Writes neighbors ascending by (squared distance, row); missing ones are (num_points, infinity).
 struct WriteNeighbors {
   int64_t k, num_points;
   int64_t* index;   // (Q, k)
@@ -13,7 +14,7 @@ struct WriteNeighbors {
 
   template <class Search, class Nearest>
   void operator()(const Search& search, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) const {
-    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+    for (PackMask left = group.active; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       const int64_t query = row[lane];
       int64_t found = 0;
@@ -37,7 +38,7 @@ struct WriteNearest {
   void operator()(const Search&, const QueryGroup& group, const NearestDistances& nearest, const uint32_t* row) const {
     alignas(64) float value[kQueries];
     nearest.squared(0).store(value);
-    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+    for (PackMask left = group.active; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       squared[row[lane]] = value[lane];
     }
@@ -55,14 +56,14 @@ void find_neighbors(const pc_context& context, float limit, const Clouds& clouds
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::neighbors
 
-// queries null: the points; pixel null: no grid; neighbours have d2 <= limit; count may be null.
 PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
                                const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
                                float* distance, int64_t* count) {
   using namespace pc;
+  using namespace pc::neighbors;
   return guarded([&] {
     const Grid grid{pixel, width, camera};
     const Clouds clouds{points, ptr, num_clouds}, from{queries, queries_ptr, num_clouds};
@@ -73,11 +74,11 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
   });
 }
 
-// squared (Q,) float: from every query to the nearest point of its cloud.
 PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,
                                      int64_t num_clouds, const float* queries, const int64_t* queries_ptr,
                                      float* squared) {
   using namespace pc;
+  using namespace pc::neighbors;
   return guarded([&] {
     const WriteNearest task{squared};
     BatchSearch<NearestDistances, WriteNearest>(*context, 1, kInfinity, task)

@@ -1,10 +1,11 @@
 // Surface normals from the covariance of the nearest points within a radius.
 //
 // Source: Hoppe et al., Surface reconstruction from unorganized points, 1992.
-#include "pc/math/eigen.hpp"
+#include "pc/math/normal.hpp"
 #include "pc/neighbors/batch_search.hpp"
+#include "pc/neighbors/nearest_keys.hpp"
 
-namespace pc {
+namespace pc::neighbors {
 namespace {
 
 // The search finds only the k-th distance. A second look at its candidates sums the moments of those that are no
@@ -16,20 +17,20 @@ class WriteNormals {
 
   template <class Search, class Nearest>
   void operator()(const Search& search, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) {
-    const Floats kth = nearest.bound();
-    const Doubles query_x = widen(group.x), query_y = widen(group.y), query_z = widen(group.z);
+    const FloatPack kth = nearest.bound();
+    const DoublePack query_x = widen(group.x), query_y = widen(group.y), query_z = widen(group.z);
     Sums sums;
     tied_.clear();
-    search.replay(group, kth, [&](const Floats& x, const Floats& y, const Floats& z, uint32_t id) {
-      const Floats squared = squared_length(x - group.x, y - group.y, z - group.z);
-      const LaneMask reached = less_equal(squared, kth) & group.active;
+    search.replay(group, kth, [&](const FloatPack& x, const FloatPack& y, const FloatPack& z, uint32_t id) {
+      const FloatPack squared = squared_length(x - group.x, y - group.y, z - group.z);
+      const PackMask reached = less_equal(squared, kth) & group.active;
       if (reached == 0) return;
       sums.add(reached, widen(x) - query_x, widen(y) - query_y, widen(z) - query_z);
-      if (const LaneMask tied = reached & ~less(squared, kth)) tied_.push_back({x, y, z, tied, id});
+      if (const PackMask tied = reached & ~less(squared, kth)) tied_.push_back({x, y, z, tied, id});
     });
     alignas(64) double sum[kSums][kQueries];
     sums.store(sum);
-    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+    for (PackMask left = group.active; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       if (sum[0][lane] > static_cast<double>(k_)) take_out_surplus(search, group, lane, sum);
     }
@@ -41,12 +42,12 @@ class WriteNormals {
   static constexpr int kSums = 10;
 
   struct Sums {
-    Floats count{0.0f};  // whole and small: exact
-    Doubles x{0.0}, y{0.0}, z{0.0}, xx{0.0}, xy{0.0}, xz{0.0}, yy{0.0}, yz{0.0}, zz{0.0};
+    FloatPack count{0.0f};  // whole and small: exact
+    DoublePack x{0.0}, y{0.0}, z{0.0}, xx{0.0}, xy{0.0}, xz{0.0}, yy{0.0}, yz{0.0}, zz{0.0};
 
-    void add(LaneMask mask, const Doubles& all_dx, const Doubles& all_dy, const Doubles& all_dz) {
-      const Doubles dx = keep(mask, all_dx), dy = keep(mask, all_dy), dz = keep(mask, all_dz);
-      count = count + keep(mask, Floats(1.0f));
+    void add(PackMask mask, const DoublePack& all_dx, const DoublePack& all_dy, const DoublePack& all_dz) {
+      const DoublePack dx = keep(mask, all_dx), dy = keep(mask, all_dy), dz = keep(mask, all_dz);
+      count = count + keep(mask, FloatPack(1.0f));
       x = x + dx;
       y = y + dy;
       z = z + dz;
@@ -58,15 +59,15 @@ class WriteNormals {
       zz = zz + dz * dz;
     }
     void store(double (&to)[kSums][kQueries]) const {
-      const Doubles all[kSums] = {widen(count), x, y, z, xx, xy, xz, yy, yz, zz};
+      const DoublePack all[kSums] = {widen(count), x, y, z, xx, xy, xz, yy, yz, zz};
       for (int s = 0; s < kSums; ++s) all[s].store(to[s]);
     }
   };
 
   // A candidate at the k-th distance in some lanes.
   struct Tied {
-    Floats x, y, z;
-    LaneMask lanes;
+    FloatPack x, y, z;
+    PackMask lanes;
     uint32_t id;
   };
 
@@ -86,21 +87,21 @@ class WriteNormals {
     }
   }
 
-  void write(const double (&sum)[kSums][kQueries], LaneMask active, const uint32_t* row) {
+  void write(const double (&sum)[kSums][kQueries], PackMask active, const uint32_t* row) {
     alignas(64) double normal[3][kQueries];
     for (int i = 0; i < kQueries; ++i) {
-      const Vector3 n = normal_of(at(sum, i));
+      const math::Vector3 n = math::normal_of(at(sum, i));
       normal[0][i] = n.x;
       normal[1][i] = n.y;
       normal[2][i] = n.z;
     }
-    for (LaneMask left = active; left != 0; left &= left - 1) {
+    for (PackMask left = active; left != 0; left &= left - 1) {
       const int i = __builtin_ctz(left);
       for (int axis = 0; axis < 3; ++axis) normals_[3 * int64_t{row[i]} + axis] = static_cast<float>(normal[axis][i]);
     }
   }
 
-  static Moments at(const double (&sum)[kSums][kQueries], int i) {
+  static math::Moments at(const double (&sum)[kSums][kQueries], int i) {
     return {sum[0][i], sum[1][i], sum[2][i], sum[3][i], {sum[4][i], sum[5][i], sum[6][i], sum[7][i], sum[8][i], sum[9][i]}};
   }
 
@@ -118,13 +119,13 @@ void estimate(const pc_context& context, const Clouds& clouds, const Grid* grid,
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::neighbors
 
-// normals (N, 3) float; neighbours have d2 <= limit; pixel null: no grid.
 PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              int64_t max_neighbors, double limit, const int64_t* pixel, int64_t width,
                              const double* camera, float* normals) {
   using namespace pc;
+  using namespace pc::neighbors;
   return guarded([&] {
     const Grid grid{pixel, width, camera};
     const auto run = max_neighbors <= NearestDistances::kMax ? estimate<NearestDistances> : estimate<NearestMany>;

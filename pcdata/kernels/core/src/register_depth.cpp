@@ -1,34 +1,36 @@
-// Depth images rendered as colour cameras see them: project every reading, paint its cell into a z-buffer, and say
-// which readings the colour camera does not see. The float32 operations are the reference's, in its order.
+// Depth images rendered as color cameras see them: project every reading, paint its cell into a z-buffer, and say
+// which readings the color camera does not see. The float32 operations are the reference's, in its order.
 #include <cmath>
+#include <cstring>
 #include <limits>
 
-#include "pc/common.hpp"
 #include "pc/images/projection.hpp"
+#include "pc/memory.hpp"
+#include "pc/threads.hpp"
 
-namespace pc {
+namespace pc::images {
 namespace {
 
-constexpr int64_t kRowsPerPiece = 64;  // of the depth image: two more are projected for every piece
+constexpr int64_t kDepthRowsPerPiece = 64;  // of the depth image: two more are projected for every piece
 constexpr int64_t kPixelsPerPiece = 1 << 16;
 constexpr uint64_t kEmpty = ~uint64_t{0};  // as an index: -1
 
 // The corners above or below a row of pixels, outer ones included; each (width + 1,).
-struct Corners {
+struct CellCorners {
   float *u, *v;
   int32_t* linked;  // the four pixels around lie on one surface
 
   static constexpr int64_t kArrays = 3;
-  Corners(float* room, int64_t width)
+  CellCorners(float* room, int64_t width)
       : u(room), v(room + (width + 1)), linked(reinterpret_cast<int32_t*>(room + 2 * (width + 1))) {}
 };
 
-// The colour pixels that a row of depth pixels covers, ends excluded; each (width,).
-struct Cells {
+// The color pixels that a row of depth pixels covers, ends excluded; each (width,).
+struct PixelCells {
   int32_t *left, *right, *top, *bottom;
 
   static constexpr int64_t kArrays = 4;
-  Cells(int32_t* room, int64_t width)
+  PixelCells(int32_t* room, int64_t width)
       : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
 };
 
@@ -42,7 +44,7 @@ void average(const float* __restrict above, const float* __restrict below, int64
 }
 
 // The corners between two rows of pixels; the outer ones keep what they are, not linked.
-void link(const Seen& seen_above, const Seen& seen_below, int64_t width, float max_jump, const Corners& corners) {
+void link(const ProjectedRow& seen_above, const ProjectedRow& seen_below, int64_t width, float max_jump, const CellCorners& corners) {
   average(seen_above.u, seen_below.u, width, corners.u + 1);
   average(seen_above.v, seen_below.v, width, corners.v + 1);
   const float* __restrict above = seen_above.reading;
@@ -57,7 +59,7 @@ void link(const Seen& seen_above, const Seen& seen_below, int64_t width, float m
 
 // One coordinate's ends of a row of cells, from the corners above and below, cut to [0, limit).
 void cut_cells(const float* __restrict center, const float* __restrict half, const float* __restrict above,
-               const float* __restrict below, const Corners& upper_corners, const Corners& lower_corners, int64_t width,
+               const float* __restrict below, const CellCorners& upper_corners, const CellCorners& lower_corners, int64_t width,
                int64_t limit, int32_t* __restrict first, int32_t* __restrict end) {
   constexpr float kInfinity = std::numeric_limits<float>::infinity();
   const float most = static_cast<float>(limit);
@@ -82,7 +84,7 @@ void cut_cells(const float* __restrict center, const float* __restrict half, con
   }
 }
 
-// The nearest reading of every colour pixel so far: the bits of its depth, which are ordered as positive floats are,
+// The nearest reading of every color pixel so far: the bits of its depth, which are ordered as positive floats are,
 // above its index. The smallest stays, so the order of painting does not matter.
 struct ZBuffer {
   uint64_t* nearest;
@@ -99,7 +101,7 @@ struct ZBuffer {
            !__atomic_compare_exchange_n(pixel, &found, key, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
     }
   }
-  void paint_row(const Seen& seen, const Cells& cells, int64_t count, uint64_t first_index) const {
+  void paint_row(const ProjectedRow& seen, const PixelCells& cells, int64_t count, uint64_t first_index) const {
     for (int64_t i = 0; i < count; ++i) {
       if (!(seen.reading[i] > 0)) continue;
       uint32_t bits;
@@ -112,52 +114,52 @@ struct ZBuffer {
 };
 
 // What one thread needs for its rows: two of pixels and two of corners at a time, which stay in the cache.
-struct Room {
-  Seen seen[2];
-  Corners corners[2];
-  Cells cells;
+struct RowBuffers {
+  ProjectedRow seen[2];
+  CellCorners corners[2];
+  PixelCells cells;
 
-  static int64_t size(int64_t width) { return cells_start(width) + Cells::kArrays * width; }
-  Room(float* room, int64_t width)
-      : seen{{room, width}, {room + Seen::kArrays * width, width}},
+  static int64_t size(int64_t width) { return cells_start(width) + PixelCells::kArrays * width; }
+  RowBuffers(float* room, int64_t width)
+      : seen{{room, width}, {room + ProjectedRow::kArrays * width, width}},
         corners{{room + corners_start(width), width},
-                {room + corners_start(width) + Corners::kArrays * (width + 1), width}},
+                {room + corners_start(width) + CellCorners::kArrays * (width + 1), width}},
         cells(reinterpret_cast<int32_t*>(room + cells_start(width)), width) {}
 
  private:
-  static int64_t corners_start(int64_t width) { return 2 * Seen::kArrays * width; }
-  static int64_t cells_start(int64_t width) { return corners_start(width) + 2 * Corners::kArrays * (width + 1); }
+  static int64_t corners_start(int64_t width) { return 2 * ProjectedRow::kArrays * width; }
+  static int64_t cells_start(int64_t width) { return corners_start(width) + 2 * CellCorners::kArrays * (width + 1); }
 };
 
 // Paint the rows [first, last) of a view. Returns false where `project` does.
-bool paint_rows(const View& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer,
-                const Room& room) {
+bool paint_rows(const DepthView& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer,
+                const RowBuffers& own) {
   const int64_t width = view.width;
   bool possible = true;
-  for (const Corners& corners : room.corners) std::fill_n(corners.linked, width + 1, 0);
+  for (const CellCorners& corners : own.corners) std::fill_n(corners.linked, width + 1, 0);
   if (first > 0) {
-    possible &= project(view, first - 1, room.seen[(first - 1) & 1]);
-    possible &= project(view, first, room.seen[first & 1]);
-    link(room.seen[(first - 1) & 1], room.seen[first & 1], width, max_jump, room.corners[(first - 1) & 1]);
+    possible &= project(view, first - 1, own.seen[(first - 1) & 1]);
+    possible &= project(view, first, own.seen[first & 1]);
+    link(own.seen[(first - 1) & 1], own.seen[first & 1], width, max_jump, own.corners[(first - 1) & 1]);
   } else {
-    possible &= project(view, 0, room.seen[0]);
+    possible &= project(view, 0, own.seen[0]);
   }
   for (int64_t row = first; row < last; ++row) {
-    const Seen& seen = room.seen[row & 1];
-    const Corners& above = room.corners[(row - 1) & 1];
-    const Corners& below = room.corners[row & 1];
+    const ProjectedRow& seen = own.seen[row & 1];
+    const CellCorners& above = own.corners[(row - 1) & 1];
+    const CellCorners& below = own.corners[row & 1];
     if (row + 1 < view.height) {
-      possible &= project(view, row + 1, room.seen[(row + 1) & 1]);
-      link(seen, room.seen[(row + 1) & 1], width, max_jump, below);
+      possible &= project(view, row + 1, own.seen[(row + 1) & 1]);
+      link(seen, own.seen[(row + 1) & 1], width, max_jump, below);
     } else {
       std::fill_n(below.linked, width + 1, 0);
     }
     if (!possible) return false;
-    cut_cells(seen.u, seen.half_width, above.u, below.u, above, below, width, buffer.width, room.cells.left,
-              room.cells.right);
-    cut_cells(seen.v, seen.half_height, above.v, below.v, above, below, width, buffer.height, room.cells.top,
-              room.cells.bottom);
-    buffer.paint_row(seen, room.cells, width, static_cast<uint64_t>(row * width));
+    cut_cells(seen.u, seen.half_width, above.u, below.u, above, below, width, buffer.width, own.cells.left,
+              own.cells.right);
+    cut_cells(seen.v, seen.half_height, above.v, below.v, above, below, width, buffer.height, own.cells.top,
+              own.cells.bottom);
+    buffer.paint_row(seen, own.cells, width, static_cast<uint64_t>(row * width));
   }
   return true;
 }
@@ -172,14 +174,14 @@ void read_keys(uint64_t* __restrict keys, float* __restrict depth, int64_t first
   }
 }
 
-// Say which readings of a row the colour camera does not see, and where a nearer surface is why.
-void find_hidden(const View& view, int64_t row, const float* registered, int64_t color_height, int64_t color_width,
-                 float farthest, const Room& room, uint8_t* hidden, uint8_t* occluding) {
-  const Seen& seen = room.seen[0];
+// Say which readings of a row the color camera does not see, and where a nearer surface is why.
+void find_hidden(const DepthView& view, int64_t row, const float* registered, int64_t color_height, int64_t color_width,
+                 float farthest, const RowBuffers& own, uint8_t* hidden, uint8_t* occluding) {
+  const ProjectedRow& seen = own.seen[0];
   project(view, row, seen);
   const float* depth = view.depth + row * view.width;
-  int32_t* __restrict columns = room.cells.left;
-  int32_t* __restrict rows = room.cells.top;
+  int32_t* __restrict columns = own.cells.left;
+  int32_t* __restrict rows = own.cells.top;
   const float* __restrict seen_u = seen.u;
   const float* __restrict seen_v = seen.v;
   const float* __restrict reading = seen.reading;
@@ -203,31 +205,28 @@ void find_hidden(const View& view, int64_t row, const float* registered, int64_t
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::images
 
-// Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of
-// that shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels.
-// Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null.
-// *possible becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be
-// computed with.
 PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
                                     int64_t width, const float* column_rays, const float* row_rays, const float* rays,
                                     const double* color_from_depth, const double* color_intrinsics,
                                     const double* half_pixels, const double* lenses, int64_t color_height,
                                     int64_t color_width, double max_jump, float* registered, int64_t* pixel_index,
                                     uint8_t* occluding, uint8_t* hidden, int64_t* possible) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::images;
+  return guarded([&] {
     const int64_t pixels = height * width, color_pixels = color_height * color_width;
     const int64_t threads = std::max<int64_t>(1, context->threads);
     const float jump = static_cast<float>(max_jump), farthest = static_cast<float>(1 + max_jump);
-    pc::ScratchFrame scratch;
-    std::vector<pc::Room> rooms;
-    for (int64_t t = 0; t < threads; ++t) rooms.emplace_back(scratch.take<float>(pc::Room::size(width)), width);
+    ScratchFrame scratch;
+    std::vector<RowBuffers> rows_of_threads;
+    for (int64_t t = 0; t < threads; ++t) rows_of_threads.emplace_back(scratch.take<float>(RowBuffers::size(width)), width);
     std::atomic<bool> all_possible{true};
     for (int64_t number = 0; number < views && all_possible; ++number) {
-      pc::Lens lens{};
+      math::Lens lens{};
       if (lenses != nullptr) std::memcpy(&lens, lenses + 13 * number, sizeof(lens));
-      pc::View view{depth + number * pixels, height, width};
+      DepthView view{depth + number * pixels, height, width};
       if (rays != nullptr) {
         view.rays = rays + 2 * number * pixels;
       } else {
@@ -240,20 +239,20 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
       float* image = registered + number * color_pixels;
       auto* keys = reinterpret_cast<uint64_t*>(pixel_index + number * color_pixels);
       uint8_t* marks = occluding + number * color_pixels;
-      const pc::ZBuffer buffer{keys, color_height, color_width, threads > 1};
-      pc::parallel_for(*context, color_pixels, pc::kPixelsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-        std::fill(keys + first, keys + last, pc::kEmpty);
+      const ZBuffer buffer{keys, color_height, color_width, threads > 1};
+      parallel_for(*context, color_pixels, kPixelsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+        std::fill(keys + first, keys + last, kEmpty);
         std::fill(marks + first, marks + last, uint8_t{0});
       });
-      pc::parallel_for(*context, height, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
-        if (!pc::paint_rows(view, first, last, jump, buffer, rooms[static_cast<size_t>(thread)]))
+      parallel_for(*context, height, kDepthRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
+        if (!paint_rows(view, first, last, jump, buffer, rows_of_threads[static_cast<size_t>(thread)]))
           all_possible.store(false, std::memory_order_relaxed);
       });
-      pc::parallel_for(*context, color_pixels, pc::kPixelsPerPiece,
-                       [&](int64_t first, int64_t last, int64_t) { pc::read_keys(keys, image, first, last); });
-      pc::parallel_for(*context, height, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
+      parallel_for(*context, color_pixels, kPixelsPerPiece,
+                       [&](int64_t first, int64_t last, int64_t) { read_keys(keys, image, first, last); });
+      parallel_for(*context, height, kDepthRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
         for (int64_t row = first; row < last; ++row)
-          pc::find_hidden(view, row, image, color_height, color_width, farthest, rooms[static_cast<size_t>(thread)],
+          find_hidden(view, row, image, color_height, color_width, farthest, rows_of_threads[static_cast<size_t>(thread)],
                           hidden + number * pixels + row * width, marks);
       });
     }

@@ -1,10 +1,11 @@
 // Picking rows of many fields at once: by index, or by a mask that keeps their order.
+#include <cstring>
 #include <type_traits>
 
-#include "pc/common.hpp"
 #include "pc/rows/runs.hpp"
+#include "pc/threads.hpp"
 
-namespace pc {
+namespace pc::rows {
 namespace {
 
 constexpr int64_t kRowsPerPiece = 16384;
@@ -51,47 +52,50 @@ void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_run
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::rows
 
-// mask (rows,) -> starts (pieces + 1,): the true rows before each piece of 16384 rows, and their number.
 PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
     starts[0] = 0;
-    pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+    parallel_for(*context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       int64_t kept = 0;
       for (int64_t row = first; row < last; ++row) kept += mask[row] != 0;
-      starts[first / pc::kRowsPerPiece + 1] = kept;
+      starts[first / kRowsPerPiece + 1] = kept;
     });
-    const int64_t pieces = (rows + pc::kRowsPerPiece - 1) / pc::kRowsPerPiece;
+    const int64_t pieces = (rows + kRowsPerPiece - 1) / kRowsPerPiece;
     for (int64_t piece = 0; piece < pieces; ++piece) starts[piece + 1] += starts[piece];
   });
 }
 
-// Copy the rows where the mask is true; starts are those of pc_count_kept.
 PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked) {
-  return pc::guarded([&] {
-    const pc::Fields fields{num_fields, sources, row_bytes, picked};
-    pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      pc::Run runs[pc::kRowsPerPiece / 2];
-      const int64_t num_runs = pc::find_runs(mask, first, last, runs);
-      const int64_t start = starts[first / pc::kRowsPerPiece];
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
+    const Fields fields{num_fields, sources, row_bytes, picked};
+    parallel_for(*context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      Run runs[kRowsPerPiece / 2];
+      const int64_t num_runs = find_runs(mask, first, last, runs);
+      const int64_t start = starts[first / kRowsPerPiece];
       fields.each([&](const char* source, int64_t row_size, char* to) {
-        pc::with_row_size(row_size, [&](auto bytes) { pc::copy_runs(source, bytes, runs, num_runs, to + start * bytes); });
+        with_row_size(row_size, [&](auto bytes) { copy_runs(source, bytes, runs, num_runs, to + start * bytes); });
       });
     });
   });
 }
 
-// Copy the rows index (num_picked,) of `rows`; *possible becomes 0, and nothing is certain, if one lies outside.
 PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, int64_t num_picked, int64_t rows,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked, int64_t* possible) {
-  return pc::guarded([&] {
-    const pc::Fields fields{num_fields, sources, row_bytes, picked};
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
+    const Fields fields{num_fields, sources, row_bytes, picked};
     std::atomic<bool> inside{true};
-    pc::parallel_for(*context, num_picked, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+    parallel_for(*context, num_picked, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       bool wrong = false;
       for (int64_t i = first; i < last; ++i) wrong |= index[i] < 0 || index[i] >= rows;
       if (wrong) {
@@ -99,7 +103,7 @@ PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, 
         return;
       }
       fields.each([&](const char* source, int64_t row_size, char* to) {
-        pc::with_row_size(row_size, [&](auto bytes) {
+        with_row_size(row_size, [&](auto bytes) {
           for (int64_t i = first; i < last; ++i)
             std::memcpy(to + i * bytes, source + index[i] * bytes, static_cast<size_t>(bytes));
         });
@@ -109,15 +113,15 @@ PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, 
   });
 }
 
-// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1] of
-// the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
 PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, const int64_t* counts,
                                 const int64_t* starts, int64_t num_fields, const int64_t* sources,
                                 const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
     const int64_t rows = std::max<int64_t>(1, starts[num_parts] / std::max<int64_t>(1, num_parts));
-    const int64_t parts_per_piece = std::max<int64_t>(1, pc::kRowsPerPiece / rows);
-    pc::parallel_for(*context, num_parts, parts_per_piece, [&](int64_t first, int64_t last, int64_t) {
+    const int64_t parts_per_piece = std::max<int64_t>(1, kRowsPerPiece / rows);
+    parallel_for(*context, num_parts, parts_per_piece, [&](int64_t first, int64_t last, int64_t) {
       for (int64_t part = first; part < last; ++part) {
         for (int64_t field = 0; field < num_fields; ++field) {
           const int64_t bytes = row_bytes[field];

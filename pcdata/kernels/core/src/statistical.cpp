@@ -1,9 +1,10 @@
-// Statistical outliers: the mean distance to the nearest neighbours, and which means are unusual for their cloud.
+// Statistical outliers: the mean distance to the nearest neighbors, and which means are unusual for their cloud.
 //
 // Source: Rusu et al., Towards 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
 #include "pc/neighbors/batch_search.hpp"
+#include "pc/neighbors/nearest_keys.hpp"
 
-namespace pc {
+namespace pc::neighbors {
 namespace {
 
 // Writes the mean distance from each query to its k nearest (fewer, in a smaller cloud), summed nearest first.
@@ -13,16 +14,16 @@ struct MeanDistance {
 
   template <class Search, class Nearest>
   void operator()(const Search&, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) const {
-    Doubles total(0.0), found(0.0);
+    DoublePack total(0.0), found(0.0);
     for (int i = 0; i < k; ++i) {
-      const Floats squared = nearest.squared(i);
-      const LaneMask real = less(squared, Floats(kInfinity));
+      const FloatPack squared = nearest.squared(i);
+      const PackMask real = less(squared, FloatPack(kInfinity));
       total = total + keep(real, square_root(widen(squared)));
-      found = found + keep(real, Doubles(1.0));
+      found = found + keep(real, DoublePack(1.0));
     }
     alignas(64) double value[kQueries];
     (total / found).store(value);
-    for (LaneMask left = group.active; left != 0; left &= left - 1) {
+    for (PackMask left = group.active; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       mean[row[lane]] = value[lane];
     }
@@ -60,22 +61,22 @@ void mean_distances(const pc_context& context, const Clouds& clouds, const Grid*
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::neighbors
 
-// mean (N,) double is working space; outlier (N,) bool. pixel null: no grid.
 PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,
                                           int64_t num_clouds, int64_t num_neighbors, double std_ratio,
                                           const int64_t* pixel, int64_t width, const double* camera, double* mean,
                                           bool* outlier) {
   using namespace pc;
+  using namespace pc::neighbors;
   return guarded([&] {
     const Grid grid{pixel, width, camera};
-    const Grid* organised = pixel == nullptr ? nullptr : &grid;
+    const Grid* organized = pixel == nullptr ? nullptr : &grid;
     const MeanDistance task{num_neighbors, mean};
     if (num_neighbors <= NearestDistances::kMax)
-      mean_distances<NearestDistances>(*context, {points, ptr, num_clouds}, organised, task);
+      mean_distances<NearestDistances>(*context, {points, ptr, num_clouds}, organized, task);
     else
-      mean_distances<NearestMany>(*context, {points, ptr, num_clouds}, organised, task);
+      mean_distances<NearestMany>(*context, {points, ptr, num_clouds}, organized, task);
     parallel_for(*context, num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
       mark_outliers(mean + ptr[b], ptr[b + 1] - ptr[b], std_ratio, outlier + ptr[b]);
     });

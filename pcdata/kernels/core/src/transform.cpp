@@ -2,12 +2,12 @@
 #include <cmath>
 
 #include "pc/math/affine.hpp"
-#include "pc/common.hpp"
+#include "pc/threads.hpp"
 
-namespace pc {
+namespace pc::rows {
 namespace {
 
-constexpr int64_t kRowsPerPiece = 16384;
+constexpr int64_t kPointsPerPiece = 16384;
 
 // Call body(cloud, first, last) for the parts of [first, last) that lie in one cloud each.
 template <class Body>
@@ -21,17 +21,18 @@ void each_cloud(const int64_t* ptr, int64_t num_clouds, int64_t first, int64_t l
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::rows
 
-// moved (N, 3) = matrix (clouds, 4, 4) of each point's cloud @ point, in float64, rounded once.
 PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* points, const int64_t* ptr,
                                       int64_t num_clouds, const double* matrices, float* moved) {
-  return pc::guarded([&] {
-    pc::parallel_for(*context, ptr[num_clouds], pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      pc::each_cloud(ptr, num_clouds, first, last, [&](int64_t cloud, int64_t begin, int64_t end) {
-        const pc::Affine move(matrices + 16 * cloud);
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
+    parallel_for(*context, ptr[num_clouds], kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      each_cloud(ptr, num_clouds, first, last, [&](int64_t cloud, int64_t begin, int64_t end) {
+        const math::Affine move(matrices + 16 * cloud);
         for (int64_t i = begin; i < end; ++i) {
-          const pc::Point p = move({points[3 * i], points[3 * i + 1], points[3 * i + 2]});
+          const math::Point p = move({points[3 * i], points[3 * i + 1], points[3 * i + 2]});
           moved[3 * i] = p.x;
           moved[3 * i + 1] = p.y;
           moved[3 * i + 2] = p.z;
@@ -41,13 +42,13 @@ PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* po
   });
 }
 
-// turned (N, 3) = linear (clouds, 3, 3) of each row's cloud @ direction in float64, divided by its length (by 1e-12 if
-// that is larger), rounded once.
 PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float* directions, const int64_t* ptr,
                                           int64_t num_clouds, const double* linear, float* turned) {
-  return pc::guarded([&] {
-    pc::parallel_for(*context, ptr[num_clouds], pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      pc::each_cloud(ptr, num_clouds, first, last, [&](int64_t cloud, int64_t begin, int64_t end) {
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
+    parallel_for(*context, ptr[num_clouds], kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      each_cloud(ptr, num_clouds, first, last, [&](int64_t cloud, int64_t begin, int64_t end) {
         const double* m = linear + 9 * cloud;
         for (int64_t i = begin; i < end; ++i) {
           const double x = directions[3 * i], y = directions[3 * i + 1], z = directions[3 * i + 2];
@@ -64,18 +65,19 @@ PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float
   });
 }
 
-// inside (N,) becomes 1 where lower <= point <= upper on every axis; *finite 0 if a coordinate is not.
 PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, int64_t rows, const float* lower,
                                 const float* upper, uint8_t* inside, int64_t* finite) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
     std::atomic<bool> all_finite{true};
-    pc::parallel_for(*context, rows, pc::kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      const pc::Box box{{lower[0], lower[1], lower[2]}, {upper[0], upper[1], upper[2]}};
+    parallel_for(*context, rows, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      const math::CropBox box{{lower[0], lower[1], lower[2]}, {upper[0], upper[1], upper[2]}};
       int32_t wrong = 0;
       for (int64_t i = first; i < last; ++i) {
-        const pc::Point p{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+        const math::Point p{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
         inside[i] = box.contains(p);
-        wrong |= !pc::is_finite(p);
+        wrong |= !math::is_finite(p);
       }
       if (wrong != 0) all_finite.store(false, std::memory_order_relaxed);
     });

@@ -1,8 +1,10 @@
-// Finding the rows of blocks by their keys, and packing colours as voxels store them.
-#include "pc/tsdf/grid.hpp"
-#include "pc/voxels/table.hpp"
+// Finding the rows of blocks by their keys, and packing colors as voxels store them.
+#include <algorithm>
 
-namespace pc {
+#include "pc/math/voxel.hpp"
+#include "pc/threads.hpp"
+
+namespace pc::tsdf {
 namespace {
 
 // Rows of blocks by their keys: open addressing, at most half full. A slot holds a row, or -1.
@@ -13,7 +15,7 @@ struct RowTable {
 
   int64_t first(int64_t key) const {
     const int shift = 64 - __builtin_ctzll(static_cast<uint64_t>(num_slots));
-    return static_cast<int64_t>(PackedVoxel::mixed(static_cast<uint64_t>(key)) >> shift);
+    return static_cast<int64_t>(math::PackedVoxel::mixed(static_cast<uint64_t>(key)) >> shift);
   }
   void add(int64_t row) {
     int64_t at = first(keys[row]);
@@ -31,16 +33,16 @@ struct RowTable {
 };
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::tsdf
 
-// Bring a table of rows (num_slots,) up to date, from the first num_known rows of keys (num_blocks,) to all, and look
-// up wanted (num_wanted,): rows (num_wanted,), -1 where there is no block; missing (*count,) are the keys of these.
 PC_EXPORT int32_t pc_tsdf_find(const pc_context*, const int64_t* keys, int64_t num_blocks, int32_t* slots,
                                int64_t num_slots, int64_t num_known, const int64_t* wanted, int64_t num_wanted,
                                int64_t* rows, int64_t* missing, int64_t* count) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
     constexpr int64_t kSlots = 24, kKeys = 12;  // ahead
-    pc::RowTable table{keys, slots, num_slots};
+    RowTable table{keys, slots, num_slots};
     for (int64_t row = num_known; row < num_blocks; ++row) {
       if (row + kSlots < num_blocks) table.prefetch_slot(keys[row + kSlots]);
       table.add(row);
@@ -57,9 +59,10 @@ PC_EXPORT int32_t pc_tsdf_find(const pc_context*, const int64_t* keys, int64_t n
   });
 }
 
-// colors (count, 3) -> packed (count,): r | g << 10 | b << 20, in steps of a stored colour.
 PC_EXPORT int32_t pc_tsdf_pack_colors(const pc_context*, const uint8_t* colors, int64_t count, int32_t* packed) {
-  return pc::guarded([&] {
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
     for (int64_t i = 0; i < count; ++i)
       packed[i] = colors[3 * i] << 2 | colors[3 * i + 1] << 12 | colors[3 * i + 2] << 22;
   });

@@ -3,13 +3,14 @@
 //
 // Eight words of 64 bits hold one property of a block's voxels, one word per z: the corners of all cubes of a slab are
 // words shifted by a voxel, a line or a slab.
+#include "pc/simd.hpp"
+#include "pc/threads.hpp"
 #include "pc/tsdf/walk.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 namespace {
 
-constexpr int64_t kGrain = 64;             // blocks
-constexpr int kSlab = kEdge * kEdge;       // voxels of one z
+constexpr int64_t kBlocksAtATime = 64;             // blocks
 constexpr int64_t kEdges = 3 * kVoxels;    // of a block
 
 // -- what the cubes look up ---------------------------------------------------------------------------------------
@@ -59,7 +60,7 @@ struct Mesh {
 
 void find_signs(const pc_context& context, const SortedBlocks& blocks, const VoxelPlanes& planes, int16_t bound,
                 BlockSigns* signs) {
-  parallel_for(context, blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_for(context, blocks.count, kBlocksAtATime, [&](int64_t begin, int64_t end, int64_t) {
     for (int64_t i = begin; i < end; ++i) {
       const int16_t *tsdf = planes.tsdf.block(blocks.rows[i]), *weight = planes.weight.block(blocks.rows[i]);
       for (int z = 0; z < kEdge; ++z) {
@@ -76,7 +77,7 @@ void find_signs(const pc_context& context, const SortedBlocks& blocks, const Vox
 }
 
 void index_edges(const pc_context& context, int64_t count, const int64_t* edge, int64_t num_edges, BlockEdges* edges) {
-  parallel_for(context, count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_for(context, count, kBlocksAtATime, [&](int64_t begin, int64_t end, int64_t) {
     int64_t row = std::lower_bound(edge, edge + num_edges, begin * kEdges) - edge;
     for (int64_t i = begin; i < end; ++i) {
       BlockEdges block{};
@@ -236,7 +237,7 @@ void write_triangles(const Mesh& mesh, const Octet& places, int64_t* to, uint8_t
 
 template <class Body>
 void each_block(const pc_context& context, const Mesh& mesh, const Body& body) {
-  parallel_for(context, mesh.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_for(context, mesh.blocks.count, kBlocksAtATime, [&](int64_t begin, int64_t end, int64_t) {
     OctetWalk walk(mesh.blocks, begin);
     for (int64_t i = begin; i < end; ++i) {
       Octet places;
@@ -247,52 +248,54 @@ void each_block(const pc_context& context, const Mesh& mesh, const Body& body) {
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::tsdf
 
-// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of a cube's corners must
-// exceed; the edges (num_edges,) of the vertices, rising -> signs (count, 16), edges (count, 32) for the calls below.
 PC_EXPORT int32_t pc_tsdf_index_mesh(const pc_context* context, const int64_t* keys, const int64_t* rows, int64_t count,
                                      const int64_t* const* planes, int64_t bound, const int64_t* edge,
                                      int64_t num_edges, int64_t* signs, int64_t* edges) {
-  static_assert(sizeof(pc::BlockSigns) == 16 * 8 && sizeof(pc::BlockEdges) == 32 * 8);
-  return pc::guarded([&] {
-    pc::find_signs(*context, {keys, rows, count}, pc::VoxelPlanes(planes), static_cast<int16_t>(bound),
-                   reinterpret_cast<pc::BlockSigns*>(signs));
-    pc::index_edges(*context, count, edge, num_edges, reinterpret_cast<pc::BlockEdges*>(edges));
+  using namespace pc;
+  using namespace pc::tsdf;
+  static_assert(sizeof(BlockSigns) == 16 * 8 && sizeof(BlockEdges) == 32 * 8);
+  return guarded([&] {
+    find_signs(*context, {keys, rows, count}, VoxelPlanes(planes), static_cast<int16_t>(bound),
+                   reinterpret_cast<BlockSigns*>(signs));
+    index_edges(*context, count, edge, num_edges, reinterpret_cast<BlockEdges*>(edges));
   });
 }
 
-// The table of cases (257,), (K, 3) -> counts (count,): the triangles of each block.
 PC_EXPORT int32_t pc_tsdf_count_triangles(const pc_context* context, const int64_t* keys, int64_t count,
                                           const int64_t* signs, const int64_t* edges, const int64_t* table,
                                           const int64_t* corners, int64_t* counts) {
-  return pc::guarded([&] {
-    const pc::Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
-    pc::each_block(*context, mesh, [&](int64_t block, const pc::Octet& places) {
-      counts[block] = pc::count_triangles(mesh, places);
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    const Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
+    each_block(*context, mesh, [&](int64_t block, const Octet& places) {
+      counts[block] = count_triangles(mesh, places);
     });
   });
 }
 
-// The same with starts (count + 1,): where each block's triangles go -> triangles (T, 3); used (num_edges,), all zero
-// before: 1 where a vertex is in one.
 PC_EXPORT int32_t pc_tsdf_write_triangles(const pc_context* context, const int64_t* keys, int64_t count,
                                           const int64_t* signs, const int64_t* edges, const int64_t* table,
                                           const int64_t* corners, const int64_t* starts, int64_t* triangles,
                                           uint8_t* used) {
-  return pc::guarded([&] {
-    const pc::Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
-    pc::each_block(*context, mesh, [&](int64_t block, const pc::Octet& places) {
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    const Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
+    each_block(*context, mesh, [&](int64_t block, const Octet& places) {
       if (starts[block] < starts[block + 1])
-        pc::write_triangles(mesh, places, triangles + 3 * starts[block], used);
+        write_triangles(mesh, places, triangles + 3 * starts[block], used);
     });
   });
 }
 
-// Number (count,) entries anew, in place.
 PC_EXPORT int32_t pc_tsdf_renumber(const pc_context* context, int64_t* entries, int64_t count, const int64_t* number) {
-  return pc::guarded([&] {
-    pc::parallel_for(*context, count, int64_t{1} << 16, [&](int64_t begin, int64_t end, int64_t) {
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    parallel_for(*context, count, int64_t{1} << 16, [&](int64_t begin, int64_t end, int64_t) {
       for (int64_t i = begin; i < end; ++i) entries[i] = number[entries[i]];
     });
   });

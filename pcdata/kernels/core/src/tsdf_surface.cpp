@@ -1,12 +1,15 @@
 // Zero crossings of a truncated signed distance field: the same numbers as pcdata/functional/tsdf/surface.py, the
 // normals up to the last bit of a square root.
+#include <memory>
+
+#include "pc/threads.hpp"
 #include "pc/tsdf/field.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 namespace {
 
-constexpr int64_t kGrain = 64;           // blocks
-constexpr int kMost = 3 * kVoxels + 16;  // edges of a block, and a line so that columns do not share cache sets
+constexpr int64_t kBlocksPerPiece = 64;           // blocks
+constexpr int kMostEdges = 3 * kVoxels + 16;  // edges of a block, and a line so that columns do not share cache sets
 constexpr int kVoxelStep[3] = {1, kEdge, kSlab}, kShift[3] = {0, 3, 6};  // of the coordinates in a voxel's number
 
 // -- counting -----------------------------------------------------------------------------------------------------
@@ -23,7 +26,7 @@ void fetch(const Distances& block) {
 
 void count_all(const pc_context& context, const Field& field, int16_t bound, int64_t* counts, int64_t* dropped) {
   std::atomic<int64_t> all_dropped{0};
-  parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_for(context, field.blocks.count, kBlocksPerPiece, [&](int64_t begin, int64_t end, int64_t) {
     Column own(field.blocks, begin, 0, 0), right(field.blocks, begin, 1, 0), below(field.blocks, begin, 0, 1);
     EdgeEnds ends;
     int64_t lost = 0;
@@ -57,24 +60,24 @@ template <class T>
 struct PlaneAround {
   const T* of[4];
 
-  PlaneAround(const Plane<T>& plane, const SortedBlocks& blocks, const int64_t places[27]) {
+  PlaneAround(const VoxelPlane<T>& plane, const SortedBlocks& blocks, const int64_t places[27]) {
     constexpr int around[4] = {13, 14, 16, 22};
     for (int i = 0; i < 4; ++i)
       of[i] = places[around[i]] < 0 ? nullptr : plane.block(blocks.rows[places[around[i]]]);
   }
 };
 
-// The crossings of one block, column by column, so that compilers vectorise the arithmetic.
+// The crossings of one block, column by column, so that compilers vectorize the arithmetic.
 struct Crossings {
   int count;
-  int32_t voxel[kMost], axis[kMost], start[kMost];
-  int32_t end_block[kMost], end_voxel[kMost];  // of the second end: 0 is the block itself, 1 + axis the next
-  float before[kMost], after[kMost], fraction[kMost], place[kMost];
-  int32_t corner[kMost];  // coordinate of the first end, in voxels, along the axis
-  int32_t first[3][kMost], second[3][kMost];
-  float gradient[3][kMost], length[kMost];
-  int32_t packed[2][kMost];
-  float channel[3][kMost];
+  int32_t voxel[kMostEdges], axis[kMostEdges], start[kMostEdges];
+  int32_t end_block[kMostEdges], end_voxel[kMostEdges];  // of the second end: 0 is the block itself, 1 + axis the next
+  float before[kMostEdges], after[kMostEdges], fraction[kMostEdges], place[kMostEdges];
+  int32_t corner[kMostEdges];  // coordinate of the first end, in voxels, along the axis
+  int32_t first[3][kMostEdges], second[3][kMostEdges];
+  float gradient[3][kMostEdges], length[kMostEdges];
+  int32_t packed[2][kMostEdges];
+  float channel[3][kMostEdges];
 
   void list(const Marks& marks) {
     count = 0;
@@ -89,7 +92,7 @@ struct Crossings {
       }
   }
 
-  void read(const Neighbourhood& near, const BlockPlace& block) {
+  void read(const BlockMargin& near, const BlockPlace& block) {
     const auto x = static_cast<int32_t>(block.x * kEdge), y = static_cast<int32_t>(block.y * kEdge),
                z = static_cast<int32_t>(block.z * kEdge);
     const int32_t corners[3] = {x, y, z};
@@ -119,7 +122,7 @@ struct Crossings {
   }
 
   // Interpolated between both ends, each as much as it has seen.
-  void find_gradients(const Neighbourhood& near) {
+  void find_gradients(const BlockMargin& near) {
     for (int a = 0; a < 3; ++a) {
       int32_t unseen = 0;
       for (int i = 0; i < count; ++i) {
@@ -191,7 +194,7 @@ struct Crossings {
   }
 };
 
-void write_block(const Field& field, int64_t number, const int64_t places[27], const Neighbourhood& near,
+void write_block(const Field& field, int64_t number, const int64_t places[27], const BlockMargin& near,
                  double voxel_size, Crossings& found, const Points& out, int64_t row) {
   const BlockPlace block = BlockPlace::of(field.blocks.keys[number]);
   found.read(near, block);
@@ -219,18 +222,18 @@ void write_block(const Field& field, int64_t number, const int64_t places[27], c
 }
 
 // What a thread works in.
-struct Desk {
+struct Workspace {
   EdgeEnds ends;
-  Neighbourhood near;
+  BlockMargin near;
   Crossings found;
 };
 
 void write_all(const pc_context& context, const Field& field, int16_t bound, const int64_t* starts, double voxel_size,
                const Points& out) {
-  std::vector<std::unique_ptr<Desk>> desks(static_cast<size_t>(std::max(context.threads, 1)));
-  parallel_for(context, field.blocks.count, kGrain, [&](int64_t begin, int64_t end, int64_t thread) {
-    auto& desk = desks[static_cast<size_t>(thread)];
-    if (!desk) desk.reset(new Desk);
+  std::vector<std::unique_ptr<Workspace>> workspaces(static_cast<size_t>(std::max(context.threads, 1)));
+  parallel_for(context, field.blocks.count, kBlocksPerPiece, [&](int64_t begin, int64_t end, int64_t thread) {
+    auto& own = workspaces[static_cast<size_t>(thread)];
+    if (!own) own.reset(new Workspace);
     Surroundings around(field.blocks, begin);
     const auto next_from = [&](int64_t i) {
       while (i < end && starts[i] == starts[i + 1]) ++i;
@@ -253,40 +256,40 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
         fetch(Distances::of(field, ahead[14]));
         if (out.colors != nullptr) fetch(field.planes.color.block(field.blocks.rows[ahead[13]]));
       }
-      const Marks marks = desk->ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
-      const Range lines = Range::of(marks);
-      desk->near.fill(distances, lines.wider(2, 2));
-      desk->near.find_slopes(lines);
-      desk->found.list(marks);
-      write_block(field, i, places, desk->near, voxel_size, desk->found, out, starts[i]);
+      const Marks marks = own->ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
+      const LineRange lines = LineRange::of(marks);
+      own->near.fill(distances, lines.wider(2, 2));
+      own->near.find_slopes(lines);
+      own->found.list(marks);
+      write_block(field, i, places, own->near, voxel_size, own->found, out, starts[i]);
     }
   });
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::tsdf
 
-// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of both ends must exceed
-// -> counts (count,): how many edges of each block cross zero; dropped (1,): how many more do, seen less.
 PC_EXPORT int32_t pc_tsdf_count_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
                                           int64_t count, const int64_t* const* planes, int64_t bound, int64_t* counts,
                                           int64_t* dropped) {
-  return pc::guarded([&] {
-    const pc::Field field{{keys, rows, count}, pc::VoxelPlanes(planes)};
-    pc::count_all(*context, field, static_cast<int16_t>(bound), counts, dropped);
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    const Field field{{keys, rows, count}, VoxelPlanes(planes)};
+    count_all(*context, field, static_cast<int16_t>(bound), counts, dropped);
   });
 }
 
-// The same with starts (count + 1,): where each block's points go -> edge (M,) or null, points (M, 3), normals (M, 3),
-// weight (M,), views (M,), colors (M, 3) or null, labels (M,) or null.
 PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
                                           int64_t count, const int64_t* const* planes, int64_t bound,
                                           const int64_t* starts, double voxel_size, int64_t* edge, float* points,
                                           float* normals, float* weight, int64_t* views, float* colors,
                                           int64_t* labels) {
-  return pc::guarded([&] {
-    const pc::Field field{{keys, rows, count}, pc::VoxelPlanes(planes)};
-    pc::write_all(*context, field, static_cast<int16_t>(bound), starts, voxel_size,
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    const Field field{{keys, rows, count}, VoxelPlanes(planes)};
+    write_all(*context, field, static_cast<int16_t>(bound), starts, voxel_size,
                   {edge, points, normals, weight, views, colors, labels});
   });
 }

@@ -1,10 +1,13 @@
 // The blocks that a depth image touches.
+#include <cmath>
+
+#include "pc/memory.hpp"
+#include "pc/simd.hpp"
 #include "pc/sort/radix.hpp"
-#include "pc/truth.hpp"
 #include "pc/tsdf/grid.hpp"
 #include "pc/voxels/table.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 namespace {
 
 struct TouchingView {
@@ -27,7 +30,7 @@ struct NearBlock {
     const int32_t limit = axis == 2 ? kDeep : kWide;
     return least > -limit && most < limit;
   }
-  static IntLanes pack(const IntLanes& x, const IntLanes& y, const IntLanes& z) {
+  static Int32Register pack(const Int32Register& x, const Int32Register& y, const Int32Register& z) {
     return (x & 2047) | (y & 2047) << 11 | z << 22;
   }
   static int32_t x(int32_t packed) { return static_cast<int32_t>(static_cast<uint32_t>(packed) << 21) >> 21; }
@@ -36,9 +39,9 @@ struct NearBlock {
 };
 
 // The blocks of a row of pixels at every offset.
-class Row {
+class BlockRow {
  public:
-  Row(ScratchFrame& scratch, const TouchingView& view)
+  BlockRow(ScratchFrame& scratch, const TouchingView& view)
       : stride_((view.width + kLanes) / kLanes * kLanes + kLanes),
         packed_(scratch.take<int32_t>(view.num_offsets * stride_)) {
     std::fill(packed_, packed_ + view.num_offsets * stride_, NearBlock::kNone);
@@ -53,13 +56,13 @@ class Row {
 
 // The lanes of some pixels of a row.
 struct Pixels {
-  FloatLanes depth, along[3];  // the way of their rays through blocks, per metre of depth
+  FloatRegister depth, along[3];  // the way of their rays through blocks, per metre of depth
 
   Pixels(const TouchingView& view, int64_t row, int64_t u) {
     const int64_t at = row * view.width + u;
     depth = load_up_to(view.depth + at, view.width);
-    const FloatLanes x = load_up_to(view.rays + at, view.width);
-    const FloatLanes y = load_up_to(view.rays + view.height * view.width + at, view.width);
+    const FloatRegister x = load_up_to(view.rays + at, view.width);
+    const FloatRegister y = load_up_to(view.rays + view.height * view.width + at, view.width);
     for (int a = 0; a < 3; ++a) {
       const float* m = view.turn + 3 * a;
       along[a] = (m[0] * x + m[1] * y) + m[2];
@@ -69,32 +72,32 @@ struct Pixels {
 
 // The range of the blocks of a row.
 struct Extent {
-  IntLanes low[3] = {}, high[3] = {};
+  Int32Register low[3] = {}, high[3] = {};
 
-  void join(int axis, const IntLanes& place) {
-    low[axis] = least(low[axis], place);
-    high[axis] = greatest(high[axis], place);
+  void join(int axis, const Int32Register& place) {
+    low[axis] = minimum(low[axis], place);
+    high[axis] = maximum(high[axis], place);
   }
 };
 
 enum class Reach { kNear, kWide, kFar };
 
 // Find the blocks of a row of pixels at every offset.
-inline Reach locate(const TouchingView& view, int64_t row, const Row& here) {
+inline Reach locate(const TouchingView& view, int64_t row, const BlockRow& here) {
   Extent extent;
-  const FloatLanes zero = {};
-  const IntLanes none = IntLanes{} + NearBlock::kNone;
+  const FloatRegister zero = {};
+  const Int32Register none = Int32Register{} + NearBlock::kNone;
   const int64_t last = std::max<int64_t>(0, view.width - kLanes);
   for (int64_t at = 0; at < view.width; at += kLanes) {
     const int64_t u = std::min(at, last);
     const Pixels pixels(view, row, u);
-    const Truth read = less(zero, pixels.depth);
+    const RegisterMask read = less(zero, pixels.depth);
     for (int64_t step = 0; step < view.num_offsets; ++step) {
-      const FloatLanes z = pixels.depth + view.offsets[step];
-      const Truth good = read & less(zero, z);
-      IntLanes place[3];
+      const FloatRegister z = pixels.depth + view.offsets[step];
+      const RegisterMask good = read & less(zero, z);
+      Int32Register place[3];
       for (int a = 0; a < 3; ++a) {
-        place[a] = select(good, floored(pixels.along[a] * z + view.fraction[a]), IntLanes{});
+        place[a] = select(good, floored(pixels.along[a] * z + view.fraction[a]), Int32Register{});
         extent.join(a, place[a]);
       }
       store(here.at(step) + 1 + u, select(good, NearBlock::pack(place[0], place[1], place[2]), none));
@@ -111,23 +114,23 @@ inline Reach locate(const TouchingView& view, int64_t row, const Row& here) {
 
 // Write each pixel's blocks that are not those of the pixel to the left, of the one above, or of the same pixel one
 // offset before; return how many. There must be room for a register more.
-inline int64_t find_new(const TouchingView& view, const Row& above, const Row& here, int32_t* found) {
+inline int64_t find_new(const TouchingView& view, const BlockRow& above, const BlockRow& here, int32_t* found) {
   int64_t count = 0;
   for (int64_t step = 0; step < view.num_offsets; ++step) {
     const int32_t *own = here.at(step), *other = above.at(step), *before = here.at(std::max<int64_t>(0, step - 1));
     const int32_t first = step == 0 ? -1 : 0;  // turns every bit over: before the first offset nothing was found
     for (int64_t u = 1; u <= view.width; u += kLanes) {
-      const auto packed = load<IntLanes>(own + u);
-      const Truth is_new = unequal(packed, load<IntLanes>(own + u - 1)) & unequal(packed, load<IntLanes>(other + u)) &
-                           unequal(packed, load<IntLanes>(before + u) ^ first) &
-                           unequal(packed, IntLanes{} + NearBlock::kNone);
+      const auto packed = load<Int32Register>(own + u);
+      const RegisterMask is_new = unequal(packed, load<Int32Register>(own + u - 1)) & unequal(packed, load<Int32Register>(other + u)) &
+                           unequal(packed, load<Int32Register>(before + u) ^ first) &
+                           unequal(packed, Int32Register{} + NearBlock::kNone);
       count += store_chosen(found + count, packed, is_new);
     }
   }
   return count;
 }
 
-// Most of these are found again and again, by neighbouring pixels in turn: leave out what was met lately.
+// Most of these are found again and again, by neighboring pixels in turn: leave out what was met lately.
 class Recent {
  public:
   Recent() { std::fill(std::begin(packed_), std::end(packed_), NearBlock::kNone); }
@@ -178,18 +181,18 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   const int64_t most = view.height * view.width * view.num_offsets;
   const auto threads = static_cast<size_t>(std::max<int32_t>(1, context.threads));
   struct Own {
-    PackedVoxel* keys;
-    Row rows[2], none;
+    math::PackedVoxel* keys;
+    BlockRow rows[2], none;
     int32_t* found;
-    VoxelTable<PackedVoxel> table;
+    voxels::VoxelTable<math::PackedVoxel> table;
     Recent recent{};
     bool used = false;
   };
   std::vector<Own> own;
   for (size_t t = 0; t < threads; ++t)
-    own.push_back({scratch.take<PackedVoxel>(most), {Row(scratch, view), Row(scratch, view)}, Row(scratch, view),
+    own.push_back({scratch.take<math::PackedVoxel>(most), {BlockRow(scratch, view), BlockRow(scratch, view)}, BlockRow(scratch, view),
                    scratch.take<int32_t>(view.width * view.num_offsets + 2 * kLanes),
-                   VoxelTable<PackedVoxel>(scratch, most)});
+                   voxels::VoxelTable<math::PackedVoxel>(scratch, most)});
   std::atomic<bool> far{false};
   parallel_for(context, view.height, kRows, [&](int64_t begin, int64_t end, int64_t thread) {
     Own& mine = own[static_cast<size_t>(thread)];
@@ -197,19 +200,19 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
     mine.used = true;
     const auto key_of = [&](int64_t x, int64_t y, int64_t z) {
       const BlockPlace block{x + view.camera[0], y + view.camera[1], z + view.camera[2]};
-      return PackedVoxel{static_cast<uint64_t>(block.key())};
+      return math::PackedVoxel{static_cast<uint64_t>(block.key())};
     };
     const auto near_key = [&](int32_t packed) {
       return key_of(NearBlock::x(packed), NearBlock::y(packed), NearBlock::z(packed));
     };
-    const Row* above = &mine.none;
+    const BlockRow* above = &mine.none;
     for (int64_t row = begin; row < end; ++row) {
-      const Row& here = mine.rows[row % 2];
+      const BlockRow& here = mine.rows[row % 2];
       const Reach reach = locate(view, row, here);
       if (reach == Reach::kFar) far.store(true, std::memory_order_relaxed);
       if (reach == Reach::kWide)
         find_all(view, row, [&](int64_t x, int64_t y, int64_t z) { mine.table.number(key_of(x, y, z)); });
-      const Row& last = *above;
+      const BlockRow& last = *above;
       above = reach == Reach::kNear ? &here : &mine.none;
       if (reach != Reach::kNear) continue;
       const int64_t count = mine.recent.drop_known(mine.found, find_new(view, last, here, mine.found));
@@ -228,7 +231,7 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   int64_t count = 0;
   for (const Own& one : own)
     for (int64_t i = 0; one.used && i < one.table.count(); ++i) items[count++] = {one.keys[i].bits};
-  const KeyItem* sorted = radix_sort(context, scratch, items, spare, even_pieces(context, total), 63);
+  const KeyItem* sorted = sort::radix_sort(context, scratch, items, spare, even_pieces(context, total), 63);
   count = 0;
   for (int64_t i = 0; i < total; ++i)
     if (i == 0 || sorted[i].key != sorted[i - 1].key) found[count++] = static_cast<int64_t>(sorted[i].key);
@@ -236,15 +239,14 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
 }
 
 }  // namespace
-}  // namespace pc
+}  // namespace pc::tsdf
 
-// depth (height, width), rays (2, height, width), turn (3, 3) and fraction (3,) in blocks, camera (3,) blocks, offsets
-// (num_offsets,) -> the sorted keys of the touched blocks, found (*count,), of room for every reading at every offset.
-// *count becomes -1 if a block lies out of reach.
 PC_EXPORT int32_t pc_tsdf_touched(const pc_context* context, const float* depth, const float* rays, int64_t height,
                                   int64_t width, const float* turn, const float* fraction, const int64_t* camera,
                                   const float* offsets, int64_t num_offsets, int64_t* found, int64_t* count) {
-  return pc::guarded([&] {
-    *count = pc::touched(*context, {depth, rays, height, width, turn, fraction, camera, offsets, num_offsets}, found);
+  using namespace pc;
+  using namespace pc::tsdf;
+  return guarded([&] {
+    *count = touched(*context, {depth, rays, height, width, turn, fraction, camera, offsets, num_offsets}, found);
   });
 }

@@ -1,9 +1,11 @@
 // Disjoint sets that many threads may join at once.
 #pragma once
 
-#include "pc/common.hpp"
+#include <atomic>
+#include <cstdint>
+#include <utility>
 
-namespace pc {
+namespace pc::cells {
 
 // Every set is named by its lowest member. A parent is never above its child and only ever falls, so a reader that sees
 // an old parent is only a few steps late, and relaxed atomics are enough.
@@ -43,4 +45,4 @@ class UnionFind {
   std::atomic<uint32_t>* parent_;
 };
 
-}  // namespace pc
+}  // namespace pc::cells

@@ -1,35 +1,18 @@
-// Rows of depth pixels projected into a colour camera. The float32 operations are the reference's, in its order.
+// Rows of depth pixels projected into a color camera. The float32 operations are the reference's, in its order.
 #pragma once
 
 #include <cmath>
+#include <cstdint>
 
-#include "pc/common.hpp"
+#include "pc/math/lens.hpp"
 
-namespace pc {
+namespace pc::images {
 
 // Beyond it sums of coordinates could overflow, and what infinities become is the reference's to say.
 constexpr float kFarthest = 1e30F;
 
-// OpenCV's lens model with k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4, and the radius at which it folds back.
-struct Lens {
-  double k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, fold;
-
-  static double cubic(double t, double a, double b, double c) { return 1 + t * (a + t * (b + t * c)); }
-
-  bool within_fold(float fx, float fy) const {
-    const double x = fx, y = fy;
-    return std::sqrt(x * x + y * y) < fold;
-  }
-  void bend(float& fx, float& fy) const {
-    const double x = fx, y = fy, r2 = x * x + y * y;
-    const double radial = cubic(r2, k1, k2, k3) / cubic(r2, k4, k5, k6);
-    fx = static_cast<float>(((x * radial + 2 * p1 * x * y) + p2 * (r2 + 2 * x * x)) + (s1 + s2 * r2) * r2);
-    fy = static_cast<float>(((y * radial + p1 * (r2 + 2 * y * y)) + 2 * p2 * x * y) + (s3 + s4 * r2) * r2);
-  }
-};
-
 // One view's depth image (height, width) and both cameras.
-struct View {
+struct DepthView {
   const float* depth;
   int64_t height, width;
   const float* column_rays = nullptr;  // x/z of every column (width,) and
@@ -37,10 +20,10 @@ struct View {
   const float* rays = nullptr;         // both of every pixel (height, width, 2)
   float move[12] = {};                 // the upper rows of color_from_depth
   float fx = 0, skew = 0, cx = 0, fy = 0, cy = 0;
-  float half_width = 0, half_height = 0;  // of a pixel's box, in colour pixels, at equal depths
-  const Lens* lens = nullptr;             // of the colour camera, if it has one
+  float half_width = 0, half_height = 0;  // of a pixel's box, in color pixels, at equal depths
+  const math::Lens* lens = nullptr;             // of the color camera, if it has one
 
-  View(const float* image, int64_t rows, int64_t columns) : depth(image), height(rows), width(columns) {}
+  DepthView(const float* image, int64_t rows, int64_t columns) : depth(image), height(rows), width(columns) {}
 
   // color_from_depth (4, 4), color_intrinsics (3, 3), half_pixel (2,)
   void set_cameras(const double* color_from_depth, const double* color_intrinsics, const double* half_pixel) {
@@ -55,15 +38,15 @@ struct View {
   }
 };
 
-// A row of depth pixels in the colour camera; each (width,).
-struct Seen {
+// A row of depth pixels in the color camera; each (width,).
+struct ProjectedRow {
   float *u, *v;
-  float* z;        // along the colour camera's axis
-  float* reading;  // the depth, 0 where the pixel has none or the colour camera cannot see it
+  float* z;        // along the color camera's axis
+  float* reading;  // the depth, 0 where the pixel has none or the color camera cannot see it
   float *half_width, *half_height;
 
   static constexpr int64_t kArrays = 6;
-  Seen(float* room, int64_t width)
+  ProjectedRow(float* room, int64_t width)
       : u(room), v(room + width), z(room + 2 * width), reading(room + 3 * width), half_width(room + 4 * width),
         half_height(room + 5 * width) {}
 };
@@ -81,11 +64,11 @@ struct PixelRays {
   float y(int64_t i) const { return pixels[2 * i + 1]; }
 };
 
-// The three steps from a row of depths to colour pixels. Plain loops over arguments and local values: they vectorise.
+// The three steps from a row of depths to color pixels. Plain loops over arguments and local values: they vectorize.
 
-// Move the readings into the colour camera: x/z, y/z and z there. Returns how many have no ray.
+// Move the readings into the color camera: x/z, y/z and z there. Returns how many have no ray.
 template <class Ray>
-int32_t move_row(const View& view, const float* __restrict depth, const Ray ray, int64_t width, float* __restrict x,
+int32_t move_row(const DepthView& view, const float* __restrict depth, const Ray ray, int64_t width, float* __restrict x,
                  float* __restrict y, float* __restrict z, float* __restrict reading) {
   const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
   const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
@@ -105,7 +88,7 @@ int32_t move_row(const View& view, const float* __restrict depth, const Ray ray,
   return lost;
 }
 
-inline void bend_row(const Lens lens, int64_t width, float* __restrict x, float* __restrict y,
+inline void bend_row(const math::Lens lens, int64_t width, float* __restrict x, float* __restrict y,
                      float* __restrict reading) {
   for (int64_t i = 0; i < width; ++i) {
     const bool visible = (reading[i] > 0) & lens.within_fold(x[i], y[i]);
@@ -118,7 +101,7 @@ inline void bend_row(const Lens lens, int64_t width, float* __restrict x, float*
 }
 
 // Turn x/z and y/z into pixels, in place, and size their boxes. Returns how many readings lie beyond kFarthest.
-inline int32_t to_pixels(const View& view, const float* __restrict depth, const float* __restrict z,
+inline int32_t to_pixels(const DepthView& view, const float* __restrict depth, const float* __restrict z,
                          const float* __restrict reading, int64_t width, float* __restrict u, float* __restrict v,
                          float* __restrict half_width, float* __restrict half_height) {
   const float fx = view.fx, skew = view.skew, cx = view.cx, fy = view.fy, cy = view.cy;
@@ -139,7 +122,7 @@ inline int32_t to_pixels(const View& view, const float* __restrict depth, const 
 }
 
 // Returns whether every reading has a ray and projects where floats can be computed with.
-inline bool project(const View& view, int64_t row, const Seen& seen) {
+inline bool project(const DepthView& view, int64_t row, const ProjectedRow& seen) {
   const int64_t width = view.width;
   const float* depth = view.depth + row * width;
   const int32_t lost =
@@ -153,4 +136,4 @@ inline bool project(const View& view, int64_t row, const Seen& seen) {
   return lost + beyond == 0;
 }
 
-}  // namespace pc
+}  // namespace pc::images

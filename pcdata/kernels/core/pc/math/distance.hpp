@@ -1,15 +1,11 @@
-// Per-point arithmetic, device-neutral: included by the CPU core and by CUDA sources alike.
+// Distances as every backend computes them.
 #pragma once
 
-#if defined(__CUDACC__)
-#define PC_HD __host__ __device__ __forceinline__
-#else
-#define PC_HD inline
-#endif
+#include "pc/math/host_device.hpp"
 
-namespace pc {
+namespace pc::math {
 
-// Squared distance as every backend computes it: ((dx*dx)+(dy*dy))+(dz*dz) in float, never fused.
+// ((dx*dx)+(dy*dy))+(dz*dz) in float, never fused.
 PC_HD float squared_distance(float ax, float ay, float az, float bx, float by, float bz) {
   const float dx = ax - bx, dy = ay - by, dz = az - bz;
 #if defined(__CUDA_ARCH__)
@@ -19,4 +15,4 @@ PC_HD float squared_distance(float ax, float ay, float az, float bx, float by, f
 #endif
 }
 
-}  // namespace pc
+}  // namespace pc::math

@@ -1,10 +1,10 @@
 // Every query of a batch searched: by windows where there is a depth image and a proof, else by the box tree.
 #pragma once
 
-#include "pc/neighbors/organized_cloud.hpp"
-#include "pc/neighbors/tree_search.hpp"
+#include "pc/neighbors/nearest_distances.hpp"
+#include "pc/neighbors/window_search.hpp"
 
-namespace pc {
+namespace pc::neighbors {
 
 struct Clouds {
   const float* points;  // (N, 3)
@@ -15,7 +15,7 @@ struct Clouds {
 // A task is copied for every piece of work and called as
 //   task(search, group, nearest, row)
 // once per group of queries: `nearest` has found everything for the active lanes, whose query rows are `row`; the
-// search can replay() its candidates, and `search.row(id)` turns the id of a neighbour into its row.
+// search can replay() its candidates, and `search.row(id)` turns the id of a neighbor into its row.
 template <class Nearest, class Task>
 class BatchSearch {
  public:
@@ -88,7 +88,7 @@ class BatchSearch {
     });
   }
 
-  // A window starts with about twice as many pixels as neighbours are wanted and grows by a few rings, each of which
+  // A window starts with about twice as many pixels as neighbors are wanted and grows by a few rings, each of which
   // costs every lane: what is then not proved (1-2 % on a tabletop frame) is cheaper in the tree.
   static constexpr int kMoreRings = 4;
   static constexpr int64_t kOneIn = 16;  // more queries without a proof than this mean a grid that does not fit
@@ -109,7 +109,7 @@ class BatchSearch {
     if (begin == end) return;
     const int64_t alone[2] = {begin, end};
     const WindowRings rings(first_reach() + kMoreRings);
-    OrganisedCloud cloud;
+    OrganizedCloud cloud;
     if (!cloud.build(context_, scratch, clouds.points, grid, b, begin, end, first_reach() + kMoreRings))
       return by_tree(scratch, {clouds.points, alone, 1});
     Unproved* unproved = scratch.take<Unproved>(end - begin);
@@ -119,20 +119,20 @@ class BatchSearch {
       Worker worker{{}, task_};
       for (int64_t u = 0; u < cloud.width(); u += kQueries) {
         QueryGroup group = search.queries_at(u, v);
-        const LaneMask points = group.active;
+        const PackMask points = group.active;
         if (points == 0) continue;
         worker.nearest.start(k_, group.limits(limit_));
         group.active = search.run(group, u, v, first_reach(), worker.nearest);
         uint32_t row[kQueries] = {};
-        for (LaneMask left = points; left != 0; left &= left - 1) {
+        for (PackMask left = points; left != 0; left &= left - 1) {
           const int lane = __builtin_ctz(left);
           row[lane] = cloud.row(v * cloud.stride() + u + lane);
         }
-        if (const LaneMask rest = points & ~group.active) {
+        if (const PackMask rest = points & ~group.active) {
           alignas(64) float bound[kQueries];
           worker.nearest.bound().store(bound);
           Unproved* next = unproved + num_unproved.fetch_add(__builtin_popcount(rest), std::memory_order_relaxed);
-          for (LaneMask left = rest; left != 0; left &= left - 1) {
+          for (PackMask left = rest; left != 0; left &= left - 1) {
             const int lane = __builtin_ctz(left);
             *next++ = {row[lane], bound[lane]};
           }
@@ -167,12 +167,12 @@ class BatchSearch {
       alignas(64) float limit[kQueries];
       uint32_t row[kQueries] = {};
       std::fill_n(limit, kQueries, kOff);
-      for (LaneMask left = group.active; left != 0; left &= left - 1) {
+      for (PackMask left = group.active; left != 0; left &= left - 1) {
         const int lane = __builtin_ctz(left);
         row[lane] = queries[leaf.row[lane]].row;
         limit[lane] = queries[leaf.row[lane]].limit;
       }
-      worker.nearest.start(k_, Floats::load(limit));
+      worker.nearest.start(k_, FloatPack::load(limit));
       search.run(*tree, group, search.leaf_near(*tree, group), worker.nearest);
       worker.nearest.finish();
       worker.task(search, group, worker.nearest, row);
@@ -185,4 +185,4 @@ class BatchSearch {
   const Task& task_;
 };
 
-}  // namespace pc
+}  // namespace pc::neighbors

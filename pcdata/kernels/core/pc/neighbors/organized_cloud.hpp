@@ -1,20 +1,16 @@
-// The search of a cloud that still lies on a depth image: a window of pixels, with proof that nothing nearer lies
-// outside.
-//
-// The proof. Let S be the least X/Z of all points in the columns from u+w+1 on, in the camera's frame, where Z > 0. All
-// of those points lie in the half-space X >= S Z, so a query left of it is at least (S Z0 - X0) / sqrt(1 + S^2) away
-// from them; likewise for the columns up to u-w-1 and for rows. If the k-th distance found in the window of half-width
-// w is less than all four, no point outside can matter. S is measured from the points, not computed from intrinsics, so
-// a grid that does not fit the points (or a lens that bends columns) can only make proofs fail, never make them wrong;
-// queries without a proof go to the box tree.
+// A cloud that still lies on a depth image.
 #pragma once
 
-#include "pc/common.hpp"
-#include "pc/sixteen.hpp"
-#include "pc/neighbors/nearest.hpp"
-#include "pc/neighbors/tree_search.hpp"
+#include <algorithm>
+#include <atomic>
+#include <cmath>
 
-namespace pc {
+#include "pc/math/morton.hpp"
+#include "pc/memory.hpp"
+#include "pc/neighbors/leaves.hpp"
+#include "pc/threads.hpp"
+
+namespace pc::neighbors {
 
 // What Python knows of a batch on depth images; camera null: the points are in the camera's frame.
 struct Grid {
@@ -28,7 +24,7 @@ struct CameraFrame {
   const double* matrix;  // (4, 4), or null for none
 
   // Sixteen points; every coordinate is rounded once, at the end.
-  void move(Floats& x, Floats& y, Floats& z) const {
+  void move(FloatPack& x, FloatPack& y, FloatPack& z) const {
     if (matrix == nullptr) return;
     alignas(64) float from[3][kQueries], to[3][kQueries];
     x.store(from[0]), y.store(from[1]), z.store(from[2]);
@@ -37,7 +33,7 @@ struct CameraFrame {
       for (int lane = 0; lane < kQueries; ++lane)
         to[axis][lane] = static_cast<float>(m[0] * from[0][lane] + m[1] * from[1][lane] + m[2] * from[2][lane] + m[3]);
     }
-    x = Floats::load(to[0]), y = Floats::load(to[1]), z = Floats::load(to[2]);
+    x = FloatPack::load(to[0]), y = FloatPack::load(to[1]), z = FloatPack::load(to[2]);
   }
 };
 
@@ -77,7 +73,7 @@ struct HalfSpaces {
 };
 
 // One cloud laid out as the part of its image that it covers, with a margin of points at infinity.
-class OrganisedCloud {
+class OrganizedCloud {
  public:
   // False when the cloud cannot be searched by windows with profit: points behind the camera, or far fewer points than
   // pixels.
@@ -119,8 +115,8 @@ class OrganisedCloud {
     parallel_for(context, tiles, 2, [&](int64_t first, int64_t last, int64_t) {
       for (int64_t i = first * kLeaves; i < last * kLeaves; ++i) {
         const int64_t tile = i / kLeaves, code = i % kLeaves;
-        fill_leaf_at(tile % across * kTile + kLeafSide * even_bits(code),
-                     tile / across * kTile + kLeafSide * even_bits(code >> 1), leaves[i]);
+        fill_leaf_at(tile % across * kTile + kLeafSide * math::even_bits(code),
+                     tile / across * kTile + kLeafSide * math::even_bits(code >> 1), leaves[i]);
       }
     });
     return {leaves, leaf_ptr, 1};
@@ -145,9 +141,6 @@ class OrganisedCloud {
   static constexpr int64_t kRowsPerPiece = 16;
   static constexpr int64_t kPointsPerPiece = 1 << 14;
   static constexpr float kMinDepth = 1e-30f, kMaxSlope = 1e18f;  // so that no slope overflows
-
-  // Bits 0, 2, 4 and 6 of a number, moved together.
-  static int64_t even_bits(int64_t v) { return (v & 1) | (v >> 1 & 2) | (v >> 2 & 4) | (v >> 3 & 8); }
 
   // A leaf may reach over the edge of the image, into the margin.
   void fill_leaf_at(int64_t u, int64_t v, Leaf& leaf) const {
@@ -178,12 +171,12 @@ class OrganisedCloud {
     if (begin == end) return false;
     first_row_ = grid.pixel[begin] / grid.width;
     height_ = grid.pixel[end - 1] / grid.width - first_row_ + 1;
-    struct alignas(64) Range {
+    struct alignas(64) ColumnRange {
       int64_t least, most;
     };
-    std::vector<Range> ranges(static_cast<size_t>(std::max(context.threads, 1)), Range{grid.width, -1});
+    std::vector<ColumnRange> ranges(static_cast<size_t>(std::max(context.threads, 1)), ColumnRange{grid.width, -1});
     parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
-      Range range = ranges[static_cast<size_t>(thread)];
+      ColumnRange range = ranges[static_cast<size_t>(thread)];
       for_pixels(grid, begin + first, begin + last, [&](int64_t, int64_t u, int64_t) {
         range = {std::min(range.least, u), std::max(range.most, u)};
       });
@@ -191,7 +184,7 @@ class OrganisedCloud {
     });
     first_column_ = grid.width;
     int64_t last_column = 0;
-    for (const Range& range : ranges) {
+    for (const ColumnRange& range : ranges) {
       first_column_ = std::min(first_column_, range.least);
       last_column = std::max(last_column, range.most);
     }
@@ -227,27 +220,27 @@ class OrganisedCloud {
 
   // Missing pixels are at infinity, so their slopes are NaN, and a minimum with NaN gives the second value.
   bool slopes_of_line(int64_t v, float* least, float* most, float& line_least, float& line_most) const {
-    Floats low(kInfinity), high(-kInfinity);
-    LaneMask bad = 0;
+    FloatPack low(kInfinity), high(-kInfinity);
+    PackMask bad = 0;
     for (int64_t u = 0; u < width_; u += kQueries) {
       const int64_t at = v * stride_ + u;
-      Floats x = Floats::load(image_[0] + at), y = Floats::load(image_[1] + at), z = Floats::load(image_[2] + at);
-      const LaneMask real = less(z, Floats(kInfinity));
+      FloatPack x = FloatPack::load(image_[0] + at), y = FloatPack::load(image_[1] + at), z = FloatPack::load(image_[2] + at);
+      const PackMask real = less(z, FloatPack(kInfinity));
       camera_.move(x, y, z);
-      const Floats inverse = Floats(1.0f) / z, across = x * inverse, down = y * inverse;
+      const FloatPack inverse = FloatPack(1.0f) / z, across = x * inverse, down = y * inverse;
       // Every comparison is false for NaN, which so counts as bad.
-      bad |= real & ~(less(Floats(kMinDepth), z) & less(z, Floats(kInfinity)) & within(across) & within(down));
-      minimum(across, Floats::load(least + u)).store(least + u);
-      maximum(across, Floats::load(most + u)).store(most + u);
+      bad |= real & ~(less(FloatPack(kMinDepth), z) & less(z, FloatPack(kInfinity)) & within(across) & within(down));
+      minimum(across, FloatPack::load(least + u)).store(least + u);
+      maximum(across, FloatPack::load(most + u)).store(most + u);
       low = minimum(down, low);
       high = maximum(down, high);
     }
-    line_least = -largest(Floats(0.0f) - low);
+    line_least = -largest(FloatPack(0.0f) - low);
     line_most = largest(high);
     return bad == 0;
   }
-  static LaneMask within(const Floats& slope) {
-    return less(slope, Floats(kMaxSlope)) & less(Floats(-kMaxSlope), slope);
+  static PackMask within(const FloatPack& slope) {
+    return less(slope, FloatPack(kMaxSlope)) & less(FloatPack(-kMaxSlope), slope);
   }
 
   int64_t first_row_ = 0, first_column_ = 0, width_ = 0, height_ = 0, stride_ = 0, origin_ = 0;
@@ -258,124 +251,4 @@ class OrganisedCloud {
   HalfSpaces columns_{}, lines_{};
 };
 
-// The pixels at each distance from the middle of a window, square ring by square ring, nearest first within a ring.
-class WindowRings {
- public:
-  explicit WindowRings(int max_reach) {
-    for (int ring = 0; ring <= max_reach; ++ring) {
-      begin_.push_back(offsets_.size());
-      for (int dv = -ring; dv <= ring; ++dv)
-        for (int du = -ring; du <= ring; ++du)
-          if (std::max(std::abs(du), std::abs(dv)) == ring) offsets_.push_back({du, dv});
-      std::stable_sort(offsets_.begin() + static_cast<ptrdiff_t>(begin_.back()), offsets_.end(),
-                       [](Offset a, Offset b) { return a.squared() < b.squared(); });
-    }
-    begin_.push_back(offsets_.size());
-  }
-  struct Offset {
-    int du, dv;
-    int squared() const { return du * du + dv * dv; }
-  };
-  const Offset* begin(int ring) const { return offsets_.data() + begin_[static_cast<size_t>(ring)]; }
-  const Offset* end(int ring) const { return begin(ring + 1); }
-
- private:
-  std::vector<Offset> offsets_;
-  std::vector<size_t> begin_;
-};
-
-// Searches windows around sixteen pixels side by side.
-class WindowSearch {
- public:
-  WindowSearch(const OrganisedCloud& cloud, const WindowRings& rings) : cloud_(cloud), rings_(rings) {}
-
-  // The points at pixels (u, v) to (u+15, v).
-  QueryGroup queries_at(int64_t u, int64_t v) const {
-    const int64_t at = v * cloud_.stride() + u;
-    return QueryGroup(cloud_.x() + at, cloud_.y() + at, cloud_.z() + at);
-  }
-
-  // Offer windows of growing size, from `reach` on; return the lanes that are proved complete.
-  template <class Nearest>
-  LaneMask run(const QueryGroup& queries, int64_t u, int64_t v, int reach, Nearest& nearest) {
-    u_ = u;
-    v_ = v;
-    for (int ring = 0; ring <= reach; ++ring) offer_ring(queries, ring, nearest);
-    const Place place(cloud_, queries);
-    for (;; offer_ring(queries, ++reach, nearest)) {
-      nearest.settle();
-      reach_ = reach;
-      const LaneMask proved = less(nearest.bound(), clear_within(place, reach)) & queries.active;
-      if (proved == queries.active || reach == cloud_.max_reach()) return proved;
-      // Rings cost all lanes: go on only for those that the largest window would prove.
-      if ((less(nearest.bound(), clear_within(place, cloud_.max_reach())) & queries.active & ~proved) == 0)
-        return proved;
-    }
-  }
-
-  // Show again every pixel of the last window: body(x, y, z, id), where row_in_lane(id, lane) is the point's row.
-  template <class Body>
-  void replay(const QueryGroup&, const Floats&, Body&& body) const {
-    for (int ring = 0; ring <= reach_; ++ring)
-      for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
-        const int64_t at = pixel(*offset);
-        body(Floats::load(cloud_.x() + at), Floats::load(cloud_.y() + at), Floats::load(cloud_.z() + at),
-             static_cast<uint32_t>(at));
-      }
-  }
-  uint32_t row(uint32_t id) const { return cloud_.row(id); }
-  // The pixel of lane 0 may lie in the margin before the image, so that its number is negative and its id has wrapped:
-  // the lane is added in 32 bits, where it wraps back.
-  uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(id + static_cast<uint32_t>(lane)); }
-
- private:
-  // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each
-  // of half a unit in the 24th bit of the largest coordinate.
-  struct Place {
-    Floats x, y, z, slack;
-
-    Place(const OrganisedCloud& cloud, const QueryGroup& queries) : x(queries.x), y(queries.y), z(queries.z) {
-      cloud.camera().move(x, y, z);
-      const Floats zero(0.0f);
-      slack = (maximum(x, zero - x) + maximum(y, zero - y) + z) * Floats(1e-6f);
-    }
-  };
-
-  template <class Nearest>
-  void offer_ring(const QueryGroup& queries, int ring, Nearest& nearest) const {
-    for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
-      const int64_t at = pixel(*offset);
-      const Floats squared = squared_length(Floats::load(cloud_.x() + at) - queries.x,
-                                            Floats::load(cloud_.y() + at) - queries.y,
-                                            Floats::load(cloud_.z() + at) - queries.z);
-      if (nearest.wants(squared)) nearest.offer(squared, Ids::ascending(static_cast<uint32_t>(at)));
-    }
-  }
-
-  // The squared distance within which every point is in the window, per lane.
-  Floats clear_within(const Place& at, int reach) const {
-    const HalfSpaces &columns = cloud_.columns(), &lines = cloud_.lines();
-    const int64_t right = u_ + reach + 1, left = u_ - reach - 1, below = v_ + reach + 1, above = v_ - reach - 1;
-    const Floats to_right = Floats::load(columns.from_b + right) * at.z - Floats::load(columns.from_a + right) * at.x;
-    const Floats to_left = Floats::load(columns.upto_a + left) * at.x - Floats::load(columns.upto_b + left) * at.z;
-    const Floats to_below = Floats(lines.from_b[below]) * at.z - Floats(lines.from_a[below]) * at.y;
-    const Floats to_above = Floats(lines.upto_a[above]) * at.y - Floats(lines.upto_b[above]) * at.z;
-    const Floats nearest_side = minimum(minimum(to_right, to_left), minimum(to_below, to_above));
-    const Floats clear = maximum(nearest_side - at.slack, Floats(0.0f));
-    return clear * clear * Floats(kMargin);
-  }
-
-  int64_t pixel(const WindowRings::Offset& offset) const {
-    return (v_ + offset.dv) * cloud_.stride() + u_ + offset.du;
-  }
-
-  // Rounding of computed squared distances (4e-7), and motions that are rigid only to 1e-5 (ImageGrid requires it).
-  static constexpr float kMargin = 1.0f - 1e-4f;
-
-  const OrganisedCloud& cloud_;
-  const WindowRings& rings_;
-  int64_t u_ = 0, v_ = 0;
-  int reach_ = 0;
-};
-
-}  // namespace pc
+}  // namespace pc::neighbors

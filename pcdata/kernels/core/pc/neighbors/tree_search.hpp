@@ -1,21 +1,21 @@
 // The search of a box tree for sixteen queries at once.
 #pragma once
 
-#include "pc/neighbors/box_tree.hpp"
-#include "pc/sixteen.hpp"
-#include "pc/neighbors/nearest.hpp"
+#include <vector>
 
-namespace pc {
+#include "pc/neighbors/box_tree.hpp"
+
+namespace pc::neighbors {
 
 // Sixteen queries, one per lane.
 struct QueryGroup {
-  Floats x, y, z;
-  LaneMask active;         // the lanes that count
+  FloatPack x, y, z;
+  PackMask active;         // the lanes that count
   float low[3], high[3];   // their box, when they come from a leaf: the tree's search needs it
 
   // Sixteen points, at infinity where there is none. Those become finite, so that no arithmetic meets NaN.
   QueryGroup(const float* qx, const float* qy, const float* qz)
-      : x(finite(qx)), y(finite(qy)), z(finite(qz)), active(less(Floats::load(qz), Floats(kInfinity))) {}
+      : x(finite(qx)), y(finite(qy)), z(finite(qz)), active(less(FloatPack::load(qz), FloatPack(kInfinity))) {}
 
   explicit QueryGroup(const Leaf& leaf) : QueryGroup(leaf.x, leaf.y, leaf.z) {
     extent(leaf.x, low[0], high[0]);
@@ -23,14 +23,14 @@ struct QueryGroup {
     extent(leaf.z, low[2], high[2]);
   }
 
-  static Floats finite(const float* from) {
-    return minimum(Floats::load(from), Floats(std::numeric_limits<float>::max()));
+  static FloatPack finite(const float* from) {
+    return minimum(FloatPack::load(from), FloatPack(std::numeric_limits<float>::max()));
   }
   // `limit` in the lanes that count, off in the others.
-  Floats limits(float limit) const {
+  FloatPack limits(float limit) const {
     alignas(64) float value[kQueries];
     for (int lane = 0; lane < kQueries; ++lane) value[lane] = active >> lane & 1 ? limit : kOff;
-    return Floats::load(value);
+    return FloatPack::load(value);
   }
 };
 
@@ -69,13 +69,13 @@ class TreeSearch {
   // Show again every point that run() has shown and that lies in a box at most `reach` away from some lane:
   // body(x, y, z, id), where row_in_lane(id, lane) is the point's row.
   template <class Body>
-  void replay(const QueryGroup& queries, const Floats& reach, Body&& body) const {
+  void replay(const QueryGroup& queries, const FloatPack& reach, Body&& body) const {
     for (const int64_t index : visited_) {
       if (!lanes_near(queries, tree_.level[0][index / kFanOut], index % kFanOut, reach)) continue;
       const Leaf& leaf = tree_.leaf[index];
       for (int i = 0; i < kLeafSize; ++i)
         if (leaf.row[i] != kNoId)
-          body(Floats(leaf.x[i]), Floats(leaf.y[i]), Floats(leaf.z[i]), leaf.row[i]);
+          body(FloatPack(leaf.x[i]), FloatPack(leaf.y[i]), FloatPack(leaf.z[i]), leaf.row[i]);
     }
   }
 
@@ -85,8 +85,8 @@ class TreeSearch {
     visited_.push_back(index);
     const Leaf& leaf = tree_.leaf[index];
     for (int i = 0; i < kLeafSize; ++i) {
-      const Floats squared = squared_length(Floats(leaf.x[i]) - queries.x, Floats(leaf.y[i]) - queries.y,
-                                            Floats(leaf.z[i]) - queries.z);
+      const FloatPack squared = squared_length(FloatPack(leaf.x[i]) - queries.x, FloatPack(leaf.y[i]) - queries.y,
+                                            FloatPack(leaf.z[i]) - queries.z);
       if (nearest.wants(squared)) nearest.offer(squared, Ids::same(leaf.row[i]));
     }
     nearest.settle();
@@ -95,10 +95,10 @@ class TreeSearch {
   template <class Nearest>
   void descend(const QueryGroup& queries, int level, int64_t block, int skip, Nearest& nearest) {
     const Boxes& boxes = tree_.level[level][block];
-    const Floats gaps = box_gaps(queries, boxes);
+    const FloatPack gaps = box_gaps(queries, boxes);
     // A gap of infinity is a missing box, or one too far for any distance in it to fit a float.
-    LaneMask near = less_equal(gaps, Floats(nearest.widest())) & less(gaps, Floats(kInfinity));
-    if (skip >= 0) near &= ~(LaneMask{1} << skip);
+    PackMask near = less_equal(gaps, FloatPack(nearest.widest())) & less(gaps, FloatPack(kInfinity));
+    if (skip >= 0) near &= ~(PackMask{1} << skip);
     if (near == 0) return;
     Child children[kFanOut];
     const int count = sort_by_gap(gaps, near, children);
@@ -118,7 +118,7 @@ class TreeSearch {
     int slot;
   };
 
-  static int sort_by_gap(const Floats& gaps, LaneMask near, Child (&children)[kFanOut]) {
+  static int sort_by_gap(const FloatPack& gaps, PackMask near, Child (&children)[kFanOut]) {
     alignas(64) float gap[kFanOut];
     gaps.store(gap);
     int count = 0;
@@ -132,22 +132,22 @@ class TreeSearch {
   }
 
   // Squared gaps between the group's box and sixteen boxes.
-  static Floats box_gaps(const QueryGroup& queries, const Boxes& boxes) {
-    Floats gap[3];
+  static FloatPack box_gaps(const QueryGroup& queries, const Boxes& boxes) {
+    FloatPack gap[3];
     for (int axis = 0; axis < 3; ++axis)
-      gap[axis] = maximum(maximum(Floats::load(boxes.low[axis]) - Floats(queries.high[axis]),
-                                  Floats(queries.low[axis]) - Floats::load(boxes.high[axis])),
-                          Floats(0.0f));
+      gap[axis] = maximum(maximum(FloatPack::load(boxes.low[axis]) - FloatPack(queries.high[axis]),
+                                  FloatPack(queries.low[axis]) - FloatPack::load(boxes.high[axis])),
+                          FloatPack(0.0f));
     return squared_length(gap[0], gap[1], gap[2]);
   }
 
   // The lanes whose query has less than `reach` between itself and one box.
-  static LaneMask lanes_near(const QueryGroup& queries, const Boxes& boxes, int64_t slot, const Floats& reach) {
-    const Floats* at[3] = {&queries.x, &queries.y, &queries.z};
-    Floats gap[3];
+  static PackMask lanes_near(const QueryGroup& queries, const Boxes& boxes, int64_t slot, const FloatPack& reach) {
+    const FloatPack* at[3] = {&queries.x, &queries.y, &queries.z};
+    FloatPack gap[3];
     for (int axis = 0; axis < 3; ++axis)
-      gap[axis] = maximum(maximum(Floats(boxes.low[axis][slot]) - *at[axis], *at[axis] - Floats(boxes.high[axis][slot])),
-                          Floats(0.0f));
+      gap[axis] = maximum(maximum(FloatPack(boxes.low[axis][slot]) - *at[axis], *at[axis] - FloatPack(boxes.high[axis][slot])),
+                          FloatPack(0.0f));
     return less_equal(squared_length(gap[0], gap[1], gap[2]), reach);
   }
 
@@ -155,4 +155,4 @@ class TreeSearch {
   std::vector<int64_t> visited_;
 };
 
-}  // namespace pc
+}  // namespace pc::neighbors

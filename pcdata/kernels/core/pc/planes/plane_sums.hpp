@@ -3,15 +3,12 @@
 
 #include <limits>
 
-#include "pc/common.hpp"
-#include "pc/lanes.hpp"
+#include "pc/math/plane.hpp"
+#include "pc/simd.hpp"
 
-namespace pc {
+namespace pc::planes {
 
-// nx*x + ny*y + nz*z + d = 0.
-struct Plane {
-  float x, y, z, d;
-};
+using math::Plane;
 
 // A block of points as one array per coordinate, small enough for the L1 cache beside everything else.
 struct PointBlock {
@@ -34,19 +31,19 @@ struct PointBlock {
 };
 
 // Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance, in separate float operations like the reference.
-inline IntLanes is_near(const Plane& plane, float distance, const FloatLanes& x, const FloatLanes& y,
-                        const FloatLanes& z) {
-  const FloatLanes signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
-  const IntLanes magnitude = reinterpret_cast<IntLanes>(signed_distance) & 0x7FFFFFFF;
-  return reinterpret_cast<FloatLanes>(magnitude) < distance;
+inline Int32Register is_near(const Plane& plane, float distance, const FloatRegister& x, const FloatRegister& y,
+                        const FloatRegister& z) {
+  const FloatRegister signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
+  const Int32Register magnitude = reinterpret_cast<Int32Register>(signed_distance) & 0x7FFFFFFF;
+  return reinterpret_cast<FloatRegister>(magnitude) < distance;
 }
 
 // Add to counts[h] the points of a block near planes[h]. Several planes share each load of a point.
 template <int kTogether>
 inline void count_near(const PointBlock& block, const Plane* planes, float distance, int64_t* counts) {
-  IntLanes near[kTogether] = {};
+  Int32Register near[kTogether] = {};
   for (int i = 0; i < block.count; i += kLanes) {
-    const auto x = load<FloatLanes>(block.x + i), y = load<FloatLanes>(block.y + i), z = load<FloatLanes>(block.z + i);
+    const auto x = load<FloatRegister>(block.x + i), y = load<FloatRegister>(block.y + i), z = load<FloatRegister>(block.z + i);
     // A true lane is -1.
     for (int h = 0; h < kTogether; ++h) near[h] -= is_near(planes[h], distance, x, y, z);
   }
@@ -55,7 +52,7 @@ inline void count_near(const PointBlock& block, const Plane* planes, float dista
 
 typedef double Double8 __attribute__((vector_size(64)));
 
-// Sums over chosen points about a centre, each in eight lanes so that every instruction set adds in the same order.
+// Sums over chosen points about a center, each in eight lanes so that every instruction set adds in the same order.
 struct PlaneMoments {
   Double8 x{}, y{}, z{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
 
@@ -72,4 +69,4 @@ struct PlaneMoments {
   }
 };
 
-}  // namespace pc
+}  // namespace pc::planes

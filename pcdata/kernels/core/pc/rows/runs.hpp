@@ -1,9 +1,10 @@
 // Runs of true bytes in a mask.
 #pragma once
 
-#include "pc/common.hpp"
+#include <cstdint>
+#include <cstring>
 
-namespace pc {
+namespace pc::rows {
 
 struct Run {
   int64_t start, length;
@@ -31,4 +32,4 @@ inline int64_t find_runs(const uint8_t* mask, int64_t first, int64_t last, Run* 
   return found;
 }
 
-}  // namespace pc
+}  // namespace pc::rows

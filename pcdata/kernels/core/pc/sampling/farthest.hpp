@@ -1,12 +1,14 @@
 // Exact farthest point sampling that visits only the points a pick can change.
 #pragma once
 
-#include "pc/common.hpp"
-#include "pc/math/distance.hpp"
-#include "pc/lanes.hpp"
+#include <algorithm>
+#include <vector>
+
+#include "pc/memory.hpp"
+#include "pc/simd.hpp"
 #include "pc/sort/morton_points.hpp"
 
-namespace pc {
+namespace pc::sampling {
 
 // Points in spatial order are cut into leaves of 32, leaves into groups of 16, groups into groups of 16, and so on: an
 // implicit tree without pointers. Every node knows its box, and its farthest point as one number, the key: the bits of
@@ -34,8 +36,8 @@ class FarthestSampler {
   int64_t count() const { return count_; }
   int64_t num_leaf_groups() const { return levels_[0].count; }
 
-  // Where a SpatialSort puts its points.
-  void place(const Placed* points, int64_t count, int64_t at) {
+  // Where sort::MortonPoints puts its points.
+  void place(const sort::PlacedPoint* points, int64_t count, int64_t at) {
     while (count > 0) {
       Leaf& leaf = leaves_[at / kLeaf];
       const int64_t first = at % kLeaf, some = std::min(count, kLeaf - first);
@@ -113,22 +115,22 @@ class FarthestSampler {
 
     // Take note of a pick; return the key of the leaf's farthest point.
     int64_t update(const Pick& pick) {
-      IntLanes far{};
+      Int32Register far{};
       for (int i = 0; i < kLeaf; i += kLanes) {
-        const FloatLanes squared =
-            squared_distance(load<FloatLanes>(x + i), load<FloatLanes>(y + i), load<FloatLanes>(z + i),  //
-                             pick.x, pick.y, pick.z);
+        const FloatRegister squared =
+            squared_length(load<FloatRegister>(x + i) - pick.x, load<FloatRegister>(y + i) - pick.y,
+                           load<FloatRegister>(z + i) - pick.z);
         // Distances are not negative, so their bits compare as they do.
-        IntLanes now = least(reinterpret_cast<IntLanes>(squared), load<IntLanes>(nearest + i));
-        now = load<UintLanes>(row + i) == pick.row ? IntLanes{} + kTaken : now;
+        Int32Register now = minimum(reinterpret_cast<Int32Register>(squared), load<Int32Register>(nearest + i));
+        now = load<Uint32Register>(row + i) == pick.row ? Int32Register{} + kTaken : now;
         store(nearest + i, now);
-        far = i == 0 ? now : greatest(far, now);
+        far = i == 0 ? now : maximum(far, now);
       }
       const int32_t farthest = highest_lane<int32_t>(far);
-      const UintLanes none = UintLanes{} + UINT32_MAX;
-      UintLanes rows = none;
+      const Uint32Register none = Uint32Register{} + UINT32_MAX;
+      Uint32Register rows = none;
       for (int i = 0; i < kLeaf; i += kLanes)
-        rows = least(rows, load<IntLanes>(nearest + i) == farthest ? load<UintLanes>(row + i) : none);
+        rows = minimum(rows, load<Int32Register>(nearest + i) == farthest ? load<Uint32Register>(row + i) : none);
       return int64_t{farthest} * (int64_t{1} << 32) + static_cast<uint32_t>(~lowest_lane<uint32_t>(rows));
     }
   };
@@ -160,8 +162,8 @@ class FarthestSampler {
       set_key(child, below.farthest());
     }
     int64_t farthest() const {
-      auto best = load<LongLanes>(key);
-      for (int i = kLanes / 2; i < kFan; i += kLanes / 2) best = greatest(load<LongLanes>(key + i), best);
+      auto best = load<Int64Register>(key);
+      for (int i = kLanes / 2; i < kFan; i += kLanes / 2) best = maximum(load<Int64Register>(key + i), best);
       return highest_lane<int64_t>(best);
     }
 
@@ -171,15 +173,15 @@ class FarthestSampler {
       if (pick.key >> 32 == 0) return holding(pick);
       uint32_t mask = 0;
       for (int i = 0; i < kFan; i += kLanes) {
-        const FloatLanes dx = gap(0, i, pick.x), dy = gap(1, i, pick.y), dz = gap(2, i, pick.z);
-        mask |= bits_of_lanes(((dx * dx) + (dy * dy)) + (dz * dz) < load<FloatLanes>(bound + i)) << i;
+        const FloatRegister dx = gap(0, i, pick.x), dy = gap(1, i, pick.y), dz = gap(2, i, pick.z);
+        mask |= less(squared_length(dx, dy, dz), load<FloatRegister>(bound + i)).bits() << i;
       }
       return mask;
     }
     uint32_t holding(const Pick& pick) const { return 1u << (std::find(key, key + kFan, pick.key) - key); }
-    FloatLanes gap(int axis, int i, float at) const {
-      const FloatLanes outside = greatest(load<FloatLanes>(low[axis] + i) - at, at - load<FloatLanes>(high[axis] + i));
-      return greatest(outside, FloatLanes{});
+    FloatRegister gap(int axis, int i, float at) const {
+      const FloatRegister outside = maximum(load<FloatRegister>(low[axis] + i) - at, at - load<FloatRegister>(high[axis] + i));
+      return maximum(outside, FloatRegister{});
     }
   };
 
@@ -220,12 +222,12 @@ class FarthestSampler {
       leaf.nearest[i] = kTaken;
       leaf.row[i] = UINT32_MAX;
     }
-    const float* columns[3] = {leaf.x, leaf.y, leaf.z};
+    const float* axes[3] = {leaf.x, leaf.y, leaf.z};
     for (int axis = 0; axis < 3; ++axis) {
-      float low = columns[axis][0], high = low;
+      float low = axes[axis][0], high = low;
       for (int i = 1; i < kLeaf; ++i) {
-        low = std::min(low, columns[axis][i]);
-        high = std::max(high, columns[axis][i]);
+        low = std::min(low, axes[axis][i]);
+        high = std::max(high, axes[axis][i]);
       }
       group.low[axis][child] = low;
       group.high[axis][child] = high;
@@ -266,4 +268,4 @@ class FarthestSampler {
   std::vector<Level> levels_;  // [0] above the leaves, the last a single group
 };
 
-}  // namespace pc
+}  // namespace pc::sampling

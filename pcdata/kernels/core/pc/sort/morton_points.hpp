@@ -1,22 +1,23 @@
-// Points put in an order in which neighbours in memory are neighbours in space.
+// Points put in an order in which neighbors in memory are neighbors in space.
 #pragma once
 
 #include <utility>
 
-#include "pc/common.hpp"
+#include "pc/memory.hpp"
+#include "pc/threads.hpp"
 
-namespace pc {
+namespace pc::sort {
 
 typedef float Float4 __attribute__((vector_size(16)));
 typedef int32_t Int4 __attribute__((vector_size(16)));
 
 // x, y, z and, as bits, the row a point came from: 16 bytes that are compared and moved as one register. (As four
 // members they would be taken apart, and putting them together again costs more than the sort.)
-struct Placed {
+struct PlacedPoint {
   Float4 lanes;
 
-  Placed() = default;
-  Placed(float x, float y, float z, uint32_t row) {
+  PlacedPoint() = default;
+  PlacedPoint(float x, float y, float z, uint32_t row) {
     auto bits = reinterpret_cast<Int4>(Float4{x, y, z, 0});
     bits[3] = static_cast<int32_t>(row);
     lanes = reinterpret_cast<Float4>(bits);
@@ -32,18 +33,18 @@ struct Placed {
 // level measures its own box, so neither a stray point far out nor a dense spot spoils the order.
 //
 // `write(points, count, place)` receives every point once: a run of sorted points, and where in the order it starts.
-class SpatialSort {
+class MortonPoints {
  public:
   // Room for `count` points, 34 bytes each.
-  SpatialSort(ScratchFrame& scratch, int64_t count)
-      : sorted_(scratch.take<Placed>(count)),
-        spare_(scratch.take<Placed>(count)),
+  MortonPoints(ScratchFrame& scratch, int64_t count)
+      : sorted_(scratch.take<PlacedPoint>(count)),
+        spare_(scratch.take<PlacedPoint>(count)),
         keys_(scratch.take<uint16_t>(count)) {}
 
   // Sort points (count, 3) on this thread, in this object's room from `offset` on.
   template <class Write>
   void serial(const float* points, int64_t count, int64_t offset, const Write& write) {
-    Placed* own = sorted_ + offset;
+    PlacedPoint* own = sorted_ + offset;
     for (int64_t i = 0; i < count; ++i) own[i] = at(points, i);
     arrange({own, spare_ + offset, keys_ + offset, count}, 0, write);
   }
@@ -145,7 +146,7 @@ class SpatialSort {
       const float scale = static_cast<float>(1 << bits) / box.half_length();
       per_half = Float4{scale, scale, scale, 0};
     }
-    uint16_t key(const Placed& p) const {
+    uint16_t key(const PlacedPoint& p) const {
       // The row's bits as a float mean nothing and may be anything: not computed with.
       const Float4 inside = reinterpret_cast<Float4>(reinterpret_cast<Int4>(p.lanes) & Int4{-1, -1, -1, 0});
       Int4 cell = __builtin_convertvector((inside * 0.5f - half_low) * per_half, Int4);
@@ -158,14 +159,14 @@ class SpatialSort {
   };
 
   // Points to put in order, and room for as many more and for their keys.
-  struct Range {
-    Placed* points;
-    Placed* spare;
+  struct Stretch {
+    PlacedPoint* points;
+    PlacedPoint* spare;
     uint16_t* keys;
     int64_t count;
   };
 
-  static Placed at(const float* points, int64_t i) {
+  static PlacedPoint at(const float* points, int64_t i) {
     return {points[3 * i], points[3 * i + 1], points[3 * i + 2], static_cast<uint32_t>(i)};
   }
 
@@ -176,7 +177,7 @@ class SpatialSort {
   }
 
   // For one cell, first how many points of a stretch fall into it, then where the next goes; apart for the two halves
-  // of the stretch, worked on in turn: neighbours mostly share a cell, and one count would wait for the other.
+  // of the stretch, worked on in turn: neighbors mostly share a cell, and one count would wait for the other.
   struct Places {
     uint32_t in_first, in_second;
 
@@ -198,7 +199,7 @@ class SpatialSort {
   }
 
   template <class Get>
-  static void move_to_cells(const Get& get, const uint16_t* keys, int64_t count, Placed* to, Places* places) {
+  static void move_to_cells(const Get& get, const uint16_t* keys, int64_t count, PlacedPoint* to, Places* places) {
     const int64_t half = count / 2;
     for (int64_t i = 0; i < half; ++i) {
       to[places[keys[i]].in_first++] = get(i);
@@ -210,7 +211,7 @@ class SpatialSort {
   // Every level cuts the longest side by 4 or more, so floats end the recursion after 138 levels at the latest; a cell
   // that holds all points ends it too.
   template <class Write>
-  static void arrange(const Range& all, int64_t place, const Write& write) {
+  static void arrange(const Stretch& all, int64_t place, const Write& write) {
     if (all.count <= kEnough) return write(all.points, all.count, place);
     auto get = [from = all.points](int64_t i) { return from[i]; };
     const Box box = Box::of(get, all.count);
@@ -237,9 +238,9 @@ class SpatialSort {
     write(all.spare + written, all.count - written, place + written);
   }
 
-  Placed* sorted_;
-  Placed* spare_;
+  PlacedPoint* sorted_;
+  PlacedPoint* spare_;
   uint16_t* keys_;
 };
 
-}  // namespace pc
+}  // namespace pc::sort

@@ -1,24 +1,24 @@
 // Rows sorted along a Morton (Z-order) curve, for clouds of any density.
-//
-// Source: Morton, A computer oriented geodetic data base, IBM 1966.
 #pragma once
 
 #include <mutex>
 #include <utility>
 
-#include "pc/common.hpp"
+#include "pc/bounds.hpp"
+#include "pc/math/morton.hpp"
+#include "pc/sort/radix.hpp"
 
-namespace pc {
+namespace pc::sort {
 
 // Sorts rows of points by the cell they lie in. A key is a 33-bit Morton code (11 bits per axis) above the 31-bit row,
 // so equal cells keep the order of rows. A run of more than `kCrowd` equal codes is coded again in its own cube: one
-// stray point a kilometre away does not blur the order of the rest, and only equal points stay together.
-class MortonSort {
+// stray point a kilometer away does not blur the order of the rest, and only equal points stay together.
+class MortonRows {
  public:
   static constexpr int64_t kMaxRows = int64_t{1} << 31;
 
   // Fill keys[0, end-begin) with the rows [begin, end) of points (N, 3) in Morton order; `spare` is as long.
-  MortonSort(const pc_context& context, const float* points) : context_(context), points_(points) {}
+  MortonRows(const pc_context& context, const float* points) : context_(context), points_(points) {}
 
   static uint32_t row(uint64_t key) { return static_cast<uint32_t>(key & kRowMask); }
 
@@ -49,57 +49,27 @@ class MortonSort {
   static constexpr int64_t kRadixFrom = 768;  // shorter runs are faster by comparison
 
   struct Cube {
-    double low[3] = {0, 0, 0};
+    double low[3];
     double per_length = 0;  // 0: all points are equal
 
-    uint64_t code(const float* p) const {
-      return spread(cell(p[0], 0)) << 2 | spread(cell(p[1], 1)) << 1 | spread(cell(p[2], 2));
+    explicit Cube(const math::Bounds& bounds) {
+      for (int axis = 0; axis < 3; ++axis) low[axis] = bounds.low[axis];
+      const double longest = bounds.extent();
+      if (longest > 0) per_length = (kCells - 1) / longest;
     }
+    uint64_t code(const float* p) const { return math::morton_code(cell(p[0], 0), cell(p[1], 1), cell(p[2], 2)); }
 
    private:
     uint64_t cell(float value, int axis) const {
       return static_cast<uint64_t>(static_cast<int32_t>((double(value) - low[axis]) * per_length));
     }
-    // Put two zero bits between the 11 bits of a value.
-    static uint64_t spread(uint64_t v) {
-      v = (v | v << 16) & 0x70000FF;
-      v = (v | v << 8) & 0x700F00F;
-      v = (v | v << 4) & 0x430C30C3;
-      return (v | v << 2) & 0x49249249;
-    }
-  };
-
-  struct Bounds {
-    float low[3], high[3];
-
-    explicit Bounds(const float* p) : low{p[0], p[1], p[2]}, high{p[0], p[1], p[2]} {}
-    void include(const float* lower, const float* upper) {
-      for (int axis = 0; axis < 3; ++axis) {
-        low[axis] = lower[axis] < low[axis] ? lower[axis] : low[axis];
-        high[axis] = upper[axis] > high[axis] ? upper[axis] : high[axis];
-      }
-    }
-    Cube cube() const {
-      Cube cube;
-      double longest = 0;
-      for (int axis = 0; axis < 3; ++axis) {
-        cube.low[axis] = low[axis];
-        longest = std::max(longest, double(high[axis]) - double(low[axis]));
-      }
-      if (longest > 0) cube.per_length = (kCells - 1) / longest;
-      return cube;
-    }
-  };
-
-  struct Run {
-    int64_t begin, end;
   };
 
   const float* point(uint64_t key) const { return points_ + 3 * int64_t{row(key)}; }
 
-  Bounds bounds(const uint64_t* keys, int64_t count) const {
-    Bounds all(point(keys[0]));
-    for (int64_t i = 1; i < count; ++i) all.include(point(keys[i]), point(keys[i]));
+  math::Bounds bounds(const uint64_t* keys, int64_t count) const {
+    auto all = math::Bounds::of_point(point(keys[0]));
+    for (int64_t i = 1; i < count; ++i) all.include(point(keys[i]));
     return all;
   }
 
@@ -110,7 +80,7 @@ class MortonSort {
   // Keys hold rows in ascending order on entry.
   void sort_serial(uint64_t* keys, uint64_t* spare, int64_t count) const {
     if (count <= 1) return;
-    const Cube cube = bounds(keys, count).cube();
+    const Cube cube(bounds(keys, count));
     if (cube.per_length == 0) return;
     encode(cube, keys, 0, count);
     if (count < kRadixFrom) {
@@ -123,51 +93,36 @@ class MortonSort {
       }
       std::swap(keys, spare);  // three passes: the result is where it should be
     }
-    for_crowded_runs(keys, 0, count, [&](Run run) { sort_serial_again(keys, spare, run); });
+    for_crowded_runs(keys, 0, count, [&](Range run) { sort_serial_again(keys, spare, run); });
   }
 
-  void sort_serial_again(uint64_t* keys, uint64_t* spare, Run run) const {
+  void sort_serial_again(uint64_t* keys, uint64_t* spare, Range run) const {
     forget_codes(keys, run.begin, run.end);
     sort_serial(keys + run.begin, spare + run.begin, run.end - run.begin);
   }
 
   void sort_parallel(uint64_t* keys, uint64_t* spare, int64_t count) const {
-    const Cube cube = parallel_bounds(keys, count).cube();
+    const Cube cube(parallel_bounds(keys, count));
     if (cube.per_length == 0) return;
-    const int64_t chunks = (count + kChunk - 1) / kChunk;
-    std::vector<int64_t> starts(static_cast<size_t>(chunks) * kCells, 0);  // (chunk, top digit)
-    parallel_for(context_, chunks, 1, [&](int64_t c, int64_t, int64_t) {
-      const int64_t begin = c * kChunk, end = std::min(count, begin + kChunk);
-      encode(cube, keys, begin, end);
-      int64_t* counts = starts.data() + c * kCells;
-      for (int64_t i = begin; i < end; ++i) ++counts[digit_of(keys[i], 2)];
-    });
-    std::vector<int64_t> bucket(kCells + 1, 0);
-    int64_t total = 0;
-    for (int64_t d = 0; d < kCells; ++d) {
-      bucket[size_t(d)] = total;
-      for (int64_t c = 0; c < chunks; ++c) total += std::exchange(starts[size_t(c * kCells + d)], total);
-    }
-    bucket[kCells] = total;
-    parallel_for(context_, chunks, 1, [&](int64_t c, int64_t, int64_t) {
-      int64_t* next = starts.data() + c * kCells;
-      for (int64_t i = c * kChunk, end = std::min(count, i + kChunk); i < end; ++i)
-        spare[next[digit_of(keys[i], 2)]++] = keys[i];
-    });
+    const std::vector<Range> chunks = chunks_of(count);
+    std::vector<uint32_t> places(chunks.size() * kCells), bucket(kCells + 1);
+    bucket[kCells] = counting_pass(
+        context_, chunks, kCells, places.data(), [&](Range chunk) { encode(cube, keys, chunk.begin, chunk.end); },
+        [=](int64_t i) { return digit_of(keys[i], 2); }, [=](int64_t i) { return keys[i]; }, spare, bucket.data());
     std::mutex mutex;
-    std::vector<Run> large;
+    std::vector<Range> large;
     parallel_for(context_, kCells, 4, [&](int64_t first, int64_t last, int64_t) {
       for (int64_t d = first; d < last; ++d) {
-        const int64_t begin = bucket[size_t(d)], size = bucket[size_t(d) + 1] - begin;
+        const int64_t begin = bucket[size_t(d)], size = int64_t{bucket[size_t(d) + 1]} - begin;
         sort_bucket(keys + begin, spare + begin, size);
-        for_crowded_runs(keys, begin, begin + size, [&](Run run) {
+        for_crowded_runs(keys, begin, begin + size, [&](Range run) {
           if (run.end - run.begin < kParallelFrom) return sort_serial_again(keys, spare, run);
           const std::lock_guard<std::mutex> lock(mutex);
           large.push_back(run);
         });
       }
     });
-    for (const Run run : large) {
+    for (const Range run : large) {
       forget_codes(keys, run.begin, run.end);
       sort_parallel(keys + run.begin, spare + run.begin, run.end - run.begin);
     }
@@ -206,7 +161,7 @@ class MortonSort {
       }
       int64_t stop = i + kCrowd + 1;
       while (stop < end && keys[stop] >> kRowBits == code) ++stop;
-      body(Run{i, stop});
+      body(Range{i, stop});
       i = stop;
     }
   }
@@ -215,15 +170,20 @@ class MortonSort {
     for (int64_t i = begin; i < end; ++i) keys[i] &= kRowMask;
   }
 
-  Bounds parallel_bounds(const uint64_t* keys, int64_t count) const {
-    const int64_t chunks = (count + kChunk - 1) / kChunk;
-    std::vector<Bounds> parts(static_cast<size_t>(chunks), Bounds(point(keys[0])));
-    parallel_for(context_, chunks, 1, [&](int64_t c, int64_t, int64_t) {
-      const int64_t begin = c * kChunk;
-      parts[size_t(c)] = bounds(keys + begin, std::min(count, begin + kChunk) - begin);
+  math::Bounds parallel_bounds(const uint64_t* keys, int64_t count) const {
+    const std::vector<Range> chunks = chunks_of(count);
+    std::vector<math::Bounds> parts(chunks.size());
+    parallel_for(context_, static_cast<int64_t>(chunks.size()), 1, [&](int64_t c, int64_t, int64_t) {
+      const Range chunk = chunks[size_t(c)];
+      parts[size_t(c)] = bounds(keys + chunk.begin, chunk.size());
     });
-    for (const Bounds& part : parts) parts[0].include(part.low, part.high);
-    return parts[0];
+    return hull(parts);
+  }
+
+  static std::vector<Range> chunks_of(int64_t count) {
+    std::vector<Range> chunks;
+    for (int64_t begin = 0; begin < count; begin += kChunk) chunks.push_back({begin, std::min(count, begin + kChunk)});
+    return chunks;
   }
 
   static constexpr int64_t kChunk = 1 << 15;
@@ -232,4 +192,4 @@ class MortonSort {
   const float* points_;
 };
 
-}  // namespace pc
+}  // namespace pc::sort

@@ -1,11 +1,13 @@
 // The distances of a block and of what is around it: which edges of the grid cross zero, and the slopes there.
 #pragma once
 
+#include <cstring>
+
+#include "pc/simd.hpp"
 #include "pc/tsdf/walk.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 
-constexpr int kSlab = kEdge * kEdge;  // voxels of one z
 constexpr int16_t kUnseen = -32768;   // no stored distance: those end at -32767
 
 struct Field {
@@ -79,13 +81,13 @@ class EdgeEnds {
 
   // Apart in sign, by at most 32767: 16 bits hold the difference. An unseen end is too far from one of the other sign.
   static uint64_t crossing(const int16_t* here, const int16_t* there) {
-    int8_t truth[kSlab];
+    int8_t crosses[kSlab];
     for (int i = 0; i < kSlab; ++i) {
       const int16_t low = std::min(here[i], there[i]), high = std::max(here[i], there[i]);
       const auto apart = static_cast<int16_t>(high - low);
-      truth[i] = static_cast<int8_t>((low & ~high & ~apart) >> 15);
+      crosses[i] = static_cast<int8_t>((low & ~high & ~apart) >> 15);
     }
-    return signs_of(truth);
+    return signs_of(crosses);
   }
 
   int16_t value_[kPitch * (kEdge + 1)];
@@ -101,17 +103,17 @@ constexpr int kPlaces = kSide * kSide * kLine;
 constexpr int place_of(int x, int y, int z) { return ((z + 2) * kSide + (y + 2)) * kLine + (x + 2); }
 
 // Lines of the block with its margin, both ends within.
-struct Range {
+struct LineRange {
   int y0, y1, z0, z1;
 
-  Range wider(int y, int z) const { return {y0 - y, y1 + y, z0 - z, z1 + z}; }
+  LineRange wider(int y, int z) const { return {y0 - y, y1 + y, z0 - z, z1 + z}; }
   // Call body(first place, last place + 1) for every z: lines follow one another.
   template <class Body>
   void each(const Body& body) const {
     for (int z = z0; z <= z1; ++z) body(place_of(-2, y0, z), place_of(-2, y1 + 1, z));
   }
   // The lines on which the ends of marked edges lie.
-  static Range of(const Marks& marks) {
+  static LineRange of(const Marks& marks) {
     uint64_t all = 0;
     int z0 = kEdge, z1 = 0;
     for (int z = 0; z < kEdge; ++z)
@@ -124,9 +126,9 @@ struct Range {
   }
 };
 
-class Neighbourhood {
+class BlockMargin {
  public:
-  void fill(const Distances near[27], const Range& lines) {
+  void fill(const Distances near[27], const LineRange& lines) {
     for (int z = lines.z0; z <= lines.z1; ++z)
       for (int y = lines.y0; y <= lines.y1; ++y) {
         const Distances* three = near + 13 + 3 * (y >> 3) + 9 * (z >> 3);
@@ -144,7 +146,7 @@ class Neighbourhood {
   // side, weighted 4, 2, 1 from the middle to the corners of the 3 x 3 lines along the axis; and 2^24 times the sum of
   // the steps, weighted likewise. A pair with an unseen end does not count. Both sums fit one number: the steps' is at
   // most 16 * (1 + 2) = 48, the rises' size at most 16 * 2 * 65534 < 2^23.
-  void find_slopes(const Range& lines) {
+  void find_slopes(const LineRange& lines) {
     constexpr int widen_y[3] = {1, 0, 1}, widen_z[3] = {1, 1, 0}, one[3] = {1, 0, 0}, other[3] = {2, 2, 1};
     for (int axis = 0; axis < 3; ++axis) {
       pair_up(kStride[axis], lines.wider(widen_y[axis], widen_z[axis]));
@@ -158,7 +160,7 @@ class Neighbourhood {
   int16_t value(int place) const { return value_[kBefore + place]; }
   int32_t slope(int axis, int place) const { return slopes_[axis][kBefore + place]; }
 
-  // The rise to the one neighbour that was seen, twice if there are two, none if there is none.
+  // The rise to the one neighbor that was seen, twice if there are two, none if there is none.
   float rise_to_seen(int place, int axis) const {
     const int16_t here = value(place), below = value(place - kStride[axis]), above = value(place + kStride[axis]);
     return static_cast<float>((above == kUnseen ? here : above) - (below == kUnseen ? here : below));
@@ -168,7 +170,7 @@ class Neighbourhood {
   static constexpr int kBefore = 16;  // room that loops over whole lines may read, its content goes nowhere
   static constexpr int kRoom = kBefore + kPlaces + 2 * kLine;
 
-  void pair_up(int stride, const Range& lines) {
+  void pair_up(int stride, const LineRange& lines) {
     lines.each([&](int begin, int end) {
       const int16_t* middle = value_ + kBefore;
       int32_t* to = pairs_ + kBefore;
@@ -180,7 +182,7 @@ class Neighbourhood {
     const int32_t both = (step << 24) + (above - below);
     return (below != kUnseen) & (above != kUnseen) ? both : 0;
   }
-  static void smooth(const int32_t* from, int stride, int32_t* to, const Range& lines) {
+  static void smooth(const int32_t* from, int stride, int32_t* to, const LineRange& lines) {
     lines.each([&](int begin, int end) {
       for (int i = kBefore + begin; i < kBefore + end; ++i) to[i] = from[i - stride] + 2 * from[i] + from[i + stride];
     });
@@ -190,4 +192,4 @@ class Neighbourhood {
   alignas(64) int32_t pairs_[kRoom] = {}, half_[kRoom] = {}, slopes_[3][kRoom] = {};
 };
 
-}  // namespace pc
+}  // namespace pc::tsdf

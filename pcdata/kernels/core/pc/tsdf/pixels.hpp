@@ -4,15 +4,15 @@
 
 #include "pc/tsdf/view.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 
 // Pixels looked up in the image, by their number.
 struct ImagePixels {
   template <class T>
   class Table {
    public:
-    Table(const View&, const SeenBlock&, const T* image) : image_(image) {}
-    auto at(const IntLanes& place) const { return gather(image_, place); }
+    Table(const FusedView&, const ProjectedBlock&, const T* image) : image_(image) {}
+    auto at(const Int32Register& place) const { return gather(image_, place); }
 
    private:
     const T* image_;
@@ -20,15 +20,15 @@ struct ImagePixels {
 
   class Places {
    public:
-    Places(const View& view, const SeenBlock&) : width_(IntLanes{} + static_cast<int32_t>(view.width)) {}
-    IntLanes of(const IntLanes& u, const IntLanes& v) const { return v * width_ + u; }
+    Places(const FusedView& view, const ProjectedBlock&) : width_(Int32Register{} + static_cast<int32_t>(view.width)) {}
+    Int32Register of(const Int32Register& u, const Int32Register& v) const { return v * width_ + u; }
 
    private:
-    IntLanes width_;
+    Int32Register width_;
   };
 };
 
-#if defined(__AVX512DQ__)
+#if defined(PC_AVX512)
 // Pixels of a small window, looked up by permuting registers: a gather takes as long as eight of these. Places count
 // from the first pixel of the window.
 template <int kEntries>
@@ -36,7 +36,7 @@ struct TablePixels {
   template <class T>
   class Table {
    public:
-    Table(const View& view, const SeenBlock& block, const T* image) {
+    Table(const FusedView& view, const ProjectedBlock& block, const T* image) {
       const T* from = image + block.v * view.width + block.u;
       for (int i = 0; i < kRegisters; ++i) {
         if (block.shift == 4) {
@@ -50,9 +50,9 @@ struct TablePixels {
         }
       }
     }
-    auto at(const IntLanes& place) const {
+    auto at(const Int32Register& place) const {
       typedef T Lanes __attribute__((vector_size(4 * kLanes)));
-      return reinterpret_cast<Lanes>(find<kRegisters>(rows_, raw(place)));
+      return reinterpret_cast<Lanes>(find<kRegisters>(rows_, native(place)));
     }
 
    private:
@@ -73,15 +73,15 @@ struct TablePixels {
 
   class Places {
    public:
-    Places(const View&, const SeenBlock& block)
-        : shift_(block.shift), first_(IntLanes{} + ((block.v << block.shift) + block.u)) {}
-    IntLanes of(const IntLanes& u, const IntLanes& v) const { return (v << shift_) + u - first_; }
+    Places(const FusedView&, const ProjectedBlock& block)
+        : shift_(block.shift), first_(Int32Register{} + ((block.v << block.shift) + block.u)) {}
+    Int32Register of(const Int32Register& u, const Int32Register& v) const { return (v << shift_) + u - first_; }
 
    private:
     int32_t shift_;
-    IntLanes first_;
+    Int32Register first_;
   };
 };
 #endif
 
-}  // namespace pc
+}  // namespace pc::tsdf

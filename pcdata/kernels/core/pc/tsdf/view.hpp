@@ -1,27 +1,28 @@
 // One view of a truncated signed distance field, and which pixels and voxels of a block can meet.
 #pragma once
 
+#include <algorithm>
 #include <limits>
 
+#include "pc/simd.hpp"
 #include "pc/tsdf/grid.hpp"
-#include "pc/truth.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 
 constexpr int kGroups = kVoxels / kLanes;  // of voxels updated together
 
 // Where two registers can be permuted as one, pixels of small windows are found in registers instead of in memory.
-#if defined(__AVX512DQ__)
+#if defined(PC_AVX512)
 constexpr bool kHasTables = true;
 #else
 constexpr bool kHasTables = false;
 #endif
 constexpr int kSmallestTable = 64, kLargestTable = 256;  // pixels
 
-struct View {
+struct FusedView {
   const float* depth;     // (height, width)
   const int32_t* weight;  // the same; null = 1 everywhere
-  const int32_t* color;   // r | g << 10 | b << 20, in steps of a stored colour, or null
+  const int32_t* color;   // r | g << 10 | b << 20, in steps of a stored color, or null
   const int32_t* label;   // or null
   int64_t height, width;
   const double* pose;     // (3, 4) image from world: pixel and depth, but the camera's frame where there is a lens
@@ -36,16 +37,16 @@ struct View {
 typedef float Corners __attribute__((vector_size(32)));  // one number for each corner of a block
 
 inline float lowest(const Corners& x) {
-  return reduce<float>(x, [](const auto& a, const auto& b) { return least(a, b); });
+  return reduce<float>(x, [](const auto& a, const auto& b) { return minimum(a, b); });
 }
 inline float highest(const Corners& x) {
-  return reduce<float>(x, [](const auto& a, const auto& b) { return greatest(a, b); });
+  return reduce<float>(x, [](const auto& a, const auto& b) { return maximum(a, b); });
 }
 
 // A block as a view sees it.
-struct SeenBlock {
+struct ProjectedBlock {
   int64_t row;
-  float first[3];     // its first voxel, as View::pose maps it
+  float first[3];     // its first voxel, as FusedView::pose maps it
   bool inside;        // every voxel falls on a pixel, further away than no reading (0) could be near
   int32_t entries;    // of the table that holds these pixels; 0 where they are too many for one
   int32_t u, v;       // the first pixel of the table
@@ -63,9 +64,9 @@ struct SeenBlock {
 };
 
 // What all blocks of a view share.
-class Sight {
+class BlockProjector {
  public:
-  explicit Sight(const View& view) : view_(view) {
+  explicit BlockProjector(const FusedView& view) : view_(view) {
     constexpr int across = kEdge - 1, last[3] = {across, across * kEdge, across * kEdge * kEdge};
     for (int i = 0; i < 8; ++i)
       for (int a = 0; a < 3; ++a)
@@ -78,24 +79,24 @@ class Sight {
   }
 
   // Nothing is missed: a group that is left out has no voxel that the view updates.
-  SeenBlock of(int64_t key, int64_t row) const {
-    SeenBlock seen;
+  ProjectedBlock of(int64_t key, int64_t row) const {
+    ProjectedBlock seen;
     seen.row = row;
     place(key, seen.first);
     seen.inside = false;
     seen.entries = 0;
     constexpr float everything = std::numeric_limits<float>::infinity();
-    Range range{-everything, everything};
+    DepthRange range{-everything, everything};
     if (view_.lens == nullptr) range = look(seen);
     mark(range, seen);
     return seen;
   }
 
  private:
-  struct Range {
+  struct DepthRange {
     float low, high;
   };
-  static constexpr Range kNothing{1, -1};
+  static constexpr DepthRange kNothing{1, -1};
 
   void place(int64_t key, float* first) const {
     const BlockPlace block = BlockPlace::of(key);
@@ -110,7 +111,7 @@ class Sight {
 
   // The depths at which voxels of a block may be updated. The pixels of a block are those between its corners';
   // rounding moves them by less than the margin as long as the block is not much deeper than it is near.
-  Range look(SeenBlock& seen) const {
+  DepthRange look(ProjectedBlock& seen) const {
     constexpr float margin = 1.0f / 16, everything = std::numeric_limits<float>::infinity();
     constexpr int64_t widest = int64_t{1} << 15;
     const Corners z = seen.first[2] + corners_[2];
@@ -135,7 +136,7 @@ class Sight {
   }
 
   // The smallest table that holds a window, moved inwards at the borders of the image.
-  void choose_table(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v, SeenBlock& seen) const {
+  void choose_table(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v, ProjectedBlock& seen) const {
     for (int32_t entries = kSmallestTable; entries <= kLargestTable; entries *= 2)
       for (int32_t shift = 3; shift <= 4; ++shift) {
         const int32_t width = 1 << shift, height = entries >> shift;
@@ -151,19 +152,19 @@ class Sight {
   }
 
   // The range of the readings in some pixels; it may take more pixels in.
-  Range readings(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v) const {
+  DepthRange readings(int32_t first_u, int32_t last_u, int32_t first_v, int32_t last_v) const {
     constexpr float everything = std::numeric_limits<float>::infinity();
     constexpr int32_t most = 64;  // pixels each way: looking at more costs more than it saves
     const int64_t pixels = view_.width * view_.height;
     if (last_u - first_u >= most || last_v - first_v >= most || pixels < kLanes) return {0, everything};
-    const FloatLanes none = FloatLanes{} + everything;
-    FloatLanes low = none, high = {};
+    const FloatRegister none = FloatRegister{} + everything;
+    FloatRegister low = none, high = {};
     for (int64_t v = first_v; v <= last_v; ++v)
       for (int64_t u = first_u; u <= last_u; u += kLanes) {
-        const auto depth = load<FloatLanes>(view_.depth + std::min(v * view_.width + u, pixels - kLanes));
-        const Truth read = less(FloatLanes{}, depth);
-        high = greatest(high, select(read, depth, FloatLanes{}));
-        low = least(low, select(read, depth, none));
+        const auto depth = load<FloatRegister>(view_.depth + std::min(v * view_.width + u, pixels - kLanes));
+        const RegisterMask read = less(FloatRegister{}, depth);
+        high = maximum(high, select(read, depth, FloatRegister{}));
+        low = minimum(low, select(read, depth, none));
       }
     return {lowest_lane<float>(low), highest_lane<float>(high)};
   }
@@ -171,26 +172,27 @@ class Sight {
   float truncation() const { return kTsdfScale / view_.scale * 1.00001f; }
 
   // By the truncation, and a little more than rounding may cost.
-  Range widened(Range depth) const {
+  DepthRange widened(DepthRange depth) const {
     if (!(depth.high > 0)) return kNothing;
     const float low = view_.carve ? 0 : depth.low - depth.low * 1e-6f - truncation();
     return {low, depth.high + depth.high * 1e-6f + truncation()};
   }
 
-  void mark(Range range, SeenBlock& seen) const {
+  void mark(DepthRange range, ProjectedBlock& seen) const {
     seen.clear();
+    const FloatRegister zero = {};
     if (range.low > range.high) return;
     for (int g = 0; g < kGroups; g += kLanes) {
-      const FloatLanes low = seen.first[2] + load<FloatLanes>(low_ + g);
-      const FloatLanes high = seen.first[2] + load<FloatLanes>(high_ + g);
-      const uint32_t bits = bits_of_lanes((low <= range.high) & (high >= range.low) & (high > 0));
-      seen.groups[g / 32] |= bits << g % 32;
+      const FloatRegister low = seen.first[2] + load<FloatRegister>(low_ + g);
+      const FloatRegister high = seen.first[2] + load<FloatRegister>(high_ + g);
+      const RegisterMask near = less_equal(low, zero + range.high) & less_equal(zero + range.low, high) & less(zero, high);
+      seen.groups[g / 32] |= near.bits() << g % 32;
     }
   }
 
-  const View& view_;
+  const FusedView& view_;
   Corners corners_[3];
   float low_[kGroups], high_[kGroups];
 };
 
-}  // namespace pc
+}  // namespace pc::tsdf

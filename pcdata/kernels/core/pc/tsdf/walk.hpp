@@ -1,9 +1,12 @@
 // Walking through the blocks of a field in the order of their keys, with the blocks around each at hand.
 #pragma once
 
+#include <algorithm>
+#include <vector>
+
 #include "pc/tsdf/grid.hpp"
 
-namespace pc {
+namespace pc::tsdf {
 
 struct SortedBlocks {
   const int64_t *keys, *rows;  // (count,) keys, rising, and the row of each
@@ -53,22 +56,4 @@ class Surroundings {
   std::vector<Column> columns_;
 };
 
-// One bit per number of 64: whether it is negative.
-inline uint64_t signs_of(const int8_t* numbers) {
-#if defined(__AVX512BW__)
-  return _mm512_movepi8_mask(_mm512_loadu_si512(numbers));
-#elif defined(__SSE2__)
-  uint64_t bits = 0;
-  for (int i = 0; i < 4; ++i) {
-    const __m128i some = _mm_loadu_si128(reinterpret_cast<const __m128i*>(numbers + 16 * i));
-    bits |= static_cast<uint64_t>(static_cast<uint32_t>(_mm_movemask_epi8(some))) << 16 * i;
-  }
-  return bits;
-#else
-  uint64_t bits = 0;
-  for (int i = 0; i < 64; ++i) bits |= static_cast<uint64_t>(numbers[i] < 0) << i;
-  return bits;
-#endif
-}
-
-}  // namespace pc
+}  // namespace pc::tsdf

@@ -1,27 +1,19 @@
-// The direction in which a neighbourhood varies least, in closed form; device-neutral.
+// The direction in which a neighborhood varies least, in closed form.
 //
 // Source: Eberly, A robust eigensolver for 3x3 symmetric matrices, Geometric Tools, 2014-2023, the non-iterative
 // algorithm, without its trigonometric functions: the one eigenvalue it needs comes from a cubic by Newton steps, the
-// rotation in its second half from square roots. All selections are conditional moves, so loops over it vectorise.
+// rotation in its second half from square roots. All selections are conditional moves, so loops over it vectorize.
 #pragma once
 
-#include "pc/math/distance.hpp"
+#include "pc/math/vector.hpp"
 
-#if !defined(__CUDACC__)
-#include <cmath>
-#endif
-
-namespace pc {
-
-struct Vector3 {
-  double x, y, z;
-};
+namespace pc::math {
 
 struct Symmetric3 {
   double xx, xy, xz, yy, yz, zz;
 };
 
-// Sums over the offsets of neighbours from their query: they keep all digits however far the cloud is from the origin.
+// Sums over the offsets of neighbors from their query: they keep all digits however far the cloud is from the origin.
 struct Moments {
   double count, x, y, z;
   Symmetric3 square;
@@ -30,26 +22,9 @@ struct Moments {
 // Differences of covariances (scaled to entries of at most 1) and of unit vectors that are rounding, not shape.
 constexpr double kRound = 1e-12;
 
-PC_HD double larger(double a, double b) { return a > b ? a : b; }
-
-PC_HD Vector3 cross(const Vector3& a, const Vector3& b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-
-PC_HD double dot(const Vector3& a, const Vector3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-
 PC_HD Vector3 times(const Symmetric3& m, const Vector3& v) {
   return {m.xx * v.x + m.xy * v.y + m.xz * v.z, m.xy * v.x + m.yy * v.y + m.yz * v.z,
           m.xz * v.x + m.yz * v.y + m.zz * v.z};
-}
-
-PC_HD Vector3 choose(bool first, const Vector3& a, const Vector3& b) {
-  return {first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z};
-}
-
-PC_HD Vector3 unit(const Vector3& v) {
-  const double length = sqrt(dot(v, v)), divisor = length > 0 ? length : 1.0;
-  return {v.x / divisor, v.y / divisor, v.z / divisor};
 }
 
 PC_HD Symmetric3 covariance(const Moments& m) {
@@ -132,10 +107,10 @@ PC_HD Vector3 positive_last(const Vector3& v) {
   return {sign * v.x + 0.0, sign * v.y + 0.0, sign * v.z + 0.0};
 }
 
-// Fewer than three neighbours span no plane.
+// Fewer than three neighbors span no plane.
 PC_HD Vector3 normal_of(const Moments& m) {
   const Vector3 normal = smallest_eigenvector(covariance(m));
   return positive_last(choose(m.count < 3, {0.0, 0.0, 1.0}, normal));
 }
 
-}  // namespace pc
+}  // namespace pc::math

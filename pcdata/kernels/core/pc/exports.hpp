@@ -1,0 +1,253 @@
+// The interface of the compiled core: every function that Python calls, and nothing else.
+//
+// Types of arguments are read from here (write_signatures.py), and a hash of the declarations is the number of the
+// interface: Python refuses a library that was built from others. All but the first two functions return a status.
+//
+// Arrays are contiguous, shapes are given row by row. Points, rays and directions are float32 (N, 3); ptr are the row
+// pointers of ragged clouds; sources, picked and other addresses are int64. What may be null says so.
+#pragma once
+
+#include <cstdint>
+
+#define PC_EXPORT extern "C" __attribute__((visibility("default")))
+
+// What Python passes to every call.
+struct pc_context {
+  int32_t threads;    // how many may work, the caller included
+  int32_t (*poll)();  // asked now and then by the calling thread; non-zero = stop (Ctrl-C); may be null
+};
+
+// -- the library itself -----------------------------------------------------------------------------------------------
+
+// A hash of the declarations in this file.
+PC_EXPORT int64_t pc_interface_number();
+
+// Only meaningful in the baseline library, which runs everywhere: 0 baseline, 1 avx2, 2 avx512.
+PC_EXPORT int32_t pc_best_instruction_set();
+
+// Ask for huge pages in blocks that are about to be filled: a page fault costs more than filling its 4 KB, and a huge
+// page takes one for 2 MB. Advice only, content stays. The huge pages at both ends count as well, or blocks of a few
+// megabytes, one behind the other in the heap, would get half of theirs: what else lies there is already in memory, and
+// stays as it is, or is free.
+PC_EXPORT int32_t pc_advise_huge_pages(const pc_context* context, int64_t count, const int64_t* addresses,
+                                       const int64_t* bytes);
+
+// -- depth images -----------------------------------------------------------------------------------------------------
+
+// Which pixels of depth (views, height, width) become points: keep (views, height, width) becomes 1 there. A pixel does
+// if its depth is positive, within [near, far], inside the mask, and its point, moved by the matrix of its view, inside
+// the box lower, upper (3,); the last three may be null. Also counted: readings
+// (views,) are the pixels that the box decided about, and starts (views * height + 1,) where the points of each image row
+// start. *possible becomes 0, and nothing else is certain, if a depth is negative or not a number, or if a reading has no
+// ray or no finite point.
+//
+// Rays of pinhole cameras without distortion: x/z of every column (views, width), y/z of every image row (views, height).
+// Or those of any cameras: x/z and y/z of every pixel (views, height, width, 2). The others are null.
+PC_EXPORT int32_t pc_choose_pixels(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                   int64_t width, const float* column_rays, const float* row_rays, const float* rays,
+                                   double near, double far, const uint8_t* mask, const double* matrices,
+                                   const float* lower, const float* upper, uint8_t* keep, int64_t* readings,
+                                   int64_t* starts, int64_t* possible);
+
+// The pixels that pc_choose_pixels kept -> points (M, 3) moved by the matrices, pixel_index (M,), and the rows of the
+// companions. Takes its rays and matrices.
+PC_EXPORT int32_t pc_deproject(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                               int64_t width, const float* column_rays, const float* row_rays, const float* rays,
+                               const double* matrices, const uint8_t* keep, const int64_t* starts, float* points,
+                               int64_t* pixel_index, int64_t over_all_views, const uint8_t* rgb, float* colors,
+                               int64_t num_copied, const int64_t* sources, const int64_t* pixel_bytes,
+                               const int64_t* copies);
+
+// masked (count,) = depth where it is positive, within [near, far] and inside the mask, which may be null; 0 elsewhere.
+PC_EXPORT int32_t pc_mask_depth(const pc_context* context, const float* depth, int64_t count, double near, double far,
+                                const uint8_t* mask, float* masked);
+
+// Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of
+// that shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels.
+// Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null.
+// *possible becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be
+// computed with.
+PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                    int64_t width, const float* column_rays, const float* row_rays, const float* rays,
+                                    const double* color_from_depth, const double* color_intrinsics,
+                                    const double* half_pixels, const double* lenses, int64_t color_height,
+                                    int64_t color_width, double max_jump, float* registered, int64_t* pixel_index,
+                                    uint8_t* occluding, uint8_t* hidden, int64_t* possible);
+
+// -- rows of fields, and points under maps ----------------------------------------------------------------------------
+
+// mask (rows,) -> starts (pieces + 1,): the true rows before each piece of 16384 rows, and their number.
+PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts);
+
+// Copy the rows where the mask is true; starts are those of pc_count_kept.
+PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
+                               int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
+                               const int64_t* picked);
+
+// Copy the rows index (num_picked,) of `rows`; *possible becomes 0, and nothing is certain, if one lies outside.
+PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, int64_t num_picked, int64_t rows,
+                               int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
+                               const int64_t* picked, int64_t* possible);
+
+// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1] of
+// the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
+PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, const int64_t* counts,
+                                const int64_t* starts, int64_t num_fields, const int64_t* sources,
+                                const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks);
+
+// moved (N, 3) = matrix (clouds, 4, 4) of each point's cloud @ point, in float64, rounded once.
+PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                      int64_t num_clouds, const double* matrices, float* moved);
+
+// turned (N, 3) = linear (clouds, 3, 3) of each row's cloud @ direction in float64, divided by its length (by 1e-12 if
+// that is larger), rounded once.
+PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float* directions, const int64_t* ptr,
+                                          int64_t num_clouds, const double* linear, float* turned);
+
+// inside (N,) becomes 1 where lower <= point <= upper on every axis; *finite 0 if a coordinate is not.
+PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, int64_t rows, const float* lower,
+                                const float* upper, uint8_t* inside, int64_t* finite);
+
+// -- neighbors --------------------------------------------------------------------------------------------------------
+
+// queries null: the points; pixel null: no grid; neighbors have d2 <= limit; count may be null.
+PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                               const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
+                               const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
+                               float* distance, int64_t* count);
+
+// squared (Q,) float: from every query to the nearest point of its cloud.
+PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,
+                                     int64_t num_clouds, const float* queries, const int64_t* queries_ptr,
+                                     float* squared);
+
+// normals (N, 3) float; neighbors have d2 <= limit; pixel null: no grid.
+PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                             int64_t max_neighbors, double limit, const int64_t* pixel, int64_t width,
+                             const double* camera, float* normals);
+
+// mean (N,) double is working space; outlier (N,) bool. pixel null: no grid.
+PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,
+                                          int64_t num_clouds, int64_t num_neighbors, double std_ratio,
+                                          const int64_t* pixel, int64_t width, const double* camera, double* mean,
+                                          bool* outlier);
+
+// -- radius outliers and clusters -------------------------------------------------------------------------------------
+
+// pixel (N,) rising within each cloud, or null; outlier (N,) out; largest (1,) out: the largest cell coordinate of any
+// cloud. The mask is complete only if that is below 2^36.
+PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float* points, const int64_t* ptr,
+                                         int64_t clouds, double radius, int64_t min_neighbors, const int64_t* pixel,
+                                         int64_t width, uint8_t* outlier, double* largest);
+
+// labels (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The labels
+// are complete only if that is below 2^36.
+PC_EXPORT int32_t pc_dbscan(const pc_context* context, const float* points, const int64_t* ptr, int64_t clouds,
+                            double eps, int64_t min_points, int64_t* labels, double* largest);
+
+// -- sampling ---------------------------------------------------------------------------------------------------------
+
+// points (N, 3); ptr, (num_clouds+1,); wanted (num_clouds,), at most the points there are; picks (sum of wanted,): rows
+// within each pick's own cloud. A cloud holds less than 2^31 points.
+PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                     int64_t num_clouds, const int64_t* wanted, int64_t* picks);
+
+// points (N, 3); ptr (num_clouds+1,); sizes (num_clouds,) -> means (M, 3) in the first rows of (N, 3); inverse (N,);
+// counts (num_clouds,): the voxels of each cloud. Clouds hold less than 2^31 points. *spans_too_many becomes 1, and
+// nothing else is written, if a cloud spans 2^53 voxels or more.
+PC_EXPORT int32_t pc_voxel_downsample(const pc_context* context, const float* points, const int64_t* ptr,
+                                      int64_t num_clouds, const double* sizes, float* means, int64_t* inverse,
+                                      int64_t* counts, int64_t* spans_too_many);
+
+// sizes (num_clouds,): the voxel size that leaves num_points of each cloud, or as few more as possible, found to the
+// relative tolerance. *possible becomes 0, and nothing is certain, if a cloud has fewer distinct points or spans 2^53
+// voxels of the size that would be needed.
+PC_EXPORT int32_t pc_find_voxel_sizes(const pc_context* context, const float* points, const int64_t* ptr,
+                                      int64_t num_clouds, int64_t num_points, double tolerance, double* sizes,
+                                      int64_t* possible);
+
+// -- planes -----------------------------------------------------------------------------------------------------------
+
+// points (N, 3), ptr (num_clouds+1,), triples (T, count, 3) of rows within a cloud, which (num_clouds,) of the T each
+// cloud takes -> planes (num_clouds, count, 4); NaN for triples on a line.
+PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* points, const int64_t* ptr,
+                                       int64_t num_clouds, const int64_t* triples, int64_t count, const int64_t* which,
+                                       double flat, double* planes);
+
+// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4) -> counts (num_clouds, H): the points of each cloud with
+// |((nx*x + ny*y) + nz*z) + d| < distance.
+PC_EXPORT int32_t pc_count_near_planes(const pc_context* context, const float* points, const int64_t* ptr,
+                                       int64_t num_clouds, const float* planes, int64_t num_planes, double distance,
+                                       int64_t* counts);
+
+// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, 4) -> near (N,), 0 or 1: whether a point is near its cloud's.
+PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                                 const float* planes, double distance, uint8_t* near);
+
+// points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
+// chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx, xy,
+// xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every eighth
+// point of a piece, and pieces are added in order.
+PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                             const uint8_t* mask, const double* centers, double* sums);
+
+// -- truncated signed distance fields ---------------------------------------------------------------------------------
+
+// depth (height, width), rays (2, height, width), turn (3, 3) and fraction (3,) in blocks, camera (3,) blocks, offsets
+// (num_offsets,) -> the sorted keys of the touched blocks, found (*count,), of room for every reading at every offset.
+// *count becomes -1 if a block lies out of reach.
+PC_EXPORT int32_t pc_tsdf_touched(const pc_context* context, const float* depth, const float* rays, int64_t height,
+                                  int64_t width, const float* turn, const float* fraction, const int64_t* camera,
+                                  const float* offsets, int64_t num_offsets, int64_t* found, int64_t* count);
+
+// Bring a table of rows (num_slots,) up to date, from the first num_known rows of keys (num_blocks,) to all, and look
+// up wanted (num_wanted,): rows (num_wanted,), -1 where there is no block; missing (*count,) are the keys of these.
+PC_EXPORT int32_t pc_tsdf_find(const pc_context* context, const int64_t* keys, int64_t num_blocks, int32_t* slots,
+                               int64_t num_slots, int64_t num_known, const int64_t* wanted, int64_t num_wanted,
+                               int64_t* rows, int64_t* missing, int64_t* count);
+
+// colors (count, 3) -> packed (count,): r | g << 10 | b << 20, in steps of a stored color.
+PC_EXPORT int32_t pc_tsdf_pack_colors(const pc_context* context, const uint8_t* colors, int64_t count, int32_t* packed);
+
+// Average one view into blocks rows (num_rows,), whose keys are keys[row]. planes: 6 arrays of chunk addresses (tsdf,
+// weight, color, views, label, votes), null where absent. The images and `lens` may be null, as in tsdf::FusedView.
+PC_EXPORT int32_t pc_tsdf_integrate(const pc_context* context, const float* depth, const int32_t* weight,
+                                    const int32_t* color, const int32_t* label, int64_t height, int64_t width,
+                                    const double* pose, double block_size, const float* steps, const float* pinhole,
+                                    const float* lens, double scale, int64_t carve, const int64_t* rows,
+                                    int64_t num_rows, const int64_t* keys, const int64_t* const* planes);
+
+// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of both ends must exceed
+// -> counts (count,): how many edges of each block cross zero; dropped (1,): how many more do, seen less.
+PC_EXPORT int32_t pc_tsdf_count_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
+                                          int64_t count, const int64_t* const* planes, int64_t bound, int64_t* counts,
+                                          int64_t* dropped);
+
+// The same with starts (count + 1,): where each block's points go -> edge (M,) or null, points (M, 3), normals (M, 3),
+// weight (M,), views (M,), colors (M, 3) or null, labels (M,) or null.
+PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
+                                          int64_t count, const int64_t* const* planes, int64_t bound,
+                                          const int64_t* starts, double voxel_size, int64_t* edge, float* points,
+                                          float* normals, float* weight, int64_t* views, float* colors,
+                                          int64_t* labels);
+
+// Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of a cube's corners must
+// exceed; the edges (num_edges,) of the vertices, rising -> signs (count, 16), edges (count, 32) for the calls below.
+PC_EXPORT int32_t pc_tsdf_index_mesh(const pc_context* context, const int64_t* keys, const int64_t* rows, int64_t count,
+                                     const int64_t* const* planes, int64_t bound, const int64_t* edge,
+                                     int64_t num_edges, int64_t* signs, int64_t* edges);
+
+// The table of cases (257,), (K, 3) -> counts (count,): the triangles of each block.
+PC_EXPORT int32_t pc_tsdf_count_triangles(const pc_context* context, const int64_t* keys, int64_t count,
+                                          const int64_t* signs, const int64_t* edges, const int64_t* table,
+                                          const int64_t* corners, int64_t* counts);
+
+// The same with starts (count + 1,): where each block's triangles go -> triangles (T, 3); used (num_edges,), all zero
+// before: 1 where a vertex is in one.
+PC_EXPORT int32_t pc_tsdf_write_triangles(const pc_context* context, const int64_t* keys, int64_t count,
+                                          const int64_t* signs, const int64_t* edges, const int64_t* table,
+                                          const int64_t* corners, const int64_t* starts, int64_t* triangles,
+                                          uint8_t* used);
+
+// Number (count,) entries anew, in place.
+PC_EXPORT int32_t pc_tsdf_renumber(const pc_context* context, int64_t* entries, int64_t count, const int64_t* number);

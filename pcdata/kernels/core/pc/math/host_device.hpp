@@ -1,0 +1,27 @@
+// What lets one header serve g++ and CUDA's compilers, NVRTC among them, which has no standard library: functions of
+// this folder are marked PC_HD, work on plain numbers and arrays, and include nothing but one another.
+#pragma once
+
+#if defined(__CUDACC__)
+#define PC_HD __host__ __device__ __forceinline__
+#else
+#define PC_HD inline
+#endif
+
+#if defined(__CUDACC_RTC__)
+namespace pc {
+using int32_t = int;
+using int64_t = long long;
+using uint32_t = unsigned int;
+using uint64_t = unsigned long long;
+}  // namespace pc
+#else
+#include <cmath>
+#include <cstdint>
+#endif
+
+namespace pc::math {
+
+PC_HD double larger(double a, double b) { return a > b ? a : b; }
+
+}  // namespace pc::math

@@ -1,0 +1,71 @@
+"""The functions of the compiled core, with the types of their arguments after the context that all take.
+
+Written by core/write_signatures.py from core/pc/exports.hpp, which says what they do.
+"""
+
+# A hash of the declarations, which a library built from them has in it.
+INTERFACE_NUMBER = 0x3797D7CF6D0ED43
+
+DECLARATIONS = """
+pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
+pc_choose_pixels: float* depth, int64 views, int64 height, int64 width, float* column_rays, float* row_rays, float*
+    rays, double near, double far, uint8* mask, double* matrices, float* lower, float* upper, uint8* keep, int64*
+    readings, int64* starts, int64* possible
+pc_deproject: float* depth, int64 views, int64 height, int64 width, float* column_rays, float* row_rays, float* rays,
+    double* matrices, uint8* keep, int64* starts, float* points, int64* pixel_index, int64 over_all_views, uint8* rgb,
+    float* colors, int64 num_copied, int64* sources, int64* pixel_bytes, int64* copies
+pc_mask_depth: float* depth, int64 count, double near, double far, uint8* mask, float* masked
+pc_register_depth: float* depth, int64 views, int64 height, int64 width, float* column_rays, float* row_rays, float*
+    rays, double* color_from_depth, double* color_intrinsics, double* half_pixels, double* lenses, int64 color_height,
+    int64 color_width, double max_jump, float* registered, int64* pixel_index, uint8* occluding, uint8* hidden, int64*
+    possible
+pc_count_kept: uint8* mask, int64 rows, int64* starts
+pc_keep_rows: uint8* mask, int64 rows, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64* picked
+pc_take_rows: int64* index, int64 num_picked, int64 rows, int64 num_fields, int64* sources, int64* row_bytes, int64*
+    picked, int64* possible
+pc_place_rows: int64 num_parts, int64* counts, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64*
+    fillers, int64* blocks
+pc_transform_points: float* points, int64* ptr, int64 num_clouds, double* matrices, float* moved
+pc_transform_directions: float* directions, int64* ptr, int64 num_clouds, double* linear, float* turned
+pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
+pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
+    int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
+pc_nearest_squared: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, float* squared
+pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
+    double* camera, float* normals
+pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_neighbors, double std_ratio, int64*
+    pixel, int64 width, double* camera, double* mean, bool* outlier
+pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, int64 min_neighbors, int64* pixel, int64
+    width, uint8* outlier, double* largest
+pc_dbscan: float* points, int64* ptr, int64 clouds, double eps, int64 min_points, int64* labels, double* largest
+pc_farthest_points: float* points, int64* ptr, int64 num_clouds, int64* wanted, int64* picks
+pc_voxel_downsample: float* points, int64* ptr, int64 num_clouds, double* sizes, float* means, int64* inverse, int64*
+    counts, int64* spans_too_many
+pc_find_voxel_sizes: float* points, int64* ptr, int64 num_clouds, int64 num_points, double tolerance, double* sizes,
+    int64* possible
+pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triples, int64 count, int64* which, double
+    flat, double* planes
+pc_count_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, int64 num_planes, double distance,
+    int64* counts
+pc_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, double distance, uint8* near
+pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
+pc_tsdf_touched: float* depth, float* rays, int64 height, int64 width, float* turn, float* fraction, int64* camera,
+    float* offsets, int64 num_offsets, int64* found, int64* count
+pc_tsdf_find: int64* keys, int64 num_blocks, int32* slots, int64 num_slots, int64 num_known, int64* wanted, int64
+    num_wanted, int64* rows, int64* missing, int64* count
+pc_tsdf_pack_colors: uint8* colors, int64 count, int32* packed
+pc_tsdf_integrate: float* depth, int32* weight, int32* color, int32* label, int64 height, int64 width, double* pose,
+    double block_size, float* steps, float* pinhole, float* lens, double scale, int64 carve, int64* rows, int64
+    num_rows, int64* keys, int64* planes
+pc_tsdf_count_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* counts, int64*
+    dropped
+pc_tsdf_write_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* starts, double
+    voxel_size, int64* edge, float* points, float* normals, float* weight, int64* views, float* colors, int64* labels
+pc_tsdf_index_mesh: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* edge, int64 num_edges,
+    int64* signs, int64* edges
+pc_tsdf_count_triangles: int64* keys, int64 count, int64* signs, int64* edges, int64* table, int64* corners, int64*
+    counts
+pc_tsdf_write_triangles: int64* keys, int64 count, int64* signs, int64* edges, int64* table, int64* corners, int64*
+    starts, int64* triangles, uint8* used
+pc_tsdf_renumber: int64* entries, int64 count, int64* number
+"""
