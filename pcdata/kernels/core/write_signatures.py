@@ -12,7 +12,7 @@ from pathlib import Path
 
 _FOLDER = Path(__file__).parent
 HEADER = _FOLDER / "pc" / "exports.hpp"
-SIGNATURES = _FOLDER.parent / "signatures.py"
+SIGNATURES = _FOLDER.parent / "cpu" / "signatures.py"
 
 _HEAD = '''"""The functions of the compiled core, with the types of their arguments after the context that all take.
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pcdata.kernels.signatures import DECLARATIONS, INTERFACE_NUMBER
+from pcdata.kernels.cpu.signatures import DECLARATIONS, INTERFACE_NUMBER
 from pcdata.threads import core_threads
 
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
@@ -242,8 +242,8 @@ def _values(function: str, parameters: Sequence[_Parameter], arguments: Sequence
 
 
 def _folder() -> Path:
-    """Find the libraries beside this file, or, for an editable install, beside the other installed packages."""
-    beside = Path(__file__).parent / "_core"
+    """Find the libraries in this tree, or, for an editable install, beside the other installed packages."""
+    beside = Path(__file__).parents[1] / "_core"
     candidates = [beside, *(Path(entry) / "pcdata" / "kernels" / "_core" for entry in sys.path if entry)]
     for folder in candidates:
         if (folder / "libpcdata_baseline.so").exists():

@@ -16,16 +16,16 @@ struct Task {
   int64_t taken;
 };
 
-void start(Task& task, sort::MortonPoints& sort) {
+void start(Task& task, sort::MortonPoints& order) {
   FarthestSampler& sampler = task.sampler;
-  sort.serial(sampler.points(), sampler.count(), task.room,
+  order.serial(sampler.points(), sampler.count(), task.room,
               [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   sampler.start_leaf_groups(0, sampler.num_leaf_groups());
   sampler.start_levels();
 }
 
-void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, sort::MortonPoints& sort) {
-  sort.parallel(context, scratch, sampler.points(), sampler.count(),
+void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, sort::MortonPoints& order) {
+  order.parallel(context, scratch, sampler.points(), sampler.count(),
                 [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
@@ -43,12 +43,12 @@ void sample(const pc_context& context, const float* points, const int64_t* ptr, 
     open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), room, picks, wanted[cloud], 0});
     room += count;
   }
-  sort::MortonPoints sort(scratch, room);
+  sort::MortonPoints order(scratch, room);
   if (open.size() == 1)
-    start_in_parallel(context, scratch, open[0].sampler, sort);
+    start_in_parallel(context, scratch, open[0].sampler, order);
   else
     parallel_for(context, static_cast<int64_t>(open.size()), 1,
-                 [&](int64_t i, int64_t, int64_t) { start(open[static_cast<size_t>(i)], sort); });
+                 [&](int64_t i, int64_t, int64_t) { start(open[static_cast<size_t>(i)], order); });
   while (!open.empty()) {
     parallel_for(context, static_cast<int64_t>(open.size()), 1, [&](int64_t i, int64_t, int64_t) {
       Task& task = open[static_cast<size_t>(i)];

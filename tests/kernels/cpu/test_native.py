@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pcdata.dispatch import why_unavailable
-from pcdata.kernels import native
+from pcdata.contracts.dispatch import why_unavailable
+from pcdata.kernels.cpu import native
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 
