@@ -141,7 +141,7 @@ def call(function: str, *arguments: Any) -> None:
     try:
         status = entry(ctypes.byref(context), *values)
     except ctypes.ArgumentError as error:
-        raise TypeError(f"{function}: {error}, in its order after the context; please report this") from error
+        raise TypeError(f"{function}: {error} (the context is argument 1); please report this") from error
     if raised:
         raise raised[0]
     if status == _OUT_OF_MEMORY:

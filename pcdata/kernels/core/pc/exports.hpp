@@ -37,12 +37,12 @@ PC_EXPORT int32_t pc_advise_huge_pages(const pc_context* context, int64_t count,
 // Which pixels of depth (views, height, width) become points: keep (views, height, width) becomes 1 there. A pixel does
 // if its depth is positive, within [near, far], inside the mask, and its point, moved by the matrix of its view, inside
 // the box lower, upper (3,); the last three may be null. Also counted: readings
-// (views,) are the pixels that the box decided about, and starts (views * height + 1,) where the points of each image row
-// start. *possible becomes 0, and nothing else is certain, if a depth is negative or not a number, or if a reading has no
-// ray or no finite point.
+// (views,) are the pixels that the box decided about, and starts (views * height + 1,) where the points of each image
+// row start. *possible becomes 0, and nothing else is certain, if a depth is negative or not a number, or if a reading
+// has no ray or no finite point.
 //
-// Rays of pinhole cameras without distortion: x/z of every column (views, width), y/z of every image row (views, height).
-// Or those of any cameras: x/z and y/z of every pixel (views, height, width, 2). The others are null.
+// Rays of pinhole cameras without distortion: x/z of every column (views, width), y/z of every image row (views,
+// height). Or those of any cameras: x/z and y/z of every pixel (views, height, width, 2). The others are null.
 PC_EXPORT int32_t pc_choose_pixels(const pc_context* context, const float* depth, int64_t views, int64_t height,
                                    int64_t width, const float* column_rays, const float* row_rays, const float* rays,
                                    double near, double far, const uint8_t* mask, const double* matrices,
@@ -89,8 +89,8 @@ PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, 
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked, int64_t* possible);
 
-// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1] of
-// the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
+// Put parts of fields into one block per field. Part p has counts[p] rows and goes to rows starts[p] to starts[p + 1]
+// of the block; what it leaves empty is filled with the field's filler byte. sources (fields, parts) are addresses.
 PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, const int64_t* counts,
                                 const int64_t* starts, int64_t num_fields, const int64_t* sources,
                                 const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks);
@@ -174,7 +174,8 @@ PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* p
                                        int64_t num_clouds, const int64_t* triples, int64_t count, const int64_t* which,
                                        double flat, double* planes);
 
-// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4) -> counts (num_clouds, H): the points of each cloud with
+// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4) -> counts (num_clouds, H): the points of each cloud
+// with
 // |((nx*x + ny*y) + nz*z) + d| < distance.
 PC_EXPORT int32_t pc_count_near_planes(const pc_context* context, const float* points, const int64_t* ptr,
                                        int64_t num_clouds, const float* planes, int64_t num_planes, double distance,
@@ -185,9 +186,9 @@ PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points,
                                  const float* planes, double distance, uint8_t* near);
 
 // points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
-// chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx, xy,
-// xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every eighth
-// point of a piece, and pieces are added in order.
+// chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx,
+// xy, xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every
+// eighth point of a piece, and pieces are added in order.
 PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              const uint8_t* mask, const double* centers, double* sums);
 

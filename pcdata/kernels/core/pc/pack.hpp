@@ -113,8 +113,10 @@ Pack<Scalar, Register> keep(PackMask mask, const Pack<Scalar, Register>& value) 
   return All::each([&](size_t p) -> Register {
     const PackMask chosen = mask >> (p * All::kPerPart);
 #if defined(PC_AVX512)
-    if constexpr (sizeof(Scalar) == 4) return _mm512_maskz_mov_ps(static_cast<__mmask16>(chosen), value.part[p]);
-    else return _mm512_maskz_mov_pd(static_cast<__mmask8>(chosen), value.part[p]);
+    if constexpr (sizeof(Scalar) == 4)
+      return _mm512_maskz_mov_ps(static_cast<__mmask16>(chosen), value.part[p]);
+    else
+      return _mm512_maskz_mov_pd(static_cast<__mmask8>(chosen), value.part[p]);
 #else
     using Integers = std::conditional_t<sizeof(Scalar) == 4, Int32Register, Int64Register>;
     Integers bit;

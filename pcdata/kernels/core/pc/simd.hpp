@@ -1,8 +1,8 @@
 // Numbers handled side by side.
 //
-// A register (FloatRegister, Int32Register, ...) holds as many as the processor handles at once: 16 floats with AVX-512,
-// 8 with AVX2, 4 with SSE2. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in one to eight
-// registers: what a search for sixteen queries works on.
+// A register (FloatRegister, Int32Register, ...) holds as many as the processor handles at once: 16 floats with
+// AVX-512, 8 with AVX2, 4 with SSE2. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in one to
+// eight registers: what a search for sixteen queries works on.
 //
 // Arithmetic and comparisons are GCC's and Clang's vector extension; intrinsics stand only where it has no word for an
 // instruction, or where compilers do not find it.
@@ -75,10 +75,18 @@ inline T maximum(const T& a, const T& b) {
 // The masked forms compile to the plain instructions; GCC 12 warns of uninitialized values in its own plain ones.
 constexpr __mmask16 kAll16 = 0xFFFF;
 constexpr __mmask8 kAll8 = 0xFF;
-inline FloatRegister minimum(const FloatRegister& a, const FloatRegister& b) { return _mm512_maskz_min_ps(kAll16, a, b); }
-inline FloatRegister maximum(const FloatRegister& a, const FloatRegister& b) { return _mm512_maskz_max_ps(kAll16, a, b); }
-inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) { return _mm512_maskz_min_pd(kAll8, a, b); }
-inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) { return _mm512_maskz_max_pd(kAll8, a, b); }
+inline FloatRegister minimum(const FloatRegister& a, const FloatRegister& b) {
+  return _mm512_maskz_min_ps(kAll16, a, b);
+}
+inline FloatRegister maximum(const FloatRegister& a, const FloatRegister& b) {
+  return _mm512_maskz_max_ps(kAll16, a, b);
+}
+inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) {
+  return _mm512_maskz_min_pd(kAll8, a, b);
+}
+inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) {
+  return _mm512_maskz_max_pd(kAll8, a, b);
+}
 inline DoubleRegister square_root(const DoubleRegister& a) { return _mm512_maskz_sqrt_pd(kAll8, a); }
 #elif defined(__AVX2__)
 inline FloatRegister minimum(const FloatRegister& a, const FloatRegister& b) { return _mm256_min_ps(a, b); }
@@ -230,8 +238,12 @@ inline int store_chosen(int32_t* to, const Int32Register& lanes, RegisterMask ch
 
 typedef int16_t Int16Lanes __attribute__((vector_size(2 * kLanes)));
 
-inline Int32Register widened(const int16_t* from) { return __builtin_convertvector(load<Int16Lanes>(from), Int32Register); }
-inline void store_narrowed(int16_t* to, const Int32Register& lanes) { store(to, __builtin_convertvector(lanes, Int16Lanes)); }
+inline Int32Register widened(const int16_t* from) {
+  return __builtin_convertvector(load<Int16Lanes>(from), Int32Register);
+}
+inline void store_narrowed(int16_t* to, const Int32Register& lanes) {
+  store(to, __builtin_convertvector(lanes, Int16Lanes));
+}
 inline FloatRegister as_float(const Int32Register& lanes) { return __builtin_convertvector(lanes, FloatRegister); }
 inline Int32Register truncated(const FloatRegister& lanes) { return __builtin_convertvector(lanes, Int32Register); }
 

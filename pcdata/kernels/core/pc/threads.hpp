@@ -58,11 +58,11 @@ struct PieceBody {
 
 void run_pieces(const pc_context& context, int64_t count, int64_t grain, PieceBody body);
 
-// Call body(begin, end, thread) over [0, count) in pieces of `grain` by up to context.threads threads. Pieces may run in
-// any order, so bodies write disjoint results. A long piece delays Ctrl-C: keep it well under a second.
+// Call body(begin, end, thread) over [0, count) in pieces of `grain` by up to context.threads threads. Pieces may run
+// in any order, so bodies write disjoint results. A long piece delays Ctrl-C: keep it well under a second.
 //
-// Every thread has a stretch of its own, the same in every loop over the same pieces, so that it meets what it has in its
-// cache; one that is done helps the others.
+// Every thread has a stretch of its own, the same in every loop over the same pieces, so that it meets what it has in
+// its cache; one that is done helps the others.
 template <class Body>
 void parallel_for(const pc_context& context, int64_t count, int64_t grain, Body&& body) {
   using Plain = std::remove_const_t<std::remove_reference_t<Body>>;

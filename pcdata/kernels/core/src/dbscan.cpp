@@ -102,7 +102,8 @@ class Clustering {
       const int64_t i = of_a.begin + of_a.size() * s / kSamples;
       for (int64_t t = 0; t < kSamples; ++t) {
         const int64_t j = of_b.begin + of_b.size() * t / kSamples;
-        if (math::squared_distance(cells_.x[i], cells_.y[i], cells_.z[i], cells_.x[j], cells_.y[j], cells_.z[j]) < limit_)
+        if (math::squared_distance(cells_.x[i], cells_.y[i], cells_.z[i], cells_.x[j], cells_.y[j], cells_.z[j]) <
+            limit_)
           return true;
       }
     }
@@ -205,8 +206,8 @@ PC_EXPORT int32_t pc_dbscan(const pc_context* context, const float* points, cons
   return guarded([&] {
     std::atomic<double> most{0};
     for_each_cloud(*context, ptr, clouds, [&](const pc_context& own, int64_t first, int64_t count) {
-      raise_to(most, cluster_cloud(own, points + 3 * first, count, static_cast<float>(eps), min_points,
-                                   labels + first));
+      raise_to(most,
+               cluster_cloud(own, points + 3 * first, count, static_cast<float>(eps), min_points, labels + first));
     });
     *largest = most.load();
   });

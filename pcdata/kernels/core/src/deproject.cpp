@@ -51,9 +51,9 @@ struct Images {
 // What makes a reading a point. Depths below 0 and NaN are no readings but mistakes.
 struct Choice {
   float near, far;
-  const uint8_t* mask;     // (views, height, width) or null
-  const double* matrices;  // (views, 4, 4) or null: what brings points to the box
-  const math::CropBox* box;          // or null
+  const uint8_t* mask;       // (views, height, width) or null
+  const double* matrices;    // (views, 4, 4) or null: what brings points to the box
+  const math::CropBox* box;  // or null
 };
 
 // Decide about one image row: keep (width,) becomes 1 where a pixel becomes a point. Returns the number of readings
@@ -164,7 +164,7 @@ PC_EXPORT int32_t pc_choose_pixels(const pc_context* context, const float* depth
       box.upper[axis] = upper[axis];
     }
     const Choice choice{static_cast<float>(near), static_cast<float>(far), mask, matrices,
-                            lower == nullptr ? nullptr : &box};
+                        lower == nullptr ? nullptr : &box};
     ScratchFrame scratch;
     auto* row_readings = scratch.take<int64_t>(images.rows());
     std::atomic<bool> all_possible{true};
@@ -198,8 +198,8 @@ PC_EXPORT int32_t pc_deproject(const pc_context* context, const float* depth, in
   using namespace pc::images;
   return guarded([&] {
     const Images images{depth, views, height, width, column_rays, row_rays, rays};
-    const Output out{starts, points, pixel_index, over_all_views != 0,
-                         {rgb, colors, num_copied, sources, pixel_bytes, copies}};
+    const Output out{
+        starts, points, pixel_index, over_all_views != 0, {rgb, colors, num_copied, sources, pixel_bytes, copies}};
     parallel_for(*context, images.rows(), kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       std::vector<rows::Run> runs(static_cast<size_t>(width + 1) / 2 + 1);
       for (int64_t row = first; row < last; ++row)

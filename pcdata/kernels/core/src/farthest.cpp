@@ -10,7 +10,7 @@ constexpr int64_t kBudget = int64_t{1} << 21;
 
 struct Task {
   FarthestSampler sampler;
-  int64_t room;       // where its points start among those of all clouds
+  int64_t room;  // where its points start among those of all clouds
   int64_t* picks;
   int64_t wanted;
   int64_t taken;
@@ -19,14 +19,15 @@ struct Task {
 void start(Task& task, sort::MortonPoints& order) {
   FarthestSampler& sampler = task.sampler;
   order.serial(sampler.points(), sampler.count(), task.room,
-              [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+               [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   sampler.start_leaf_groups(0, sampler.num_leaf_groups());
   sampler.start_levels();
 }
 
-void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler, sort::MortonPoints& order) {
+void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler,
+                       sort::MortonPoints& order) {
   order.parallel(context, scratch, sampler.points(), sampler.count(),
-                [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+                 [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
   sampler.start_levels();

@@ -6,7 +6,7 @@ namespace pc::planes {
 namespace {
 
 constexpr int64_t kSummedPiece = 8192;  // points summed on their own; pieces are added in order
-constexpr int kBlock = 512;       // points with one array per coordinate at a time
+constexpr int kBlock = 512;             // points with one array per coordinate at a time
 
 typedef float Float8 __attribute__((vector_size(32)));
 typedef int64_t Long8 __attribute__((vector_size(64)));
@@ -61,8 +61,7 @@ PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, con
     for_each_piece(*context, pieces, kSummedPiece, [&](const CloudPiece& piece, int64_t number) {
       Sums own;
       for (int64_t first = piece.begin; first < piece.end; first += kBlock)
-        add_block(points, mask, first, std::min<int64_t>(piece.end, first + kBlock), centers + 3 * piece.cloud,
-                      own);
+        add_block(points, mask, first, std::min<int64_t>(piece.end, first + kBlock), centers + 3 * piece.cloud, own);
       found[static_cast<size_t>(number)] = own;
     });
     std::fill_n(sums, 11 * num_clouds, 0.0);

@@ -102,7 +102,8 @@ class WriteNormals {
   }
 
   static math::Moments at(const double (&sum)[kSums][kQueries], int i) {
-    return {sum[0][i], sum[1][i], sum[2][i], sum[3][i], {sum[4][i], sum[5][i], sum[6][i], sum[7][i], sum[8][i], sum[9][i]}};
+    return {
+        sum[0][i], sum[1][i], sum[2][i], sum[3][i], {sum[4][i], sum[5][i], sum[6][i], sum[7][i], sum[8][i], sum[9][i]}};
   }
 
   int64_t k_;

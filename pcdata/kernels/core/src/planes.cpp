@@ -66,7 +66,7 @@ PC_EXPORT int32_t pc_count_near_planes(const pc_context* context, const float* p
       int64_t* to = own + number * num_planes;
       std::fill_n(to, num_planes, 0);
       count_piece(points, piece.begin, piece.end, all + piece.cloud * num_planes, num_planes,
-                      static_cast<float>(distance), to);
+                  static_cast<float>(distance), to);
     });
     std::fill_n(counts, num_clouds * num_planes, 0);
     for (int64_t p = 0; p < num_pieces; ++p) {
@@ -76,16 +76,16 @@ PC_EXPORT int32_t pc_count_near_planes(const pc_context* context, const float* p
   });
 }
 
-PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                 int64_t num_clouds, const float* planes, double distance, uint8_t* near) {
+PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                                 const float* planes, double distance, uint8_t* near) {
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
     for_each_piece(*context, cut_clouds(ptr, num_clouds, kCountedPiece), kCountedPiece,
-                       [&](const CloudPiece& piece, int64_t) {
-                         const float* plane = planes + 4 * piece.cloud;
-                         mark_near(points, piece.begin, piece.end, {plane[0], plane[1], plane[2], plane[3]},
-                                       static_cast<float>(distance), near);
-                       });
+                   [&](const CloudPiece& piece, int64_t) {
+                     const float* plane = planes + 4 * piece.cloud;
+                     mark_near(points, piece.begin, piece.end, {plane[0], plane[1], plane[2], plane[3]},
+                               static_cast<float>(distance), near);
+                   });
   });
 }

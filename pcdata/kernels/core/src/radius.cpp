@@ -19,11 +19,11 @@ namespace {
 struct RadiusSearch {
   const float* points;  // (count, 3) one cloud
   int64_t count;
-  float radius, limit;  // a neighbor has d2 < limit
-  int64_t enough;       // neighbors that make an inlier, itself included
-  uint8_t* outlier;     // (count,) 1 = not yet shown to be an inlier
-  const int64_t* pixel; // (count,) where each point lies in an image, rising; null = unknown
-  int64_t width;        // of the image
+  float radius, limit;   // a neighbor has d2 < limit
+  int64_t enough;        // neighbors that make an inlier, itself included
+  uint8_t* outlier;      // (count,) 1 = not yet shown to be an inlier
+  const int64_t* pixel;  // (count,) where each point lies in an image, rising; null = unknown
+  int64_t width;         // of the image
 };
 
 // Coordinates of the points around a piece of a cloud, infinitely far away (so never near) outside the cloud.
@@ -155,8 +155,8 @@ struct Pick {
 };
 
 // The points that can be near a marked one, and the marked ones themselves.
-Pick pick_around_marked(const pc_context& context, ScratchFrame& scratch, const RadiusSearch& search, const math::Bounds& box,
-                        int64_t marked) {
+Pick pick_around_marked(const pc_context& context, ScratchFrame& scratch, const RadiusSearch& search,
+                        const math::Bounds& box, int64_t marked) {
   BlockBitmap blocks(context, scratch, box, search.radius, marked);
   std::vector<Range> pieces = even_pieces(context, search.count);
   const auto num_pieces = static_cast<int64_t>(pieces.size());
@@ -222,7 +222,7 @@ PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float*
     std::atomic<double> most{0};
     for_each_cloud(*context, ptr, clouds, [&](const pc_context& own, int64_t first, int64_t count) {
       raise_to(most, search_cloud(own, {points + 3 * first, count, narrow, narrow * narrow, min_neighbors + 1,
-                                         outlier + first, pixel ? pixel + first : nullptr, width}));
+                                        outlier + first, pixel ? pixel + first : nullptr, width}));
     });
     *largest = most.load();
   });

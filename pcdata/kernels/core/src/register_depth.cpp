@@ -39,12 +39,12 @@ float upper(float a, float b) { return a > b ? a : b; }
 
 // The mean coordinates at the inner corners between two rows of pixels.
 void average(const float* __restrict above, const float* __restrict below, int64_t width, float* __restrict corners) {
-  for (int64_t i = 0; i + 1 < width; ++i)
-    corners[i] = 0.25F * ((below[i + 1] + above[i + 1]) + (below[i] + above[i]));
+  for (int64_t i = 0; i + 1 < width; ++i) corners[i] = 0.25F * ((below[i + 1] + above[i + 1]) + (below[i] + above[i]));
 }
 
 // The corners between two rows of pixels; the outer ones keep what they are, not linked.
-void link(const ProjectedRow& seen_above, const ProjectedRow& seen_below, int64_t width, float max_jump, const CellCorners& corners) {
+void link(const ProjectedRow& seen_above, const ProjectedRow& seen_below, int64_t width, float max_jump,
+          const CellCorners& corners) {
   average(seen_above.u, seen_below.u, width, corners.u + 1);
   average(seen_above.v, seen_below.v, width, corners.v + 1);
   const float* __restrict above = seen_above.reading;
@@ -59,8 +59,8 @@ void link(const ProjectedRow& seen_above, const ProjectedRow& seen_below, int64_
 
 // One coordinate's ends of a row of cells, from the corners above and below, cut to [0, limit).
 void cut_cells(const float* __restrict center, const float* __restrict half, const float* __restrict above,
-               const float* __restrict below, const CellCorners& upper_corners, const CellCorners& lower_corners, int64_t width,
-               int64_t limit, int32_t* __restrict first, int32_t* __restrict end) {
+               const float* __restrict below, const CellCorners& upper_corners, const CellCorners& lower_corners,
+               int64_t width, int64_t limit, int32_t* __restrict first, int32_t* __restrict end) {
   constexpr float kInfinity = std::numeric_limits<float>::infinity();
   const float most = static_cast<float>(limit);
   const int32_t* __restrict linked_above = upper_corners.linked;
@@ -97,9 +97,7 @@ struct ZBuffer {
       if (key < found) *pixel = key;
       return;
     }
-    while (key < found &&
-           !__atomic_compare_exchange_n(pixel, &found, key, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-    }
+    while (key < found && !__atomic_compare_exchange_n(pixel, &found, key, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
   }
   void paint_row(const ProjectedRow& seen, const PixelCells& cells, int64_t count, uint64_t first_index) const {
     for (int64_t i = 0; i < count; ++i) {
@@ -221,7 +219,8 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
     const float jump = static_cast<float>(max_jump), farthest = static_cast<float>(1 + max_jump);
     ScratchFrame scratch;
     std::vector<RowBuffers> rows_of_threads;
-    for (int64_t t = 0; t < threads; ++t) rows_of_threads.emplace_back(scratch.take<float>(RowBuffers::size(width)), width);
+    for (int64_t t = 0; t < threads; ++t)
+      rows_of_threads.emplace_back(scratch.take<float>(RowBuffers::size(width)), width);
     std::atomic<bool> all_possible{true};
     for (int64_t number = 0; number < views && all_possible; ++number) {
       math::Lens lens{};
@@ -249,11 +248,11 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
           all_possible.store(false, std::memory_order_relaxed);
       });
       parallel_for(*context, color_pixels, kPixelsPerPiece,
-                       [&](int64_t first, int64_t last, int64_t) { read_keys(keys, image, first, last); });
+                   [&](int64_t first, int64_t last, int64_t) { read_keys(keys, image, first, last); });
       parallel_for(*context, height, kDepthRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
         for (int64_t row = first; row < last; ++row)
-          find_hidden(view, row, image, color_height, color_width, farthest, rows_of_threads[static_cast<size_t>(thread)],
-                          hidden + number * pixels + row * width, marks);
+          find_hidden(view, row, image, color_height, color_width, farthest,
+                      rows_of_threads[static_cast<size_t>(thread)], hidden + number * pixels + row * width, marks);
       });
     }
     *possible = all_possible;

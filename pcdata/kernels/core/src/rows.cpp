@@ -15,7 +15,7 @@ struct Fields {
   int64_t count;
   const int64_t* sources;  // addresses
   const int64_t* row_bytes;
-  const int64_t* picked;   // addresses
+  const int64_t* picked;  // addresses
 
   template <class Body>
   void each(const Body& body) const {
@@ -28,11 +28,16 @@ struct Fields {
 template <class Body>
 void with_row_size(int64_t bytes, const Body& body) {
   switch (bytes) {
-    case 1: return body(std::integral_constant<int64_t, 1>());
-    case 4: return body(std::integral_constant<int64_t, 4>());
-    case 8: return body(std::integral_constant<int64_t, 8>());
-    case 12: return body(std::integral_constant<int64_t, 12>());
-    default: return body(bytes);
+    case 1:
+      return body(std::integral_constant<int64_t, 1>());
+    case 4:
+      return body(std::integral_constant<int64_t, 4>());
+    case 8:
+      return body(std::integral_constant<int64_t, 8>());
+    case 12:
+      return body(std::integral_constant<int64_t, 12>());
+    default:
+      return body(bytes);
   }
 }
 
@@ -44,7 +49,8 @@ void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_run
     const char* from = source + runs[r].start * bytes;
     const int64_t length = runs[r].length;
     if (length < kShort)
-      for (int64_t i = 0; i < length; ++i) std::memcpy(picked + i * bytes, from + i * bytes, static_cast<size_t>(bytes));
+      for (int64_t i = 0; i < length; ++i)
+        std::memcpy(picked + i * bytes, from + i * bytes, static_cast<size_t>(bytes));
     else
       std::memcpy(picked, from, static_cast<size_t>(length * bytes));
     picked += length * bytes;

@@ -30,8 +30,8 @@ struct MeanDistance {
   }
 };
 
-// The sum of body(0), body(1), ... in eight interleaved runs, then these in order; the reference adds in this order too,
-// since the mask hangs on the last bit where all means are equal.
+// The sum of body(0), body(1), ... in eight interleaved runs, then these in order; the reference adds in this order
+// too, since the mask hangs on the last bit where all means are equal.
 template <class Body>
 double interleaved_sum(int64_t count, Body&& body) {
   double run[8] = {};

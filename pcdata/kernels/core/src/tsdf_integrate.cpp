@@ -16,7 +16,8 @@ inline void bend(const float* c, FloatRegister& x, FloatRegister& y, const Float
 }
 
 // The stored color with a pixel's averaged in, rounded up or down in turn; `share` in steps of 2^-15, `turn` likewise.
-inline Int32Register mixed_color(const Int32Register& old, const Int32Register& pixel, const Int32Register& share, const Int32Register& turn) {
+inline Int32Register mixed_color(const Int32Register& old, const Int32Register& pixel, const Int32Register& share,
+                                 const Int32Register& turn) {
   const auto step = [&](int shift) {
     const Int32Register apart = ((pixel >> shift) & 1023) - ((old >> shift) & 1023);
     return ((apart * share + turn) >> 15) << shift;
@@ -145,7 +146,8 @@ void update(const FusedView& view, const VoxelPlanes& planes, const PendingBlock
     if constexpr (kMore) {
       if (has_labels)
         vote(planes.label.block(block.row) + at, planes.votes.block(block.row) + at, pixel_labels.at(place), near);
-      if (counts != nullptr) store_narrowed(counts + at, select(seen, minimum(count + 1, Int32Register{} + 32767), count));
+      if (counts != nullptr)
+        store_narrowed(counts + at, select(seen, minimum(count + 1, Int32Register{} + 32767), count));
     }
   });
 }
@@ -203,8 +205,9 @@ PC_EXPORT int32_t pc_tsdf_integrate(const pc_context* context, const float* dept
   using namespace pc;
   using namespace pc::tsdf;
   return guarded([&] {
-    const FusedView view{depth, weight,     color, label,   height, width,
-                        pose,  block_size, steps, pinhole, lens,   static_cast<float>(scale), carve != 0};
+    const FusedView view{depth,     weight,     color, label,   height, width,
+                         pose,      block_size, steps, pinhole, lens,   static_cast<float>(scale),
+                         carve != 0};
     const VoxelPlanes voxels(planes);
     const bool more = weight != nullptr || label != nullptr || voxels.views;
     if (more)

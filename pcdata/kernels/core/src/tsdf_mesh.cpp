@@ -10,8 +10,8 @@
 namespace pc::tsdf {
 namespace {
 
-constexpr int64_t kBlocksAtATime = 64;             // blocks
-constexpr int64_t kEdges = 3 * kVoxels;    // of a block
+constexpr int64_t kBlocksAtATime = 64;   // blocks
+constexpr int64_t kEdges = 3 * kVoxels;  // of a block
 
 // -- what the cubes look up ---------------------------------------------------------------------------------------
 
@@ -258,7 +258,7 @@ PC_EXPORT int32_t pc_tsdf_index_mesh(const pc_context* context, const int64_t* k
   static_assert(sizeof(BlockSigns) == 16 * 8 && sizeof(BlockEdges) == 32 * 8);
   return guarded([&] {
     find_signs(*context, {keys, rows, count}, VoxelPlanes(planes), static_cast<int16_t>(bound),
-                   reinterpret_cast<BlockSigns*>(signs));
+               reinterpret_cast<BlockSigns*>(signs));
     index_edges(*context, count, edge, num_edges, reinterpret_cast<BlockEdges*>(edges));
   });
 }
@@ -270,9 +270,8 @@ PC_EXPORT int32_t pc_tsdf_count_triangles(const pc_context* context, const int64
   using namespace pc::tsdf;
   return guarded([&] {
     const Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
-    each_block(*context, mesh, [&](int64_t block, const Octet& places) {
-      counts[block] = count_triangles(mesh, places);
-    });
+    each_block(*context, mesh,
+               [&](int64_t block, const Octet& places) { counts[block] = count_triangles(mesh, places); });
   });
 }
 
@@ -285,8 +284,7 @@ PC_EXPORT int32_t pc_tsdf_write_triangles(const pc_context* context, const int64
   return guarded([&] {
     const Mesh mesh({keys, nullptr, count}, signs, edges, table, corners);
     each_block(*context, mesh, [&](int64_t block, const Octet& places) {
-      if (starts[block] < starts[block + 1])
-        write_triangles(mesh, places, triangles + 3 * starts[block], used);
+      if (starts[block] < starts[block + 1]) write_triangles(mesh, places, triangles + 3 * starts[block], used);
     });
   });
 }

@@ -8,7 +8,7 @@
 namespace pc::tsdf {
 namespace {
 
-constexpr int64_t kBlocksPerPiece = 64;           // blocks
+constexpr int64_t kBlocksPerPiece = 64;       // blocks
 constexpr int kMostEdges = 3 * kVoxels + 16;  // edges of a block, and a line so that columns do not share cache sets
 constexpr int kVoxelStep[3] = {1, kEdge, kSlab}, kShift[3] = {0, 3, 6};  // of the coordinates in a voxel's number
 
@@ -62,8 +62,7 @@ struct PlaneAround {
 
   PlaneAround(const VoxelPlane<T>& plane, const SortedBlocks& blocks, const int64_t places[27]) {
     constexpr int around[4] = {13, 14, 16, 22};
-    for (int i = 0; i < 4; ++i)
-      of[i] = places[around[i]] < 0 ? nullptr : plane.block(blocks.rows[places[around[i]]]);
+    for (int i = 0; i < 4; ++i) of[i] = places[around[i]] < 0 ? nullptr : plane.block(blocks.rows[places[around[i]]]);
   }
 };
 
@@ -178,8 +177,7 @@ struct Crossings {
     float grid[3][kEdge];
     const int64_t corners[3] = {block.x * kEdge, block.y * kEdge, block.z * kEdge};
     for (int a = 0; a < 3; ++a)
-      for (int j = 0; j < kEdge; ++j)
-        grid[a][j] = static_cast<float>(static_cast<double>(corners[a] + j) * voxel_size);
+      for (int j = 0; j < kEdge; ++j) grid[a][j] = static_cast<float>(static_cast<double>(corners[a] + j) * voxel_size);
     for (int i = 0; i < count; ++i) {
       float* point = points + 3 * i;
       for (int a = 0; a < 3; ++a) point[a] = grid[a][voxel[i] >> kShift[a] & 7];
@@ -290,6 +288,6 @@ PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64
   return guarded([&] {
     const Field field{{keys, rows, count}, VoxelPlanes(planes)};
     write_all(*context, field, static_cast<int16_t>(bound), starts, voxel_size,
-                  {edge, points, normals, weight, views, colors, labels});
+              {edge, points, normals, weight, views, colors, labels});
   });
 }

@@ -11,19 +11,19 @@ namespace pc::tsdf {
 namespace {
 
 struct TouchingView {
-  const float* depth;          // (height, width)
-  const float* rays;           // (2, height, width)
+  const float* depth;  // (height, width)
+  const float* rays;   // (2, height, width)
   int64_t height, width;
-  const float* turn;           // (3, 3) world from camera, in blocks per metre
-  const float* fraction;       // (3,) where the camera is, in its block
-  const int64_t* camera;       // (3,) the block that it is in
-  const float* offsets;        // (num_offsets,) along z
+  const float* turn;      // (3, 3) world from camera, in blocks per metre
+  const float* fraction;  // (3,) where the camera is, in its block
+  const int64_t* camera;  // (3,) the block that it is in
+  const float* offsets;   // (num_offsets,) along z
   int64_t num_offsets;
 };
 
 // The three coordinates of a block, counted from the camera's, in 32 bits.
 struct NearBlock {
-  static constexpr int32_t kNone = INT32_MIN;  // no reading; z = -512, which is not used
+  static constexpr int32_t kNone = INT32_MIN;                // no reading; z = -512, which is not used
   static constexpr int32_t kWide = 1 << 10, kDeep = 1 << 9;  // x and y, z lie below
 
   static bool fits(int axis, int32_t least, int32_t most) {
@@ -121,9 +121,10 @@ inline int64_t find_new(const TouchingView& view, const BlockRow& above, const B
     const int32_t first = step == 0 ? -1 : 0;  // turns every bit over: before the first offset nothing was found
     for (int64_t u = 1; u <= view.width; u += kLanes) {
       const auto packed = load<Int32Register>(own + u);
-      const RegisterMask is_new = unequal(packed, load<Int32Register>(own + u - 1)) & unequal(packed, load<Int32Register>(other + u)) &
-                           unequal(packed, load<Int32Register>(before + u) ^ first) &
-                           unequal(packed, Int32Register{} + NearBlock::kNone);
+      const RegisterMask is_new = unequal(packed, load<Int32Register>(own + u - 1)) &
+                                  unequal(packed, load<Int32Register>(other + u)) &
+                                  unequal(packed, load<Int32Register>(before + u) ^ first) &
+                                  unequal(packed, Int32Register{} + NearBlock::kNone);
       count += store_chosen(found + count, packed, is_new);
     }
   }
@@ -190,7 +191,9 @@ int64_t touched(const pc_context& context, const TouchingView& view, int64_t* fo
   };
   std::vector<Own> own;
   for (size_t t = 0; t < threads; ++t)
-    own.push_back({scratch.take<math::PackedVoxel>(most), {BlockRow(scratch, view), BlockRow(scratch, view)}, BlockRow(scratch, view),
+    own.push_back({scratch.take<math::PackedVoxel>(most),
+                   {BlockRow(scratch, view), BlockRow(scratch, view)},
+                   BlockRow(scratch, view),
                    scratch.take<int32_t>(view.width * view.num_offsets + 2 * kLanes),
                    voxels::VoxelTable<math::PackedVoxel>(scratch, most)});
   std::atomic<bool> far{false};

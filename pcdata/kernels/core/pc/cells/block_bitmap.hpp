@@ -5,9 +5,9 @@
 
 namespace pc::cells {
 
-// BlockBitmap of space twice the radius wide, hashed into a bitmap. Marking every block that a point's neighbors can lie in,
-// at most two along each axis, leaves one look per point. Wider blocks, or two that share a bit, do no harm: they only
-// pick points that turn out to be too far.
+// Blocks of space twice the radius wide, hashed into a bitmap. Marking every block that a point's neighbors can
+// lie in, at most two along each axis, leaves one look per point. Wider blocks, or two that share a bit, do no harm:
+// they only pick points that turn out to be too far.
 class BlockBitmap {
  public:
   BlockBitmap(const pc_context& context, ScratchFrame& scratch, const math::Bounds& box, float radius, int64_t marks) {

@@ -129,8 +129,15 @@ Cells<Key> sort_into_cells(const pc_context& context, ScratchFrame& scratch, con
   const int64_t num_cells = cells_before.back();
   Key* key = scratch.take<Key>(num_cells);
   uint32_t* start = scratch.take<uint32_t>(num_cells + 1);
-  Cells<Key> cells{lattice, num_cells, key, start, count, scratch.take<float>(count), scratch.take<float>(count),
-                   scratch.take<float>(count), scratch.take<uint32_t>(count)};
+  Cells<Key> cells{lattice,
+                   num_cells,
+                   key,
+                   start,
+                   count,
+                   scratch.take<float>(count),
+                   scratch.take<float>(count),
+                   scratch.take<float>(count),
+                   scratch.take<uint32_t>(count)};
   constexpr int64_t kAhead = 16;  // points in no order are fetched this early, or each would wait for memory
   parallel_for(context, num_pieces, 1, [&](int64_t p, int64_t, int64_t) {
     int64_t cell = cells_before[p], place = points_before[p];
@@ -154,8 +161,8 @@ Cells<Key> sort_into_cells(const pc_context& context, ScratchFrame& scratch, con
   return cells;
 }
 
-// Call body(cell, begin, end) for every cell that owns some of the points [begin, end), with the part it owns: pieces of
-// points are even work, however unlike the cells are.
+// Call body(cell, begin, end) for every cell that owns some of the points [begin, end), with the part it owns: pieces
+// of points are even work, however unlike the cells are.
 template <class Key, class Body>
 void for_each_cell(const Cells<Key>& cells, int64_t begin, int64_t end, Body&& body) {
   const uint32_t* after = std::upper_bound(cells.start, cells.start + cells.count, static_cast<uint32_t>(begin));

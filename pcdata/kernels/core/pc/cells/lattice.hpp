@@ -32,8 +32,7 @@ inline double cell_side(float radius) { return static_cast<double>(radius) / std
 
 inline void raise_to(std::atomic<double>& most, double value) {
   double seen = most.load();
-  while (value > seen && !most.compare_exchange_weak(seen, value)) {
-  }
+  while (value > seen && !most.compare_exchange_weak(seen, value)) {}
 }
 
 // Call body(cloud, serial context or not) for every cloud: large ones one after another with all threads, small ones

@@ -14,12 +14,12 @@ struct RowStep {
 };
 
 // All 25 rows that hold neighbors, near first; the first is the cell's own.
-constexpr RowStep kAllRows[] = {{0, 0},  {-1, 0}, {0, -1}, {0, 1},  {1, 0},  {-1, -1}, {-1, 1}, {1, -1}, {1, 1},
-                                {-2, 0}, {0, -2}, {0, 2},  {2, 0},  {-2, -1}, {-2, 1}, {-1, -2}, {-1, 2}, {1, -2},
-                                {1, 2},  {2, -1}, {2, 1},  {-2, -2}, {-2, 2}, {2, -2}, {2, 2}};
+constexpr RowStep kAllRows[] = {{0, 0},  {-1, 0}, {0, -1}, {0, 1},   {1, 0},   {-1, -1}, {-1, 1},  {1, -1}, {1, 1},
+                                {-2, 0}, {0, -2}, {0, 2},  {2, 0},   {-2, -1}, {-2, 1},  {-1, -2}, {-1, 2}, {1, -2},
+                                {1, 2},  {2, -1}, {2, 1},  {-2, -2}, {-2, 2},  {2, -2},  {2, 2}};
 // Those behind the cell in sorted order, to meet every pair of cells once.
-constexpr RowStep kLaterRows[] = {{0, 0}, {0, 1},  {1, 0},  {1, -1}, {1, 1}, {0, 2}, {2, 0},
-                                  {1, -2}, {1, 2}, {2, -1}, {2, 1}, {2, -2}, {2, 2}};
+constexpr RowStep kLaterRows[] = {{0, 0},  {0, 1}, {1, 0},  {1, -1}, {1, 1},  {0, 2}, {2, 0},
+                                  {1, -2}, {1, 2}, {2, -1}, {2, 1},  {2, -2}, {2, 2}};
 constexpr int kAdjacentLaterRows = 5;  // of those, the rows that touch the cell's own
 
 // Finds the neighbors of one cell after another, in rising order: a search starts where the last one for the same

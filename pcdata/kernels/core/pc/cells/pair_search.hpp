@@ -73,8 +73,9 @@ class PairSearch {
 
   static int64_t halve(std::vector<CellPoint>& points, Range range, int axis) {
     const int64_t middle = range.begin + range.size() / 2;
-    std::nth_element(points.begin() + range.begin, points.begin() + middle, points.begin() + range.end,
-                     [axis](const CellPoint& p, const CellPoint& q) { return p.coordinate[axis] < q.coordinate[axis]; });
+    std::nth_element(
+        points.begin() + range.begin, points.begin() + middle, points.begin() + range.end,
+        [axis](const CellPoint& p, const CellPoint& q) { return p.coordinate[axis] < q.coordinate[axis]; });
     return middle;
   }
 

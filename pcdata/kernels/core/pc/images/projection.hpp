@@ -21,7 +21,7 @@ struct DepthView {
   float move[12] = {};                 // the upper rows of color_from_depth
   float fx = 0, skew = 0, cx = 0, fy = 0, cy = 0;
   float half_width = 0, half_height = 0;  // of a pixel's box, in color pixels, at equal depths
-  const math::Lens* lens = nullptr;             // of the color camera, if it has one
+  const math::Lens* lens = nullptr;       // of the color camera, if it has one
 
   DepthView(const float* image, int64_t rows, int64_t columns) : depth(image), height(rows), width(columns) {}
 
@@ -47,7 +47,11 @@ struct ProjectedRow {
 
   static constexpr int64_t kArrays = 6;
   ProjectedRow(float* room, int64_t width)
-      : u(room), v(room + width), z(room + 2 * width), reading(room + 3 * width), half_width(room + 4 * width),
+      : u(room),
+        v(room + width),
+        z(room + 2 * width),
+        reading(room + 3 * width),
+        half_width(room + 4 * width),
         half_height(room + 5 * width) {}
 };
 
@@ -68,8 +72,8 @@ struct PixelRays {
 
 // Move the readings into the color camera: x/z, y/z and z there. Returns how many have no ray.
 template <class Ray>
-int32_t move_row(const DepthView& view, const float* __restrict depth, const Ray ray, int64_t width, float* __restrict x,
-                 float* __restrict y, float* __restrict z, float* __restrict reading) {
+int32_t move_row(const DepthView& view, const float* __restrict depth, const Ray ray, int64_t width,
+                 float* __restrict x, float* __restrict y, float* __restrict z, float* __restrict reading) {
   const float a0 = view.move[0], b0 = view.move[1], c0 = view.move[2], d0 = view.move[3];
   const float a1 = view.move[4], b1 = view.move[5], c1 = view.move[6], d1 = view.move[7];
   const float a2 = view.move[8], b2 = view.move[9], c2 = view.move[10], d2 = view.move[11];
@@ -125,11 +129,10 @@ inline int32_t to_pixels(const DepthView& view, const float* __restrict depth, c
 inline bool project(const DepthView& view, int64_t row, const ProjectedRow& seen) {
   const int64_t width = view.width;
   const float* depth = view.depth + row * width;
-  const int32_t lost =
-      view.rays != nullptr
-          ? move_row(view, depth, PixelRays{view.rays + 2 * row * width}, width, seen.u, seen.v, seen.z, seen.reading)
-          : move_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]}, width, seen.u, seen.v, seen.z,
-                     seen.reading);
+  const int32_t lost = view.rays != nullptr ? move_row(view, depth, PixelRays{view.rays + 2 * row * width}, width,
+                                                       seen.u, seen.v, seen.z, seen.reading)
+                                            : move_row(view, depth, PinholeRays{view.column_rays, view.row_rays[row]},
+                                                       width, seen.u, seen.v, seen.z, seen.reading);
   if (view.lens != nullptr) bend_row(*view.lens, width, seen.u, seen.v, seen.reading);
   const int32_t beyond =
       to_pixels(view, depth, seen.z, seen.reading, width, seen.u, seen.v, seen.half_width, seen.half_height);

@@ -76,10 +76,11 @@ PC_HD Vector3 smallest_across(const Symmetric3& m, const Vector3& clear) {
 }
 
 // The unit eigenvector of the smallest eigenvalue. The eigenvalue that stands clear of the other two gives its vector;
-// where that is the largest, the smallest is found in the plane across it. Where none stands out: as the reference says.
+// where that is the largest, the smallest is found in the plane across it. Where none stands out: as the reference
+// says.
 PC_HD Vector3 smallest_eigenvector(const Symmetric3& a) {
-  const double scale = larger(larger(larger(fabs(a.xx), fabs(a.xy)), larger(fabs(a.xz), fabs(a.yy))),
-                              larger(fabs(a.yz), fabs(a.zz)));
+  const double scale =
+      larger(larger(larger(fabs(a.xx), fabs(a.xy)), larger(fabs(a.xz), fabs(a.yy))), larger(fabs(a.yz), fabs(a.zz)));
   const double divisor = scale > 0 ? scale : 1.0;
   const Symmetric3 m{a.xx / divisor, a.xy / divisor, a.xz / divisor, a.yy / divisor, a.yz / divisor, a.zz / divisor};
   const double mean = (m.xx + m.yy + m.zz) / 3;
@@ -88,8 +89,8 @@ PC_HD Vector3 smallest_eigenvector(const Symmetric3& a) {
   const double spread = sqrt((dx * dx + dy * dy + dz * dz + 2 * off) / 6);
   const bool is_isotropic = spread <= kRound;
   const double safe = is_isotropic ? 1.0 : spread;
-  const double determinant = dx * (dy * dz - m.yz * m.yz) - m.xy * (m.xy * dz - m.yz * m.xz) +
-                             m.xz * (m.xy * m.yz - dy * m.xz);
+  const double determinant =
+      dx * (dy * dz - m.yz * m.yz) - m.xy * (m.xy * dz - m.yz * m.xz) + m.xz * (m.xy * m.yz - dy * m.xz);
   const double half = determinant / (safe * safe * safe) / 2;
   const bool clear_is_largest = half >= 0;
   const double size = fabs(half), clamped = size < 1 ? size : 1.0;

@@ -20,8 +20,8 @@ struct Plane {
   }
 };
 
-// Write the plane (4,) through three points, with the float64 operations of the reference; NaN where they cannot be told
-// from a line: their triangle is lower than `flat` of the largest coordinate.
+// Write the plane (4,) through three points, with the float64 operations of the reference; NaN where they cannot be
+// told from a line: their triangle is lower than `flat` of the largest coordinate.
 PC_HD void plane_through(const Vector3& a, const Vector3& b, const Vector3& c, double flat, double* plane) {
   const Vector3 ab = difference(b, a), ac = difference(c, a), normal = cross(ab, ac);
   const double length = fused_length(normal);

@@ -45,7 +45,8 @@ class BatchSearch {
     for_groups(groups.all(), [&](const Leaf& leaf, int64_t, int64_t cloud, TreeSearch& search, Worker& worker) {
       const QueryGroup group(leaf);
       worker.nearest.start(k_, group.limits(limit_));
-      if (trees[cloud].num_leaves > 0) search.run(trees[cloud], group, search.leaf_near(trees[cloud], group), worker.nearest);
+      if (trees[cloud].num_leaves > 0)
+        search.run(trees[cloud], group, search.leaf_near(trees[cloud], group), worker.nearest);
       worker.nearest.finish();
       worker.task(search, group, worker.nearest, leaf.row);
     });
@@ -65,8 +66,8 @@ class BatchSearch {
     parallel_for(context_, groups.count(), groups_per_piece(), [&](int64_t begin, int64_t end, int64_t) {
       TreeSearch search;
       Worker worker{{}, task_};
-      int64_t cloud = std::upper_bound(groups.leaf_ptr, groups.leaf_ptr + groups.num_clouds + 1, begin) -
-                      groups.leaf_ptr - 1;
+      int64_t cloud =
+          std::upper_bound(groups.leaf_ptr, groups.leaf_ptr + groups.num_clouds + 1, begin) - groups.leaf_ptr - 1;
       for (int64_t g = begin; g < end; ++g) {
         while (g >= groups.leaf_ptr[cloud + 1]) ++cloud;
         body(groups.leaf[g], g, cloud, search, worker);
@@ -158,8 +159,7 @@ class BatchSearch {
     const CloudTree* tree = build_trees(context_, scratch, leaves);
     // Stragglers are sorted in space too, so that the sixteen of a group look into the same boxes.
     float* points = scratch.take<float>(3 * count);
-    for (int64_t i = 0; i < count; ++i)
-      std::copy_n(rows + 3 * int64_t{queries[i].row}, 3, points + 3 * i);
+    for (int64_t i = 0; i < count; ++i) std::copy_n(rows + 3 * int64_t{queries[i].row}, 3, points + 3 * i);
     const int64_t all[2] = {0, count};
     LeafBuilder groups(context_, scratch, points, all, 1);
     for_groups(groups.all(), [&](const Leaf& leaf, int64_t, int64_t, TreeSearch& search, Worker& worker) {

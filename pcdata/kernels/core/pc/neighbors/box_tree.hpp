@@ -43,8 +43,7 @@ inline CloudTree* build_trees(const pc_context& context, ScratchFrame& scratch, 
       nodes = blocks > 1 ? blocks : 0;
     }
   };
-  for (int64_t b = 0; b < leaves.num_clouds; ++b)
-    for_levels(b, [&](int, int64_t, int64_t blocks) { total += blocks; });
+  for (int64_t b = 0; b < leaves.num_clouds; ++b) for_levels(b, [&](int, int64_t, int64_t blocks) { total += blocks; });
   Boxes* boxes = scratch.take<Boxes>(total);
   int64_t used = 0;
   for (int64_t b = 0; b < leaves.num_clouds; ++b) {
@@ -89,9 +88,8 @@ inline CloudTree* build_trees(const pc_context& context, ScratchFrame& scratch, 
   }
   for (int64_t b = 0; b < leaves.num_clouds; ++b)
     for_levels(b, [&](int level, int64_t nodes, int64_t blocks) {
-      parallel_for(context, blocks, kBlocksPerPiece, [&](int64_t begin, int64_t end, int64_t) {
-        build_level(trees[b], level, nodes, begin, end);
-      });
+      parallel_for(context, blocks, kBlocksPerPiece,
+                   [&](int64_t begin, int64_t end, int64_t) { build_level(trees[b], level, nodes, begin, end); });
     });
   return trees;
 }

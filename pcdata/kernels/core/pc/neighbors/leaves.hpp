@@ -105,7 +105,8 @@ class LeafBuilder {
   static constexpr int64_t kLeavesPerPiece = 256;
 
   bool same_place(uint64_t a, uint64_t b) const {
-    const float *p = points_ + 3 * int64_t{sort::MortonRows::row(a)}, *q = points_ + 3 * int64_t{sort::MortonRows::row(b)};
+    const float *p = points_ + 3 * int64_t{sort::MortonRows::row(a)},
+                *q = points_ + 3 * int64_t{sort::MortonRows::row(b)};
     return p[0] == q[0] && p[1] == q[1] && p[2] == q[2];
   }
 

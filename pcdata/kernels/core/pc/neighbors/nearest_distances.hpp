@@ -75,7 +75,7 @@ class NearestDistances {
     if (filled_ == blocks_) bound_ = squared(k_ - 1);
   }
 
-  float (*at(int block))[kQueries] { return value_ + block * kBlock; }
+  float (*at(int block)) [kQueries] { return value_ + block * kBlock; }
 
   alignas(64) float value_[kMax][kQueries];  // the first `filled_` blocks, ascending per lane
   alignas(64) float waiting_value_[kBlock][kQueries];

@@ -103,8 +103,8 @@ class OrganizedCloud {
     return measure_slopes(context, scratch);
   }
 
-  // The cloud as leaves of 4x4 pixels, in Morton order within tiles of 64x64: near in the image is mostly near in space,
-  // and it takes no sort. Missing pixels leave empty slots anywhere in a leaf.
+  // The cloud as leaves of 4x4 pixels, in Morton order within tiles of 64x64: near in the image is mostly near in
+  // space, and it takes no sort. Missing pixels leave empty slots anywhere in a leaf.
   Leaves tile_leaves(const pc_context& context, ScratchFrame& scratch) const {
     const int64_t across = (width_ + kTile - 1) / kTile, tiles = across * ((height_ + kTile - 1) / kTile);
     constexpr int64_t kLeaves = kTile / kLeafSide * (kTile / kLeafSide);
@@ -177,9 +177,8 @@ class OrganizedCloud {
     std::vector<ColumnRange> ranges(static_cast<size_t>(std::max(context.threads, 1)), ColumnRange{grid.width, -1});
     parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
       ColumnRange range = ranges[static_cast<size_t>(thread)];
-      for_pixels(grid, begin + first, begin + last, [&](int64_t, int64_t u, int64_t) {
-        range = {std::min(range.least, u), std::max(range.most, u)};
-      });
+      for_pixels(grid, begin + first, begin + last,
+                 [&](int64_t, int64_t u, int64_t) { range = {std::min(range.least, u), std::max(range.most, u)}; });
       ranges[static_cast<size_t>(thread)] = range;
     });
     first_column_ = grid.width;
@@ -224,7 +223,8 @@ class OrganizedCloud {
     PackMask bad = 0;
     for (int64_t u = 0; u < width_; u += kQueries) {
       const int64_t at = v * stride_ + u;
-      FloatPack x = FloatPack::load(image_[0] + at), y = FloatPack::load(image_[1] + at), z = FloatPack::load(image_[2] + at);
+      FloatPack x = FloatPack::load(image_[0] + at), y = FloatPack::load(image_[1] + at),
+                z = FloatPack::load(image_[2] + at);
       const PackMask real = less(z, FloatPack(kInfinity));
       camera_.move(x, y, z);
       const FloatPack inverse = FloatPack(1.0f) / z, across = x * inverse, down = y * inverse;

@@ -5,8 +5,8 @@
 
 namespace pc::neighbors {
 
-// EightPacks values per lane. Loops over them are written out by a fold, and all is inlined: GCC keeps an array in registers
-// only when its indices are constants from the start and its address is never needed.
+// EightPacks values per lane. Loops over them are written out by a fold, and all is inlined: GCC keeps an array in
+// registers only when its indices are constants from the start and its address is never needed.
 struct EightPacks {
   FloatPack v[8];
 

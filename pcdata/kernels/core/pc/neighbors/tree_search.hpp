@@ -10,8 +10,8 @@ namespace pc::neighbors {
 // Sixteen queries, one per lane.
 struct QueryGroup {
   FloatPack x, y, z;
-  PackMask active;         // the lanes that count
-  float low[3], high[3];   // their box, when they come from a leaf: the tree's search needs it
+  PackMask active;        // the lanes that count
+  float low[3], high[3];  // their box, when they come from a leaf: the tree's search needs it
 
   // Sixteen points, at infinity where there is none. Those become finite, so that no arithmetic meets NaN.
   QueryGroup(const float* qx, const float* qy, const float* qz)
@@ -74,8 +74,7 @@ class TreeSearch {
       if (!lanes_near(queries, tree_.level[0][index / kFanOut], index % kFanOut, reach)) continue;
       const Leaf& leaf = tree_.leaf[index];
       for (int i = 0; i < kLeafSize; ++i)
-        if (leaf.row[i] != kNoId)
-          body(FloatPack(leaf.x[i]), FloatPack(leaf.y[i]), FloatPack(leaf.z[i]), leaf.row[i]);
+        if (leaf.row[i] != kNoId) body(FloatPack(leaf.x[i]), FloatPack(leaf.y[i]), FloatPack(leaf.z[i]), leaf.row[i]);
     }
   }
 
@@ -86,7 +85,7 @@ class TreeSearch {
     const Leaf& leaf = tree_.leaf[index];
     for (int i = 0; i < kLeafSize; ++i) {
       const FloatPack squared = squared_length(FloatPack(leaf.x[i]) - queries.x, FloatPack(leaf.y[i]) - queries.y,
-                                            FloatPack(leaf.z[i]) - queries.z);
+                                               FloatPack(leaf.z[i]) - queries.z);
       if (nearest.wants(squared)) nearest.offer(squared, Ids::same(leaf.row[i]));
     }
     nearest.settle();
@@ -146,8 +145,9 @@ class TreeSearch {
     const FloatPack* at[3] = {&queries.x, &queries.y, &queries.z};
     FloatPack gap[3];
     for (int axis = 0; axis < 3; ++axis)
-      gap[axis] = maximum(maximum(FloatPack(boxes.low[axis][slot]) - *at[axis], *at[axis] - FloatPack(boxes.high[axis][slot])),
-                          FloatPack(0.0f));
+      gap[axis] =
+          maximum(maximum(FloatPack(boxes.low[axis][slot]) - *at[axis], *at[axis] - FloatPack(boxes.high[axis][slot])),
+                  FloatPack(0.0f));
     return less_equal(squared_length(gap[0], gap[1], gap[2]), reach);
   }
 

@@ -105,9 +105,9 @@ class WindowSearch {
   void offer_ring(const QueryGroup& queries, int ring, Nearest& nearest) const {
     for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
       const int64_t at = pixel(*offset);
-      const FloatPack squared = squared_length(FloatPack::load(cloud_.x() + at) - queries.x,
-                                            FloatPack::load(cloud_.y() + at) - queries.y,
-                                            FloatPack::load(cloud_.z() + at) - queries.z);
+      const FloatPack squared =
+          squared_length(FloatPack::load(cloud_.x() + at) - queries.x, FloatPack::load(cloud_.y() + at) - queries.y,
+                         FloatPack::load(cloud_.z() + at) - queries.z);
       if (nearest.wants(squared)) nearest.offer(squared, Ids::ascending(static_cast<uint32_t>(at)));
     }
   }
@@ -116,8 +116,10 @@ class WindowSearch {
   FloatPack clear_within(const Place& at, int reach) const {
     const HalfSpaces &columns = cloud_.columns(), &lines = cloud_.lines();
     const int64_t right = u_ + reach + 1, left = u_ - reach - 1, below = v_ + reach + 1, above = v_ - reach - 1;
-    const FloatPack to_right = FloatPack::load(columns.from_b + right) * at.z - FloatPack::load(columns.from_a + right) * at.x;
-    const FloatPack to_left = FloatPack::load(columns.upto_a + left) * at.x - FloatPack::load(columns.upto_b + left) * at.z;
+    const FloatPack to_right =
+        FloatPack::load(columns.from_b + right) * at.z - FloatPack::load(columns.from_a + right) * at.x;
+    const FloatPack to_left =
+        FloatPack::load(columns.upto_a + left) * at.x - FloatPack::load(columns.upto_b + left) * at.z;
     const FloatPack to_below = FloatPack(lines.from_b[below]) * at.z - FloatPack(lines.from_a[below]) * at.y;
     const FloatPack to_above = FloatPack(lines.upto_a[above]) * at.y - FloatPack(lines.upto_b[above]) * at.z;
     const FloatPack nearest_side = minimum(minimum(to_right, to_left), minimum(to_below, to_above));
@@ -125,9 +127,7 @@ class WindowSearch {
     return clear * clear * FloatPack(kMargin);
   }
 
-  int64_t pixel(const WindowRings::Offset& offset) const {
-    return (v_ + offset.dv) * cloud_.stride() + u_ + offset.du;
-  }
+  int64_t pixel(const WindowRings::Offset& offset) const { return (v_ + offset.dv) * cloud_.stride() + u_ + offset.du; }
 
   // Rounding of computed squared distances (4e-7), and motions that are rigid only to 1e-5 (ImageGrid requires it).
   static constexpr float kMargin = 1.0f - 1e-4f;

@@ -32,7 +32,7 @@ struct PointBlock {
 
 // Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance, in separate float operations like the reference.
 inline Int32Register is_near(const Plane& plane, float distance, const FloatRegister& x, const FloatRegister& y,
-                        const FloatRegister& z) {
+                             const FloatRegister& z) {
   const FloatRegister signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
   const Int32Register magnitude = reinterpret_cast<Int32Register>(signed_distance) & 0x7FFFFFFF;
   return reinterpret_cast<FloatRegister>(magnitude) < distance;
@@ -43,7 +43,8 @@ template <int kTogether>
 inline void count_near(const PointBlock& block, const Plane* planes, float distance, int64_t* counts) {
   Int32Register near[kTogether] = {};
   for (int i = 0; i < block.count; i += kLanes) {
-    const auto x = load<FloatRegister>(block.x + i), y = load<FloatRegister>(block.y + i), z = load<FloatRegister>(block.z + i);
+    const auto x = load<FloatRegister>(block.x + i), y = load<FloatRegister>(block.y + i),
+               z = load<FloatRegister>(block.z + i);
     // A true lane is -1.
     for (int h = 0; h < kTogether; ++h) near[h] -= is_near(planes[h], distance, x, y, z);
   }

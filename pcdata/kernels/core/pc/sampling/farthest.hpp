@@ -180,7 +180,8 @@ class FarthestSampler {
     }
     uint32_t holding(const Pick& pick) const { return 1u << (std::find(key, key + kFan, pick.key) - key); }
     FloatRegister gap(int axis, int i, float at) const {
-      const FloatRegister outside = maximum(load<FloatRegister>(low[axis] + i) - at, at - load<FloatRegister>(high[axis] + i));
+      const FloatRegister outside =
+          maximum(load<FloatRegister>(low[axis] + i) - at, at - load<FloatRegister>(high[axis] + i));
       return maximum(outside, FloatRegister{});
     }
   };

@@ -44,7 +44,7 @@ class MortonRows {
   static constexpr int kCells = 1 << kBits;
   static constexpr int kRowBits = 31;
   static constexpr uint64_t kRowMask = (uint64_t{1} << kRowBits) - 1;
-  static constexpr int64_t kCrowd = 16;    // a leaf of the box tree
+  static constexpr int64_t kCrowd = 16;  // a leaf of the box tree
   static constexpr int64_t kPiece = 1 << 14;
   static constexpr int64_t kRadixFrom = 768;  // shorter runs are faster by comparison
 

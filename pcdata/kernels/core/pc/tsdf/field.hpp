@@ -8,7 +8,7 @@
 
 namespace pc::tsdf {
 
-constexpr int16_t kUnseen = -32768;   // no stored distance: those end at -32767
+constexpr int16_t kUnseen = -32768;  // no stored distance: those end at -32767
 
 struct Field {
   SortedBlocks blocks;

@@ -9,7 +9,7 @@
 namespace pc::tsdf {
 
 constexpr int kEdge = 8, kVoxels = 512;  // of a block
-constexpr int kSlab = kEdge * kEdge;      // voxels of one z
+constexpr int kSlab = kEdge * kEdge;     // voxels of one z
 constexpr float kTsdfScale = 32767, kMaxWeight = 32767;
 
 using math::BlockPlace;

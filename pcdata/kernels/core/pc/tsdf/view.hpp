@@ -25,12 +25,12 @@ struct FusedView {
   const int32_t* color;   // r | g << 10 | b << 20, in steps of a stored color, or null
   const int32_t* label;   // or null
   int64_t height, width;
-  const double* pose;     // (3, 4) image from world: pixel and depth, but the camera's frame where there is a lens
+  const double* pose;  // (3, 4) image from world: pixel and depth, but the camera's frame where there is a lens
   double block_size;
-  const float* steps;     // (3, 512): the voxels of a block from its first one, likewise
-  const float* pinhole;   // fx, skew, cx, fy, cy
-  const float* lens;      // 12 coefficients and the squared radius where the model folds, or null
-  float scale;            // of a stored distance, per metre
+  const float* steps;    // (3, 512): the voxels of a block from its first one, likewise
+  const float* pinhole;  // fx, skew, cx, fy, cy
+  const float* lens;     // 12 coefficients and the squared radius where the model folds, or null
+  float scale;           // of a stored distance, per metre
   bool carve;
 };
 
@@ -46,11 +46,11 @@ inline float highest(const Corners& x) {
 // A block as a view sees it.
 struct ProjectedBlock {
   int64_t row;
-  float first[3];     // its first voxel, as FusedView::pose maps it
-  bool inside;        // every voxel falls on a pixel, further away than no reading (0) could be near
-  int32_t entries;    // of the table that holds these pixels; 0 where they are too many for one
-  int32_t u, v;       // the first pixel of the table
-  int32_t shift;      // rows of the table are 1 << shift pixels apart
+  float first[3];                        // its first voxel, as FusedView::pose maps it
+  bool inside;                           // every voxel falls on a pixel, further away than no reading (0) could be near
+  int32_t entries;                       // of the table that holds these pixels; 0 where they are too many for one
+  int32_t u, v;                          // the first pixel of the table
+  int32_t shift;                         // rows of the table are 1 << shift pixels apart
   uint32_t groups[(kGroups + 31) / 32];  // those that may hold a voxel to update
 
   bool any() const {
@@ -185,7 +185,8 @@ class BlockProjector {
     for (int g = 0; g < kGroups; g += kLanes) {
       const FloatRegister low = seen.first[2] + load<FloatRegister>(low_ + g);
       const FloatRegister high = seen.first[2] + load<FloatRegister>(high_ + g);
-      const RegisterMask near = less_equal(low, zero + range.high) & less_equal(zero + range.low, high) & less(zero, high);
+      const RegisterMask near =
+          less_equal(low, zero + range.high) & less_equal(zero + range.low, high) & less(zero, high);
       seen.groups[g / 32] |= near.bits() << g % 32;
     }
   }

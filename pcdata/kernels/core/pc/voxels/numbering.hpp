@@ -59,7 +59,7 @@ inline bool measure(const math::Bounds& bounds, double size, VoxelGrid& grid) {
 
 // The grid of every cloud; false if one spans too many voxels.
 inline bool measure_all(const pc_context& context, ScratchFrame& scratch, const float* points, Pieces& pieces,
-                 const double* sizes, int64_t num_clouds, VoxelGrid* grids) {
+                        const double* sizes, int64_t num_clouds, VoxelGrid* grids) {
   math::Bounds* bounds = scratch.take<math::Bounds>(pieces.size());
   parallel_for(context, pieces.size(), 1,
                [&](int64_t p, int64_t, int64_t) { bounds[p] = bounds_of(points, pieces[p].begin, pieces[p].end); });
@@ -76,9 +76,9 @@ inline bool measure_all(const pc_context& context, ScratchFrame& scratch, const 
 // Where the pieces leave their results: piece p owns [begin, end) of each, like its rows, and uses what it needs.
 template <class Voxel>
 struct Found {
-  Voxel* voxels;     // by number
-  VoxelSum* sums;    // by number; null if nobody asks
-  int32_t* common;   // the number of a piece's voxel in its cloud, by its number in the piece
+  Voxel* voxels;    // by number
+  VoxelSum* sums;   // by number; null if nobody asks
+  int32_t* common;  // the number of a piece's voxel in its cloud, by its number in the piece
 };
 
 // Number the voxels of one piece by first appearance and sum the offsets of their points.
@@ -203,7 +203,8 @@ struct SizedClouds {
 
 // Call body(a voxel of the type that the clouds need); false if one spans too many voxels.
 template <class Body>
-bool with_grids(const pc_context& context, ScratchFrame& scratch, const SizedClouds& clouds, Pieces& pieces, Body&& body) {
+bool with_grids(const pc_context& context, ScratchFrame& scratch, const SizedClouds& clouds, Pieces& pieces,
+                Body&& body) {
   std::vector<VoxelGrid> grids(static_cast<size_t>(clouds.num_clouds));
   for (VoxelGrid& grid : grids) grid = {};
   if (!measure_all(context, scratch, clouds.points, pieces, clouds.sizes, clouds.num_clouds, grids.data()))
