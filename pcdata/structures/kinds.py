@@ -87,6 +87,8 @@ class KindRow:
     """All that clouds know about one kind of field; a file keeps the kind's name."""
 
     holds: str  # what its values must be, in words
+    moves: str  # what a motion of the cloud does to it, in words
+    averages: str  # what becomes of several, in words
     fits: Callable[[torch.dtype], bool]  # whether they are of such a dtype
     row: tuple[int, ...] | None = None  # the shape that a row must have; None = any
     move: Move
@@ -96,9 +98,10 @@ class KindRow:
 
 
 KINDS = {
-    # Moved by the 4x4; averaged.
     Kind.POSITION: KindRow(
         holds="float (N, 3)",
+        moves="by the 4x4",
+        averages="the mean",
         fits=_floats,
         row=(3,),
         move=transform_points,
@@ -106,22 +109,41 @@ KINDS = {
         padding=_zero,
         is_length=True,
     ),
-    # Moved by the inverse transpose and brought back to unit length; averaged, and to unit length again.
     Kind.DIRECTION: KindRow(
         holds="float (N, 3)",
+        moves="by the inverse transpose, back to unit length",
+        averages="the mean, back to unit length",
         fits=_floats,
         row=(3,),
         move=transform_directions,
         average=voxel_mean_direction,
         padding=_zero,
     ),
-    # Not moved; floats are averaged, integers voted: an integer is never averaged.
     Kind.INVARIANT: KindRow(
-        holds="numbers (N, ...)", fits=_any, move=_stays, average=_mean_or_vote, padding=_no_number
+        holds="numbers (N, ...)",
+        moves="not at all",
+        averages="of floats the mean; of integers a vote, the lowest of equals: an integer is never averaged",
+        fits=_any,
+        move=_stays,
+        average=_mean_or_vote,
+        padding=_no_number,
     ),
-    # Not moved; of several the lowest counts.
-    Kind.MINIMUM: KindRow(holds="integers (N, ...)", fits=_whole, move=_stays, average=_minimum, padding=_no_number),
+    Kind.MINIMUM: KindRow(
+        holds="integers (N, ...)",
+        moves="not at all",
+        averages="the lowest",
+        fits=_whole,
+        move=_stays,
+        average=_minimum,
+        padding=_no_number,
+    ),
 }
+
+
+def kinds_table() -> str:
+    """Return the rows as Markdown, for docs/clouds.md."""
+    rows = [f"| `{kind.value}` | {row.holds} | {row.moves} | {row.averages} |" for kind, row in KINDS.items()]
+    return "\n".join(["| kind | holds | is moved | several become |", "|---|---|---|---|", *rows])
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from pcdata.geometry import rigid
 from pcdata.io.store.cloud_record import cloud_from_record, record_from_cloud
 from pcdata.rng import seeded
 from pcdata.structures import Kind, PointCloud
-from pcdata.structures.kinds import FIELDS, KINDS
+from pcdata.structures.kinds import FIELDS, KINDS, kinds_table
 from tests.factories import assert_same, base_from_camera, cloud_in_base
 
 COUNTS = [3, 0, 5]
@@ -89,6 +91,10 @@ def test_an_average_is_a_mean_a_vote_the_lowest_or_the_first_and_never_the_mean_
     for name, (_, _, expected) in fields.items():
         torch.testing.assert_close(one.extra[name].double(), torch.tensor(expected).double(), atol=1e-6, rtol=0)
     assert one.source_index.tolist() == [5]
+
+
+def test_the_page_tells_every_kind():
+    assert kinds_table() in (Path(__file__).parents[2] / "docs" / "clouds.md").read_text(encoding="utf-8")
 
 
 def test_what_a_kind_cannot_hold_is_refused():
