@@ -38,7 +38,7 @@ NUM_CAPTURES, OLD = 10, 4  # captures; of which an old result holds so many
 SERVER = """
 import json, os, sys, torch, h5py, scipy.io, PIL.Image
 torch.set_num_threads(1)
-import pcdata.build, pcdata.exports, pcdata.calibration, pcdata.validation, pcdata.report.inspection, pcdata.io
+import pcdata.build, pcdata.exports, pcdata.calibration, pcdata.validation, pcdata.report.inspection_text, pcdata.io
 from pcdata.cli import calib, datasets, export, fuse, main, models, sensors, validate
 for line in sys.stdin:
     call = json.loads(line)

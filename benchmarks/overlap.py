@@ -39,7 +39,7 @@ from pcdata.report import text_table
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from pcdata.validation import verify_overlap
-from pcdata.validation.measures.surfaces import surfaces_of
+from pcdata.validation.measures.view_surfaces import surfaces_of
 from pcdata.verdicts import Verdict
 
 RESULT = Path(__file__).parent / "results" / "overlap.json"

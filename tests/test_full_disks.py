@@ -15,7 +15,7 @@ from pcdata.io import write_calibration, write_color, write_depth, write_labels,
 from pcdata.io.calibration.capture_camera import write_pose
 from pcdata.io.images.confidence import write_confidence
 from pcdata.io.writers.capture_folder import write_capture
-from pcdata.report.figure import save_pipeline_figure
+from pcdata.report.pipeline_figure import save_pipeline_figure
 from pcdata.structures import TSDFVolume
 from pcdata.structures.calibration import Calibration
 from tests.disk_limits import largest_file

@@ -12,7 +12,7 @@ from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
 
 
 class PairMotion(NamedTuple):
-    """What a pairwise registration found: ``motion`` brings the source view onto the target view."""
+    """What a pairwise alignment found: ``motion`` brings the source view onto the target view."""
 
     source: int
     target: int

@@ -1,4 +1,4 @@
-"""Pairwise registration by other libraries: small_gicp and Open3D."""
+"""Pairwise alignment by other libraries: small_gicp and Open3D."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from pcdata.errors import CalibrationError, ConfigError, FrameError, near_matche
 from pcdata.geometry import rigid
 from pcdata.structures import DepthFrame
 from pcdata.structures.calibration import Calibration, Evidence, FramePair
-from pcdata.validation.measures.surfaces import surfaces_of
+from pcdata.validation.measures.view_surfaces import surfaces_of
 from pcdata.validation.overlap import judge_alignment
 from pcdata.validation.overlap_result import OverlapLimits, OverlapResult
 
@@ -130,7 +130,7 @@ def refine_extrinsics(
     """Find the poses at which all cameras see one surface, one camera kept where it is.
 
     ``method="pcdata"`` solves all cameras in one least-squares over the point-to-plane distances of all pairs and
-    captures. The others register pair by pair and average the pairs by their information. Whichever found the poses,
+    captures. The others align pair by pair and average the pairs by their information. Whichever found the poses,
     the same distances judge them, and poses are refused rather than returned when they cannot be trusted.
 
     Args:

@@ -146,7 +146,7 @@ def _noise_of(sensor: str, focal: float) -> Callable[[float], float]:
 
 
 def _check_table(checks: dict[str, PlaneResult]) -> str:
-    from pcdata.report.table import text_table
+    from pcdata.report.plain_table import text_table
 
     header = ["capture", "axis m", "normal m", "tilt deg", "fill %", "on plane %", "plane RMS mm", "depth RMS mm"]
     any_check = next(iter(checks.values()))
@@ -167,7 +167,7 @@ def _check_table(checks: dict[str, PlaneResult]) -> str:
 
 def _intrinsics(arguments: argparse.Namespace) -> int:
     from pcdata.calibration import calibrate_intrinsics, find_board, read_board_images
-    from pcdata.report.table import text_table
+    from pcdata.report.plain_table import text_table
 
     images = read_board_images(arguments.images)
     views, size = find_board(images, arguments.board)
@@ -198,7 +198,7 @@ def _intrinsics(arguments: argparse.Namespace) -> int:
 
 def _hand_eye(arguments: argparse.Namespace) -> int:
     from pcdata.calibration import calibrate_hand_eye, read_robot_poses
-    from pcdata.report.table import text_table
+    from pcdata.report.plain_table import text_table
 
     poses = read_robot_poses(arguments.poses, locate=_locator(arguments))
     result = calibrate_hand_eye(poses, setup=arguments.setup)
@@ -265,7 +265,7 @@ def _locate(path: Path, board: Board, camera: Any) -> Any:
 
 
 def _findings_table(findings: Sequence[Finding]) -> str:
-    from pcdata.report.table import text_table
+    from pcdata.report.plain_table import text_table
 
     rows = [[f.name, f.found, "" if f.threshold is None else _shown(f.verdict)] for f in findings]
     table = text_table(["measure", "found", "verdict"], rows)

@@ -53,7 +53,7 @@ def given_preset(model: str, pairs: list[tuple[str, str]]) -> Preset:
     """
     from pcdata.errors import ConfigError
     from pcdata.models import contract, preset
-    from pcdata.models.catalogue import CHOICES, EXAMPLES
+    from pcdata.models.catalog import CHOICES, EXAMPLES
 
     choices = given_choices(model, pairs)
     left = contract(model, **choices).required_choices

@@ -8,7 +8,7 @@ from typing import Any
 from pcdata.cli.choices import add_model_options, given_preset
 from pcdata.cli.known_names import FORMATS
 from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, skip_list
-from pcdata.cli.progress import ProgressBar
+from pcdata.cli.progress_bar import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -103,7 +103,7 @@ def _build(arguments: argparse.Namespace) -> None:
 def _inspect(arguments: argparse.Namespace) -> None:
     from pcdata.io.sources.listing import absolute
     from pcdata.io.store.manifest import FILE_NAME
-    from pcdata.report.inspection import capture_text, dataset_text
+    from pcdata.report.inspection_text import capture_text, dataset_text
 
     if (absolute(arguments.path) / FILE_NAME).is_file():
         print(dataset_text(arguments.path))
@@ -112,12 +112,12 @@ def _inspect(arguments: argparse.Namespace) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> None:
-    from pcdata.report.health import health_text
+    from pcdata.report.health_text import health_text
 
     print(health_text())
 
 
 def _build_table(report: Any) -> str:
-    from pcdata.report.inspection import build_text
+    from pcdata.report.inspection_text import build_text
 
     return build_text(report)

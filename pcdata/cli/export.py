@@ -7,7 +7,7 @@ from typing import Any
 
 from pcdata.cli.known_names import TARGETS
 from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
-from pcdata.cli.progress import ProgressBar
+from pcdata.cli.progress_bar import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -44,8 +44,8 @@ def _options_in_words() -> list[str]:
 def _export(arguments: argparse.Namespace) -> None:
     from pcdata.errors import ConfigError
     from pcdata.exports import export_dataset
-    from pcdata.exports.registry import target_named
-    from pcdata.exports.sources import is_built
+    from pcdata.exports.export_source import is_built
+    from pcdata.exports.targets import target_named
 
     options = dict(arguments.set)
     if len(options) != len(arguments.set):

@@ -8,7 +8,7 @@ from typing import Any
 
 from pcdata.cli.known_names import CARVINGS, WEIGHTINGS
 from pcdata.cli.options import add_capture_options, open_captures, positive
-from pcdata.cli.progress import ProgressBar
+from pcdata.cli.progress_bar import ProgressBar
 
 
 def add_to(commands: Any) -> None:

@@ -34,7 +34,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from pcdata.exports import is_export
     from pcdata.files.opening import replacing
     from pcdata.io.store.manifest import FILE_NAME
-    from pcdata.report.validation import validation_text
+    from pcdata.report.validation_text import validation_text
     from pcdata.verdicts import Verdict
 
     if arguments.keys:
@@ -111,7 +111,7 @@ def _check_foreign(arguments: argparse.Namespace) -> Any:
 def _models(arguments: argparse.Namespace) -> int:
     from pcdata.models import CONTRACTS, contract
     from pcdata.models.pages import contract_page
-    from pcdata.report.table import text_table
+    from pcdata.report.plain_table import text_table
 
     if arguments.name:
         print(contract_page(contract(arguments.name)))

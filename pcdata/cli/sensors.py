@@ -14,6 +14,6 @@ def add_to(commands: Any) -> None:
 
 
 def _profiles(arguments: argparse.Namespace) -> None:
-    from pcdata.report.sensors import profile_text, profiles_text
+    from pcdata.report.sensor_text import profile_text, profiles_text
 
     print(profiles_text() if arguments.name is None else profile_text(arguments.name))

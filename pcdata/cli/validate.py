@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from pcdata.cli.known_names import CHECKS, SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
-from pcdata.cli.progress import ProgressBar
+from pcdata.cli.progress_bar import ProgressBar
 
 
 def add_to(commands: Any) -> None:
@@ -40,7 +40,7 @@ def add_to(commands: Any) -> None:
 def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.errors import CaptureError, PoseError, UnitError
     from pcdata.files.opening import replacing
-    from pcdata.report.validation import validation_text
+    from pcdata.report.validation_text import validation_text
     from pcdata.validation import WHOLE, CaptureLimits, SampleReport, Summary, check_of_error, validate_source
     from pcdata.verdicts import Verdict
 

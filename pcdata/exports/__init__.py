@@ -1,9 +1,9 @@
 """Exports: built clouds and captures in the layouts that the models' own loaders open, unmodified."""
 
-from pcdata.exports.check import check_export, is_export
-from pcdata.exports.export import ExportReport, export_dataset
-from pcdata.exports.registry import TARGETS, register_target
+from pcdata.exports.export_check import check_export, is_export
+from pcdata.exports.exporter import ExportReport, export_dataset
 from pcdata.exports.target import Item, Target
+from pcdata.exports.targets import TARGETS, register_target
 
 __all__ = [
     "TARGETS",

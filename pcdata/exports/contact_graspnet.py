@@ -13,8 +13,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.exports.checks import object_ids, one_view
-from pcdata.exports.contracts import require_depth
+from pcdata.exports.model_contracts import require_depth
+from pcdata.exports.sample_needs import object_ids, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npz import write_npz
 from pcdata.io.store.manifest import key_of

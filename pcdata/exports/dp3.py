@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.exports.checks import check_channels, check_same_count, one_cloud
-from pcdata.exports.contracts import require_cloud
 from pcdata.exports.episodes import Given, episode_names, read_episodes
+from pcdata.exports.model_contracts import require_cloud
+from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
 from pcdata.structures import PointCloud

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.exports.checks import check_size, colors_of, one_view
-from pcdata.exports.contracts import require_image
+from pcdata.exports.model_contracts import require_image
+from pcdata.exports.sample_needs import check_size, colors_of, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.opening import read_text
 from pcdata.io.images.writing import write_color

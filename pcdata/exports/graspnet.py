@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import CaptureError, add_note
-from pcdata.exports.checks import check_size, colors_of, object_ids, one_view
-from pcdata.exports.contracts import require_depth
+from pcdata.exports.model_contracts import require_depth
+from pcdata.exports.sample_needs import check_size, colors_of, object_ids, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.io.images.writing import write_color, write_depth
 from pcdata.io.store.manifest import key_of

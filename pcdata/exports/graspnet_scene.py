@@ -15,8 +15,8 @@ import annotated_types
 import torch
 
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError
-from pcdata.exports.checks import colors_of
 from pcdata.exports.graspnet import GraspNetImages, meta_bytes
+from pcdata.exports.sample_needs import colors_of
 from pcdata.exports.target import Item, Note, Samples
 from pcdata.files.npy import write_npy
 from pcdata.geometry import rigid

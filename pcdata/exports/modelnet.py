@@ -15,9 +15,9 @@ from typing import Annotated, ClassVar, Literal
 import annotated_types
 import numpy as np
 
-from pcdata.exports.checks import check_channels, check_count, one_cloud
-from pcdata.exports.contracts import require_cloud
-from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.model_contracts import require_cloud
+from pcdata.exports.sample_needs import check_channels, check_count, one_cloud
 from pcdata.exports.target import Item, Note, Samples, Target
 
 _EXACT = "%.9g"  # nine digits give every float32 back
@@ -28,7 +28,7 @@ class ModelNet(Target):
     """``<class>/<class>_0001.txt``, lists of shapes and classes; the loaders look for ``modelnet40_normal_resampled``.
 
     Args:
-        table: class and split (train or test) of every sample; see :func:`pcdata.exports.table.read_table`.
+        table: class and split (train or test) of every sample; see :func:`pcdata.exports.class_table.read_table`.
         num_points: as many points as the loader takes, the first ones; no cloud may have fewer.
     """
 

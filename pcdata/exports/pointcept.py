@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
-from pcdata.exports.checks import check_channels, one_cloud
-from pcdata.exports.contracts import require_cloud
-from pcdata.exports.table import Given, read_table
+from pcdata.exports.class_table import Given, read_table
+from pcdata.exports.model_contracts import require_cloud
+from pcdata.exports.sample_needs import check_channels, one_cloud
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npy import write_npy
 from pcdata.io.store.manifest import key_of
@@ -29,7 +29,7 @@ class Pointcept(Target):
     """``<split>/<sample>/{coord,color,normal,segment,instance}.npy``; give the folder to the loader as ``data_root``.
 
     Args:
-        table: split of every sample, any name; None = all in ``train``. See :func:`pcdata.exports.table.read_table`.
+        table: split of every sample, any name; None = all in ``train``; see :mod:`pcdata.exports.class_table`.
         segment: the per-point field of semantic classes, -1 = ignored; None = do without.
         instance: the per-point field of objects, -1 = none; None = do without.
         frame: the frame that the clouds must be in; None = any.

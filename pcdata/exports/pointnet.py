@@ -15,9 +15,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from pcdata.errors import ConfigError
-from pcdata.exports.checks import one_cloud
-from pcdata.exports.contracts import require_cloud
-from pcdata.exports.table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.model_contracts import require_cloud
+from pcdata.exports.sample_needs import one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.files.interrupts import shielded
 from pcdata.io.arrays.hdf5_writing import FaultKeepingFile, new_hdf5
@@ -33,7 +33,7 @@ class PointNet(Target):
     """``ply_data_<split><n>.h5``, ``<split>_files.txt`` and ``shape_names.txt``.
 
     Args:
-        table: class and split (train or test) of every sample; see :func:`pcdata.exports.table.read_table`.
+        table: class and split (train or test) of every sample; see :func:`pcdata.exports.class_table.read_table`.
         prefix: put before the file names in the lists. ``train.py`` opens those names as they are, from the
             repository's folder; the default is the folder in which it looks for the lists.
     """

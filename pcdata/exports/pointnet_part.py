@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.exports.checks import check_channels
+from pcdata.exports.class_table import Row, classes_of
 from pcdata.exports.pointnet import NUM_POINTS, PointNet
-from pcdata.exports.table import Row, classes_of
+from pcdata.exports.sample_needs import check_channels
 from pcdata.structures import PointCloud
 
 _CLASSES = 16  # NUM_CATEGORIES of the loader

@@ -1,9 +1,9 @@
 """What each downstream model takes, as data: presets that meet it, checks that hold data against it, the way back."""
 
 from pcdata.models.batch import ModelBatch
-from pcdata.models.catalogue import CONTRACTS, contract
-from pcdata.models.check import check, check_files, require
+from pcdata.models.catalog import CONTRACTS, contract
 from pcdata.models.contract import Channel, InputTensor, ModelContract, Role
+from pcdata.models.model_check import check, check_files, require
 from pcdata.models.predictions import Predictions, to_frame, to_source
 from pcdata.models.preset import Preset, preset
 

@@ -8,8 +8,8 @@ from typing import Any
 from pcdata.errors import DTypeError
 from pcdata.models.batch import ModelBatch
 from pcdata.models.contract import ModelContract
-from pcdata.models.images import image_tensor
-from pcdata.models.tensors import contract_tensor
+from pcdata.models.image_tensors import image_tensor
+from pcdata.models.model_tensors import contract_tensor
 from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
 
 

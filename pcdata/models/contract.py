@@ -28,7 +28,7 @@ class Role(str, Enum):
 class Channel:
     """Neighbouring columns of a tensor that mean one thing."""
 
-    name: str  # unique among all contracts for one meaning; COLUMNS of pcdata.models.tensors computes it
+    name: str  # unique among all contracts for one meaning; COLUMNS of pcdata.models.model_tensors computes it
     width: int = 3
     role: Role = Role.POSITION
     low: float | None = None  # smallest and largest value that the model expects
@@ -56,7 +56,7 @@ class InputTensor:
     layout: str
     channels: tuple[Channel, ...] = ()
     dtype: str = "float32"
-    content: str = "columns"  # how it is made: a name in PACKERS of pcdata.models.tensors
+    content: str = "columns"  # how it is made: a name in PACKERS of pcdata.models.model_tensors
 
     @property
     def axes(self) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pcdata.models.catalogue import CONTRACTS, EXAMPLES, allowed_counts, possible_choices
+from pcdata.models.catalog import CONTRACTS, EXAMPLES, allowed_counts, possible_choices
 from pcdata.models.contract import Channel, ModelContract
 
 

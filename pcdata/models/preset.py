@@ -10,10 +10,10 @@ from pcdata.errors import ConfigError, DTypeError
 from pcdata.io import CaptureSource
 from pcdata.models.batch import ModelBatch
 from pcdata.models.batching import batch_of
-from pcdata.models.catalogue import contract as contract_named
-from pcdata.models.catalogue import missing_choices
-from pcdata.models.check import require
+from pcdata.models.catalog import contract as contract_named
+from pcdata.models.catalog import missing_choices
 from pcdata.models.contract import ModelContract
+from pcdata.models.model_check import require
 from pcdata.models.steps import pipeline_of
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Compose
@@ -24,7 +24,7 @@ class Preset:
     """A contract with its choices made, the pipeline that meets it, and :meth:`collate` for ``DataLoader``.
 
     The pipeline is yours to change (``preset.pipeline``): a chain of its steps and your own cleaning and augmentation;
-    :func:`pcdata.models.check` says whether the result still fits the model.
+    :func:`pcdata.models.model_check` says whether the result still fits the model.
     """
 
     def __init__(self, contract: ModelContract, choices: Mapping[str, Any], pipeline: Compose | None = None) -> None:

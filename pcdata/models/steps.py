@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pcdata.models.catalogue import is_camera
+from pcdata.models.catalog import is_camera
 from pcdata.models.contract import ModelContract
 from pcdata.structures import CAMERA_FRAME
 from pcdata.transforms import (

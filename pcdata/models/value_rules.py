@@ -10,9 +10,9 @@ from torch import Tensor
 from pcdata.contracts.lengths import WIDEST, plausible_units
 from pcdata.functional.planes import ransac_plane
 from pcdata.models.batch import ModelBatch
-from pcdata.models.catalogue import is_camera
+from pcdata.models.catalog import is_camera
 from pcdata.models.contract import MIN_POINTS, Channel, InputTensor, ModelContract, Role
-from pcdata.models.rules import denser, layout_fault, ruled
+from pcdata.models.declared_rules import denser, layout_fault, ruled
 from pcdata.structures import METRE
 from pcdata.verdicts import Finding, Verdict, graded
 

@@ -1,6 +1,6 @@
 """Numbers to pictures and tables."""
 
-from pcdata.report.figure import save_pipeline_figure
-from pcdata.report.table import text_table
+from pcdata.report.pipeline_figure import save_pipeline_figure
+from pcdata.report.plain_table import text_table
 
 __all__ = ["save_pipeline_figure", "text_table"]

@@ -1,11 +1,11 @@
 """Judging captures: do they hold what training needs, and do several cameras agree."""
 
 from pcdata.validation.capture_check import CHECKS, Check, Explained, register_check
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
-from pcdata.validation.report import WHOLE, SampleReport, Summary
 from pcdata.validation.run import check_of_error, validate_frame, validate_source
+from pcdata.validation.summary import WHOLE, SampleReport, Summary
 
 __all__ = [
     "CHECKS",

@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple
 from pcdata.errors import ConfigError
 from pcdata.registry import Registry
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.verdicts import Finding, Verdict
 
 

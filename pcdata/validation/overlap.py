@@ -16,7 +16,7 @@ from pcdata.errors import ConfigError, ShapeError
 from pcdata.geometry.small_motions import motion_from_twist
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
-from pcdata.validation.measures.surfaces import surfaces_of
+from pcdata.validation.measures.view_surfaces import surfaces_of
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.verdicts import Verdict, judged, worst
 

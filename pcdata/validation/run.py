@@ -12,8 +12,8 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.validation import checks as _checks  # noqa: F401  # registers them
 from pcdata.validation.capture_check import CHECKS, Check
-from pcdata.validation.limits import CaptureLimits
-from pcdata.validation.report import WHOLE, SampleReport
+from pcdata.validation.capture_limits import CaptureLimits
+from pcdata.validation.summary import WHOLE, SampleReport
 from pcdata.verdicts import Finding, Verdict
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.

@@ -19,15 +19,15 @@ from pcdata.cli import known_names
 from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import export_dataset
-from pcdata.exports.registry import TARGETS
+from pcdata.exports.targets import TARGETS
 from pcdata.io import CaptureCamera, write_capture_camera, write_color, write_depth, write_pose
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.sources.registry import LAYOUTS
 from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
 from pcdata.io.store.stores import STORES
 from pcdata.models import CONTRACTS, check, check_files, contract, preset
-from pcdata.models.catalogue import CHOICES, EXAMPLES
-from pcdata.models.check import require
+from pcdata.models.catalog import CHOICES, EXAMPLES
+from pcdata.models.model_check import require
 from pcdata.sensors import sensor_profiles
 from pcdata.synthetic import tabletop
 from pcdata.validation import CHECKS

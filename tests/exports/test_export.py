@@ -16,8 +16,8 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import CacheError, CaptureError, ConfigError
 from pcdata.exports import TARGETS, export_dataset
-from pcdata.exports.record import FILE_NAME
-from pcdata.exports.registry import target_named
+from pcdata.exports.export_record import FILE_NAME
+from pcdata.exports.targets import target_named
 from pcdata.io.writers.capture_folder import write_capture
 from pcdata.synthetic import SyntheticSource
 from tests.exports.samples import Samples, cloud, frame, tree
@@ -157,7 +157,7 @@ def test_an_item_that_was_moved_by_half_is_written_again(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         rename(source, target)
 
-    monkeypatch.setattr("pcdata.exports.export.os.replace", fails_at_the_second_depth)
+    monkeypatch.setattr("pcdata.exports.exporter.os.replace", fails_at_the_second_depth)
     with pytest.raises(KeyboardInterrupt):
         export_dataset(captures(), "ggcnn", tmp_path / "out", resume=True, **options)
     monkeypatch.undo()
@@ -202,7 +202,7 @@ def test_an_export_killed_at_its_start_can_be_continued(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("pcdata.exports.export.rename_to_free", stop_here)
+        patch.setattr("pcdata.exports.exporter.rename_to_free", stop_here)
         with pytest.raises(KeyboardInterrupt):
             export_dataset(captures(), "contact_graspnet", tmp_path / "out", resume=True)
     assert not (tmp_path / "out").exists()  # never without its plan

@@ -13,7 +13,7 @@ import torch
 
 from pcdata import Camera, DepthFrame, PointCloud, TSDFVolume, read_ply, read_volume, write_ply, write_volume
 from pcdata.errors import CacheError, CaptureError, PcdataError
-from pcdata.exports.record import FILE_NAME, ExportRecord
+from pcdata.exports.export_record import FILE_NAME, ExportRecord
 from pcdata.files.npz import write_npz
 from pcdata.files.strict_json import json_object, parse_json
 from pcdata.io.arrays.stored_arrays import stored_arrays

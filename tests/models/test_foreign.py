@@ -15,7 +15,7 @@ from pcdata.errors import CacheError, ConfigError, ContractError, DTypeError, Pc
 from pcdata.models import check, check_files, require
 from pcdata.verdicts import Verdict
 from tests.models.captures import correct_batch
-from tests.models.test_check import failed
+from tests.models.test_model_check import failed
 
 GIVEN = {"frame": "base", "frame_id": "base", "unit": "m"}
 

@@ -7,7 +7,7 @@ import torch
 
 from pcdata import PointCloud
 from pcdata.report.labels import label_text
-from pcdata.report.table import text_table
+from pcdata.report.plain_table import text_table
 
 NAMES = ["$x^{2}$", "$\\frac$", "_left", "a\nb", "\x1b[2Jx", "100 $"]
 

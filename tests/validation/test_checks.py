@@ -15,7 +15,7 @@ from pcdata.errors import ConfigError, ShapeError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Deproject
 from pcdata.validation import CHECKS, CaptureLimits, Check, Explained, register_check
-from pcdata.validation.page import checks_table
+from pcdata.validation.checks_page import checks_table
 from pcdata.verdicts import Finding, Verdict
 from tests.validation.captures import Frames, scene
 

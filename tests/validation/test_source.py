@@ -19,7 +19,7 @@ from pcdata import open_source, validate_frame, validate_source
 from pcdata.errors import CaptureError, DTypeError
 from pcdata.geometry import rigid
 from pcdata.io import read_depth, write_pcd
-from pcdata.report.validation import validation_text
+from pcdata.report.validation_text import validation_text
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import SyntheticSource, look_at, tabletop
 from pcdata.validation import WHOLE, CaptureLimits, SampleReport, Summary

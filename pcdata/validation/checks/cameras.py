@@ -11,7 +11,7 @@ import torch
 from pcdata.contracts.lengths import FARTHEST
 from pcdata.structures import Camera, DepthFrame
 from pcdata.validation.capture_check import Check, Explained
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.verdicts import Finding, Verdict, graded
 
 _MAX_SKEWED = 1e-3  # of R R^T - I; more is refused where a frame is made

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pcdata.structures import DepthFrame
 from pcdata.validation.capture_check import Check, Explained
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.measures.edge_offset import (
     SHIFT_LIMIT,
     TELLABLE,

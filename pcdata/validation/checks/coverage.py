@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.capture_check import Check, Explained
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.measures.missing_region import largest_missing_block, largest_missing_region
 from pcdata.verdicts import Finding, graded
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, UnitFit, encoded, unit_fits, units_in_words
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.verdicts import Finding, Verdict
 
 NAME = "depth_unit"

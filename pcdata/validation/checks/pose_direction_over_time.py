@@ -9,8 +9,8 @@ from typing import ClassVar
 from pcdata.alignment.view_agreement import Agreement
 from pcdata.structures import DepthFrame
 from pcdata.validation.capture_check import Check, views_failing
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.checks.pose_direction import PoseDirection, direction_check, judged_as_given
-from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
     PosedView,

@@ -11,8 +11,8 @@ from torch import Tensor
 from pcdata.functional.depth.stored_depth import MARKS
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation.capture_check import Check, Explained
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.checks.depth_unit import depth_unit_check
-from pcdata.validation.limits import CaptureLimits
 from pcdata.validation.measures.extremes import pile_at_extreme
 from pcdata.verdicts import Finding, graded
 

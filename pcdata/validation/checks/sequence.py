@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.structures import DepthFrame
 from pcdata.validation.capture_check import Check, Explained
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict, graded
 

@@ -17,7 +17,7 @@ import torch
 from pcdata import open_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CaptureError, ConfigError, DTypeError, PcdataError
-from pcdata.exports.sources import BuiltClouds
+from pcdata.exports.export_source import BuiltClouds
 from pcdata.files.sample_names import in_order
 from pcdata.io import (
     COMBINATORS,

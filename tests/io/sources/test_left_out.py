@@ -17,7 +17,7 @@ from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
 from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.open_source import read_skip_file
 from pcdata.io.store.manifest import Manifest
-from pcdata.report.inspection import skipped_text
+from pcdata.report.inspection_text import skipped_text
 
 SIZE = (24, 32)
 STEPS = "depth:\n- Deproject: {}\ncloud:\n- FarthestPointSample: {num_points: 16}\n"

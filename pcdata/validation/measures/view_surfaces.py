@@ -1,4 +1,4 @@
-"""The surfaces that the views of a capture saw, for registration."""
+"""The surfaces that the views of a capture saw, for alignment."""
 
 from __future__ import annotations
 

@@ -15,10 +15,10 @@ from pcdata.datasets import CachedCloudDataset, SampleDataset
 from pcdata.errors import ContractError, DTypeError, PcdataError, locates_path
 from pcdata.models.batch import ModelBatch
 from pcdata.models.batching import batch_of
-from pcdata.models.catalogue import contract as contract_named
+from pcdata.models.catalog import contract as contract_named
 from pcdata.models.contract import ModelContract
+from pcdata.models.declared_rules import cheap_checks
 from pcdata.models.foreign import read_samples
-from pcdata.models.rules import cheap_checks
 from pcdata.models.value_rules import value_checks
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.validation import SampleReport, Summary

@@ -12,7 +12,7 @@ import pytest
 from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import TARGETS, check_export, export_dataset
-from pcdata.exports.record import FILE_NAME
+from pcdata.exports.export_record import FILE_NAME
 from tests.exports import test_dp3
 from tests.exports.samples import Samples, cloud, shape
 

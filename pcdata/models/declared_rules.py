@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from pcdata.models.batch import ModelBatch
-from pcdata.models.catalogue import CONTRACTS, possible_choices
+from pcdata.models.catalog import CONTRACTS, possible_choices
 from pcdata.models.contract import MIN_POINTS, InputTensor, ModelContract
-from pcdata.models.images import size_step
+from pcdata.models.image_tensors import size_step
 from pcdata.structures import METRE
 from pcdata.verdicts import Finding, Verdict
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
-from pcdata.report.table import text_table
+from pcdata.report.plain_table import text_table
 from pcdata.sensors import SensorProfile, sensor_profile, sensor_profiles
 
 _DERIVED = ("noise_at", "pitch_at", "outlier_radius", "edge_threshold", "voxel_size")

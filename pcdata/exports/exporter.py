@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CacheError, ConfigError, PcdataError, WriteError, add_note, write_fault
-from pcdata.exports.record import FILE_NAME, ExportRecord, check_only_export, files_of
-from pcdata.exports.registry import target_named
-from pcdata.exports.sources import identity_of, open_for
+from pcdata.exports.export_record import FILE_NAME, ExportRecord, check_only_export, files_of
+from pcdata.exports.export_source import identity_of, open_for
 from pcdata.exports.target import Item, Samples, Target
+from pcdata.exports.targets import target_named
 from pcdata.files.inputs import recording
 from pcdata.files.interrupts import shielded
 from pcdata.files.scratch import scratch_beside

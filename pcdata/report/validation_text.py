@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pcdata.errors import told_apart
-from pcdata.report.table import text_table
+from pcdata.report.plain_table import text_table
 from pcdata.validation import Summary
-from pcdata.validation.report import Message
+from pcdata.validation.summary import Message
 from pcdata.verdicts import Finding, Verdict
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.errors import CacheError, ConfigError, ContractError
-from pcdata.exports.record import FILE_NAME, ExportRecord
-from pcdata.exports.registry import TARGETS
+from pcdata.exports.export_record import FILE_NAME, ExportRecord
+from pcdata.exports.targets import TARGETS
 from pcdata.models import contract
-from pcdata.models.catalogue import possible_choices
-from pcdata.models.check import reports_of_file
+from pcdata.models.catalog import possible_choices
+from pcdata.models.model_check import reports_of_file
 from pcdata.validation import SampleReport, Summary
 
 

@@ -11,7 +11,7 @@ import pcdata
 import pcdata.functional
 from pcdata import extras
 from pcdata.contracts import dispatch
-from pcdata.report.table import text_table
+from pcdata.report.plain_table import text_table
 
 
 def health_text() -> str:

@@ -10,7 +10,7 @@ from statistics import median
 from pcdata.build import BuildReport
 from pcdata.datasets import CachedCloudDataset
 from pcdata.io.sources.capture_source import CaptureSource, kinds_of, unread_of
-from pcdata.report.table import text_table
+from pcdata.report.plain_table import text_table
 from pcdata.structures import DepthFrame, PointCloud
 
 _SKIPPED_SHOWN = 20  # captures that were left out, in a summary

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from pcdata.validation.capture_check import CHECKS
-from pcdata.validation.limits import CaptureLimits
+from pcdata.validation.capture_limits import CaptureLimits
 
 _PERCENT = re.compile(r"(\d)%")
 
