@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import Count, Length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
@@ -74,6 +74,48 @@ class _TiltFromUp:
         return tilt
 
 
+# The steps of the search that touch every point, for all clouds at once.
+
+
+@inner
+def draw_planes(
+    points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor, *, backend: str = "auto"
+) -> Tensor:  # (B, P, 4) float64 on the CPU, as planes_through
+    """Return the planes through triples (T, P, 3) of rows within a cloud; ``which`` (B,) of the T each cloud takes."""
+    rows = triples[which] + ptr[:-1].cpu()[:, None, None]
+    return planes_through(points[rows.to(points.device)].cpu())
+
+
+@inner
+def count_near_planes(
+    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, *, backend: str = "auto"
+) -> Tensor:  # (B, P) int64 on the CPU
+    """Count the points of each cloud that are near its planes (B, P, 4); planes of NaN are near nothing."""
+    bounds = pairwise(ptr.tolist())
+    return torch.stack([_count_near(points[start:stop], own, distance) for (start, stop), own in zip(bounds, planes)])
+
+
+@inner
+def near_planes(
+    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, *, backend: str = "auto"
+) -> Tensor:  # (N,) bool
+    """Mark the points that are near their cloud's plane, planes (B, 4)."""
+    bounds = pairwise(ptr.tolist())
+    near = [
+        plane_distance(points[start:stop], plane[None])[0].abs_() < distance
+        for (start, stop), plane in zip(bounds, planes)
+    ]
+    return torch.cat(near)
+
+
+@inner
+def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "auto") -> Tensor:  # (B, 4) on the CPU
+    """Fit each cloud's plane to its chosen points (N,) bool; NaN where they lie on a line, as plane_of_moments."""
+    none = torch.full((4,), torch.nan, dtype=torch.float64, device="cpu")
+    fitted = (fit_plane(points[start:stop][chosen[start:stop]]) for start, stop in pairwise(ptr.tolist()))
+    return torch.stack([none if plane is None else plane for plane in fitted])
+
+
 @op(
     points="N 3",
     ptr="ptr N B >= 3",
@@ -82,6 +124,7 @@ class _TiltFromUp:
     seed=_SeedPerCloud(),
     up=_UpPerCloud(),
     max_tilt=_TiltFromUp(),
+    steps=(draw_planes, count_near_planes, near_planes, fit_planes),
     gradient=False,
 )
 def ransac_plane(
@@ -126,50 +169,20 @@ def ransac_plane(
     assert ptr is not None  # @op fills it
     assert isinstance(seed, list)  # and makes it one per cloud,
     assert up is None or isinstance(up, Tensor)  # and unit vectors
-    return search_planes(points, ptr, _TORCH_WORK, distance, num_hypotheses, seed, up, max_tilt)
-
-
-@dataclass(frozen=True)
-class PlaneWork:
-    """The parts of :func:`ransac_plane` that touch every point, for all clouds at once; a kernel brings its own."""
-
-    # points (N, 3), ptr (B+1,), triples (T, P, 3) of rows within a cloud, which of the T each cloud takes (B,) ->
-    # planes (B, P, 4) float64 on the CPU, as planes_through
-    draw: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-    # points, ptr, planes (B, P, 4), distance -> (B, P) int64 on the CPU; planes of NaN are near nothing
-    count_inliers: Callable[[Tensor, Tensor, Tensor, float], Tensor]
-    # points, ptr, planes (B, 4), distance -> (N,) bool
-    inlier_mask: Callable[[Tensor, Tensor, Tensor, float], Tensor]
-    # points, ptr, chosen (N,) bool -> planes (B, 4) on the CPU; NaN where the chosen lie on a line, as plane_of_moments
-    fit: Callable[[Tensor, Tensor, Tensor], Tensor]
-
-
-def search_planes(
-    points: Tensor,
-    ptr: Tensor,
-    work: PlaneWork,
-    distance: float,
-    num_hypotheses: int,
-    seeds: list[int],
-    ups: Tensor | None,
-    max_tilt: float | None,
-) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
-    """Run :func:`ransac_plane` with the given work: draws, decisions and refinement are the same for all kernels."""
-    num_clouds = len(ptr) - 1
-    counts = counts_from_ptr(ptr).tolist()
+    num_clouds, counts = len(ptr) - 1, counts_from_ptr(ptr).tolist()
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
     winners = []
     for first in range(0, num_clouds, at_once):
         some = slice(first, min(first + at_once, num_clouds))
         own, own_ptr = _clouds_between(points, ptr, some.start, some.stop)
-        triples, which = _draw_triples(counts[some], num_hypotheses, seeds[some])
-        hypotheses = work.draw(own, own_ptr, triples, which)
-        allowed = _within_tilt(hypotheses, None if ups is None else ups[some, None], max_tilt)
-        near = work.count_inliers(own, own_ptr, hypotheses, distance)
+        triples, which = _draw_triples(counts[some], num_hypotheses, seed[some])
+        hypotheses = draw_planes(own, own_ptr, triples, which, backend=backend)
+        allowed = _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
+        near = count_near_planes(own, own_ptr, hypotheses, distance, backend=backend)
         winners.append(_best_planes(hypotheses, allowed, near, distance, first))
-    planes, inliers = _refine(points, ptr, torch.cat(winners), distance, ups, max_tilt, work)
-    return _face(planes, ups, distance).to(points.device), inliers
+    planes, inliers = _refine(points, ptr, torch.cat(winners), distance, up, max_tilt, backend)
+    return _face(planes, up, distance).to(points.device), inliers
 
 
 def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
@@ -192,11 +205,6 @@ def _triples_of(num_points: int, count: int, seed: int) -> Tensor:
     return torch.stack([first, second, third], dim=1)
 
 
-def _draw(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
-    rows = triples[which] + ptr[:-1].cpu()[:, None, None]
-    return planes_through(points[rows.to(points.device)].cpu())
-
-
 def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: float, first_cloud: int) -> Tensor:
     """Return each cloud's allowed plane with the most inliers, the earliest among equals, (B, 4)."""
     is_plane = ~planes[..., 0].isnan()
@@ -217,11 +225,6 @@ def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: floa
             "is it in the right unit?"
         )
     return planes[torch.arange(len(planes), dtype=torch.int64, device="cpu"), best]
-
-
-def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
-    bounds = pairwise(ptr.tolist())
-    return torch.stack([_count_near(points[start:stop], own, distance) for (start, stop), own in zip(bounds, planes)])
 
 
 def _count_near(points: Tensor, planes: Tensor, distance: float) -> Tensor:
@@ -249,16 +252,16 @@ def _refine(
     distance: float,
     ups: Tensor | None,
     max_tilt: float | None,
-    work: PlaneWork,
+    backend: str,
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
     """Refit to the inliers until they no longer change; return the last allowed planes and their inliers."""
-    inliers = work.inlier_mask(points, ptr, planes, distance)
+    inliers = near_planes(points, ptr, planes, distance, backend=backend)
     unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
     rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(_MAX_REFINEMENTS):
-        refitted = work.fit(own, own_ptr, before)
+        refitted = fit_planes(own, own_ptr, before, backend=backend)
         fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
-        after = work.inlier_mask(own, own_ptr, refitted, distance)
+        after = near_planes(own, own_ptr, refitted, distance, backend=backend)
         fits &= count_per_cloud(after, own_ptr) >= 3
         settled = fits & (count_per_cloud(after != before, own_ptr) == 0)
         planes[unsettled[fits]] = refitted[fits]
@@ -280,21 +283,6 @@ def _refine(
             chosen, unsettled = chosen[kept], unsettled[open_]
         before = chosen
     return planes, inliers
-
-
-def _inlier_mask(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
-    bounds = pairwise(ptr.tolist())
-    near = [
-        plane_distance(points[start:stop], plane[None])[0].abs_() < distance
-        for (start, stop), plane in zip(bounds, planes)
-    ]
-    return torch.cat(near)
-
-
-def _fit(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
-    none = torch.full((4,), torch.nan, dtype=torch.float64, device="cpu")
-    fitted = (fit_plane(points[start:stop][chosen[start:stop]]) for start, stop in pairwise(ptr.tolist()))
-    return torch.stack([none if plane is None else plane for plane in fitted])
 
 
 def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple[Tensor, Tensor]:
@@ -323,6 +311,3 @@ def _within_tilt(planes: Tensor, ups: Tensor | None, max_tilt: float | None) -> 
         return torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")
     angle = angle_between(planes[..., :3], ups)
     return torch.minimum(angle, math.pi - angle) <= max_tilt
-
-
-_TORCH_WORK = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import pcdata.functional.planes
+import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import OPERATIONS, kernel
-from pcdata.functional.planes import PlaneWork, search_planes
 from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
 from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
@@ -56,41 +57,33 @@ def find_voxel_size(points: Tensor, ptr: Tensor, *, num_points: int) -> Tensor:
     return _reference("find_voxel_size", points, ptr, num_points=num_points)  # knows what to say
 
 
-@kernel("ransac_plane", "cpu")
-def ransac_plane(
-    points: Tensor,
-    ptr: Tensor,
-    *,
-    distance: float,
-    num_hypotheses: int,
-    seed: list[int],
-    up: Tensor | None,
-    max_tilt: float | None,
-) -> tuple[Tensor, Tensor]:
-    """Make and score all hypotheses of all clouds in one pass over the points; decisions are the reference's."""
-    work = PlaneWork(_draw, _count_inliers, _inlier_mask, _fit)
-    return search_planes(points, ptr, work, distance, num_hypotheses, seed, up, max_tilt)
-
-
-def _draw(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
+@kernel("draw_planes", "cpu")
+def draw_planes(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
+    """Make the planes of all clouds in one pass."""
     planes = room((len(which), triples.shape[1], 4), torch.float64)
     call("pc_planes_of_triples", points, ptr, len(which), triples, triples.shape[1], which, FLAT, planes)
     return planes
 
 
-def _count_inliers(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+@kernel("count_near_planes", "cpu")
+def count_near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    """Score all planes of all clouds in one pass over the points."""
     counts = room(planes.shape[:2], torch.int64)
     call("pc_count_near_planes", points, ptr, len(planes), planes.float(), planes.shape[1], float(distance), counts)
     return counts
 
 
-def _inlier_mask(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+@kernel("near_planes", "cpu")
+def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    """Mark in one pass."""
     near = room(len(points), torch.bool)
     call("pc_near_planes", points, ptr, len(planes), planes.float(), float(distance), near)
     return near
 
 
-def _fit(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
+@kernel("fit_planes", "cpu")
+def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
+    """Sum moments in one pass; the planes are the reference's."""
     # Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
     origin = points[first_per_cloud(chosen, ptr)].double()
     sums = room((len(origin), 11), torch.float64)
