@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.fields import Fields
 from pcdata.contracts.numbers import Spec
 from pcdata.contracts.tensors import TensorSpec, check_tensors, parse_spec
-from pcdata.errors import DTypeError, ShapeError
+from pcdata.errors import DeviceError, DTypeError, ShapeError
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Contract:
     _required: tuple[str, ...]  # tensors that may not be None
     _pointers: tuple[tuple[str, str], ...]  # row pointers, the tensor whose rows they cut
     _optional: frozenset[str]  # other arguments whose default is None
+    _fields: dict[str, Fields]  # arguments that hold tensors
 
     @classmethod
     def of(cls, function: Callable[..., Any], specs: Mapping[str, str | Spec]) -> Contract:
@@ -52,7 +54,13 @@ class Contract:
             _required=tuple(key for key, spec in parsed.items() if not spec.is_ptr and defaults[key] is none),
             _pointers=tuple((key, rows[spec.dims[0]]) for key, spec in parsed.items() if spec.is_ptr),
             _optional=frozenset(name for name, default in defaults.items() if default is None),
+            _fields={key: spec for key, spec in specs.items() if isinstance(spec, Fields) and spec.tensors},
         )
+
+    @property
+    def tensors_alone(self) -> bool:
+        """Whether no argument is an object that holds tensors."""
+        return not self._fields
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
         """Return all arguments by name; as ``inspect.Signature.bind``, at a fraction of the price.
@@ -92,3 +100,19 @@ class Contract:
         for key, spec in self.others.items():
             if arguments[key] is not None or key not in self._optional:
                 arguments[key] = spec.checked(self.name, key, arguments)
+        if self._fields:
+            devices = {spec.device(arguments[key]) for key, spec in self._fields.items()}
+            if len(devices) > 1:
+                raise DeviceError(f"{self.name}: {' and '.join(self._fields)} are on different devices; move one")
+
+    def device(self, arguments: Mapping[str, Any]) -> torch.device:
+        """Return where the call is to be computed: on the device of its first tensor."""
+        for key in self.tensors:
+            if arguments[key] is not None:
+                device: torch.device = arguments[key].device
+                return device
+        for key in self._fields:
+            found = self._fields[key].device(arguments[key])
+            if found is not None:
+                return found
+        return torch.device("cpu")

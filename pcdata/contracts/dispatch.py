@@ -56,12 +56,13 @@ class Operation:
     public: Callable[..., Any]
     contract: Contract | None = None  # None for an inner function
     gradient: bool = True  # whether results carry one to the inputs
+    mutates: tuple[str, ...] = ()  # arguments that it changes in place
     steps: tuple[str, ...] = ()  # inner functions that the reference tells its backend
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
 
     def serves(self, backend: str) -> bool:
         """Say whether a backend, once loaded, computes this operation."""
-        return backend in self.kernels or self.serves_by_steps(backend)
+        return backend == REFERENCE or backend in self.kernels or self.serves_by_steps(backend)
 
     def serves_by_steps(self, backend: str) -> bool:
         """Say whether a backend has kernels of all steps: the reference then runs on it, gradients and all."""
@@ -73,7 +74,11 @@ INNER: dict[str, Operation] = {}
 
 
 def op(
-    *, gradient: bool = True, steps: tuple[Callable[..., Any], ...] = (), **specs: str | Spec
+    *,
+    gradient: bool = True,
+    mutates: tuple[str, ...] = (),
+    steps: tuple[Callable[..., Any], ...] = (),
+    **specs: str | Spec,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register the decorated reference as a public operation with a contract per argument.
 
@@ -82,6 +87,7 @@ def op(
 
     Args:
         gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
+        mutates: arguments that it changes in place, to the same values on every backend; all others stay as they are.
         steps: inner functions that the reference calls with its ``backend``.
         specs: argument name -> contract: of tensors a string, see :mod:`pcdata.contracts.tensors`; of others an object,
             see :mod:`pcdata.contracts.numbers`.
@@ -97,7 +103,7 @@ def op(
             contract.check(arguments)
             backend = arguments.pop("backend", "auto")
             wants_gradient = gradient and _wants_gradient(arguments.values())
-            device = next(arguments[key].device for key in contract.tensors if arguments[key] is not None)
+            device = contract.device(arguments)
             backend = _choose(operation, backend, device, wants_gradient)
             body: Callable[..., R] | None = operation.kernels.get(backend)
             _tidy(arguments, detach=body is not None or not gradient, contiguous=backend != REFERENCE)
@@ -106,7 +112,7 @@ def op(
             return body(**arguments) if body is not None else operation.reference(**arguments)
 
         operation = OPERATIONS[name] = Operation(
-            name, reference, public, contract, gradient, tuple(step.__name__ for step in steps)
+            name, reference, public, contract, gradient, mutates, tuple(step.__name__ for step in steps)
         )
         return public
 

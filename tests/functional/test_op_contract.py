@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-import pcdata.functional  # noqa: F401 - registers the operations
+import pcdata.functional
+import pcdata.functional.tsdf  # noqa: F401 - registers operations
 from pcdata.contracts.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailable
 from pcdata.contracts.numbers import (
     Count,
@@ -88,6 +89,10 @@ def disparity_alone(count: int, seed: int) -> dict[str, Tensor]:
     return {"disparity": depth_image(count, seed)["depth"]}
 
 
+def color_image(count: int, seed: int) -> dict[str, Tensor]:
+    return {"colors": torch.randint(256, (count, 5, 3), generator=seeded(seed), dtype=torch.uint8)}
+
+
 def beside_a_color_camera(count: int, seed: int) -> dict[str, Tensor]:
     color_from_depth = torch.eye(4, dtype=torch.float64)[None].clone()
     color_from_depth[:, 0, 3] = 0.03 + 0.01 * seed
@@ -126,6 +131,7 @@ EXAMPLES = [
     Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
+    Example("pack_colors", color_image, ("row",)),
     Example("project_points", in_front_of_a_camera, ("row", "row")),
     Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
     Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
@@ -207,12 +213,17 @@ def assert_equal(one, other) -> None:
         assert torch.equal(a, b), f"output {place} differs"
 
 
-def test_every_operation_has_an_example():
-    assert {example.name for example in EXAMPLES} == set(OPERATIONS)
+def test_every_operation_on_tensors_has_an_example():
+    on_tensors = {name for name, operation in OPERATIONS.items() if operation.contract.tensors_alone}
+    assert {
+        example.name for example in EXAMPLES
+    } == on_tensors  # the others: tests/functional/tsdf/test_step_contract.py
 
 
 def test_every_argument_of_every_contract_is_in_an_example():
     for name, operation in OPERATIONS.items():
+        if not operation.contract.tensors_alone:
+            continue
         used = set()
         for example in EXAMPLES:
             if example.name == name:

@@ -1,17 +1,19 @@
 """Truncated signed distance fields: many depth images averaged into one surface."""
 
-from pcdata.functional.tsdf.backends import (
-    find_blocks,
-    find_crossings,
-    find_triangles,
-    integrate_view,
-    pack_colors,
-    touched_blocks,
-)
 from pcdata.functional.tsdf.blocks import Planes, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
-from pcdata.functional.tsdf.surface import Crossings
-from pcdata.functional.tsdf.views import Carving, FusionView, Weighting, fit_labels, pack_labels, weight_image
+from pcdata.functional.tsdf.integrate import find_blocks, integrate_view, touched_blocks
+from pcdata.functional.tsdf.marching import find_triangles
+from pcdata.functional.tsdf.surface import Crossings, find_crossings
+from pcdata.functional.tsdf.views import (
+    Carving,
+    FusionView,
+    Weighting,
+    fit_labels,
+    pack_colors,
+    pack_labels,
+    weight_image,
+)
 
 __all__ = [
     "Carving",

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.fields import Fields
 from pcdata.functional.tsdf.grid import VOXELS
 
 CHUNK = 8192  # blocks
@@ -171,3 +172,7 @@ class VoxelBlocks:
         for chunk, inside, where in self.in_chunks(rows):
             found[where] = getattr(chunk, name)[inside]
         return found
+
+
+# The spec of blocks.
+BLOCKS = Fields(VoxelBlocks, keys="K : int64")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.contracts.fields import Fields
 from pcdata.errors import ConfigError, UnitError
 
 EDGE = 8  # voxels along a block's edge
@@ -48,6 +49,9 @@ class VoxelGrid:
         """Offsets from a reading along its ray, in metres of depth, at which blocks are opened: half a block apart."""
         halves = max(1, math.ceil(self.truncation / (self.block_size / 2)))
         return [self.truncation * step / halves for step in range(-halves, halves + 1)]
+
+
+GRID = Fields(VoxelGrid)  # the spec of a grid
 
 
 def pack_keys(blocks: Tensor) -> Tensor:

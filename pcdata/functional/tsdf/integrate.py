@@ -10,16 +10,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
-from pcdata.functional.tsdf.grid import VoxelGrid, pack_keys, unpack_keys, voxel_offsets
-from pcdata.functional.tsdf.views import FusionView
+from pcdata.contracts.dispatch import op
+from pcdata.functional.tsdf.blocks import BLOCKS, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
+from pcdata.functional.tsdf.grid import GRID, VoxelGrid, pack_keys, unpack_keys, voxel_offsets
+from pcdata.functional.tsdf.views import VIEW, FusionView
 
 _TOGETHER = 2048  # blocks updated in one go: a million voxels
 _FURTHEST = 2.0**40  # blocks; beyond what keys reach
 _SHARE_STEPS = 1 << 15  # of a pixel's share in a colour, which is mixed in integers
 
 
-def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
+@op(view=VIEW, grid=GRID, gradient=False)
+def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") -> Tensor:
     """Return the sorted keys (N,) of the blocks within the truncation band of a view's readings.
 
     Along the ray of every reading, blocks are looked up half a block apart, from one truncation in front to one behind.
@@ -36,7 +38,8 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     return torch.cat(found).unique()
 
 
-def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
+@op(blocks=BLOCKS, keys="N : int64", gradient=False)
+def find_blocks(blocks: VoxelBlocks, keys: Tensor, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
     """Return the row (N,) of every key, -1 where there is no block, and the keys (M,) of which this is true."""
     rows = blocks.find(keys)
     return rows, keys[rows < 0]
@@ -62,7 +65,10 @@ def band(grid: VoxelGrid) -> Tensor:
     return torch.tensor(grid.band, dtype=torch.float32, device="cpu")
 
 
-def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
+@op(blocks=BLOCKS, rows="R : int64", view=VIEW, grid=GRID, mutates=("blocks",), gradient=False)
+def integrate_view(
+    blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool, backend: str = "auto"
+) -> None:
     """Average a view into the given rows of the blocks, in place.
 
     The signed distance of a voxel is the reading at its nearest pixel less its own depth, along z. Within the

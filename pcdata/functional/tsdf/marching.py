@@ -11,7 +11,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from pcdata.functional.tsdf.blocks import VoxelBlocks
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import Count
+from pcdata.functional.tsdf.blocks import BLOCKS, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
 from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
 
@@ -64,11 +66,13 @@ def _edge(a: int, b: int) -> Edge:
     return min(a, b), max(a, b)
 
 
+@op(blocks=BLOCKS, edge="M : int64", min_weight=Count(), gradient=False)
 def find_triangles(
     blocks: VoxelBlocks,
     edge: Tensor,  # (M,) int64, rising: the edges with a vertex, numbered as in Crossings
     *,
     min_weight: int = 1,
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # used (K,) int64 rows of the vertices, rising; triangles (T, 3) int64 rows of used
     """Find the surface within the cubes whose eight corners were seen, with ``min_weight`` at least.
 

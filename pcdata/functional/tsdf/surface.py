@@ -8,9 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import Count
 from pcdata.functional.rows import pick_rows
-from pcdata.functional.tsdf.blocks import COLOR_SCALE, TSDF_SCALE, VoxelBlocks
-from pcdata.functional.tsdf.grid import EDGE, VOXELS, VoxelGrid
+from pcdata.functional.tsdf.blocks import BLOCKS, COLOR_SCALE, TSDF_SCALE, VoxelBlocks
+from pcdata.functional.tsdf.grid import EDGE, GRID, VOXELS, VoxelGrid
 from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
 
 _TOGETHER = 512  # blocks read in one go: 0.7 million voxels with their margins
@@ -49,7 +51,10 @@ class Crossings:
         return Crossings(**{**joined, "dropped": sum(part.dropped for part in parts)})
 
 
-def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False) -> Crossings:
+@op(blocks=BLOCKS, grid=GRID, min_weight=Count(), gradient=False)
+def find_crossings(
+    blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False, backend: str = "auto"
+) -> Crossings:
     """Find every zero crossing between neighbours along x, y and z that were both seen, with ``min_weight`` at least.
 
     Point, colour and gradient are interpolated linearly between the ends; the label is that of the nearer end, of the

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.fields import Fields
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
 from pcdata.geometry import rigid
 from pcdata.geometry.lens import fold_radius
@@ -44,8 +46,26 @@ class FusionView:
         return float("inf") if self.distortion is None else float(fold_radius(self.distortion[None])) ** 2
 
 
-def pack_colors(colors: Tensor) -> Tensor:
-    """Pack (..., 3) uint8 RGB into (...) int32, as voxels store it."""
+# The spec of a view: what kernels read.
+VIEW = Fields(
+    FusionView,
+    depth="H W",
+    rays="2 H W",
+    distortion="12 : float64",
+    world_from_camera="4 4 : float64",
+    weight="H W : int32",
+    color="H W : int32",
+    label="H W : int32",
+)
+
+
+@op(colors="H W 3 : uint8", gradient=False)
+def pack_colors(
+    colors: Tensor,  # (H, W, 3) uint8 RGB
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (H, W) int32
+    """Pack colours into one number each, as voxels store them."""
     r, g, b = (colors.int() * COLOR_SCALE).unbind(-1)
     return r | (g << 10) | (b << 20)
 

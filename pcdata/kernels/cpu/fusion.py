@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.tsdf import integrate, marching
-from pcdata.functional.tsdf.backends import BODIES
 from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
@@ -20,6 +20,7 @@ _MOST_PIXELS = 2**31 - 1  # of an image: the core numbers them with an int32
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
+@kernel("touched_blocks", "cpu")
 def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     """Collect keys in one hash table per thread; sorted, they do not depend on the threads."""
     height, width = view.depth.shape
@@ -30,17 +31,20 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     images = (view.depth.contiguous(), view.rays.contiguous(), height, width)
     call("pc_tsdf_touched", *images, turn, fraction, camera, offsets, len(offsets), found, count)
     if count < 0:
-        return integrate.touched_blocks(view, grid)  # knows what to say
+        keys: Tensor = OPERATIONS["touched_blocks"].reference(view, grid)  # knows what to say
+        return keys
     return torch.from_numpy(found[: int(count)].numpy().copy())
 
 
+@kernel("pack_colors", "cpu")
 def pack_colors(colors: Tensor) -> Tensor:
     """Pack pixels on this thread: torch's threads would spin where the next steps want to work."""
     packed = room(colors.shape[:-1], torch.int32)
-    call("pc_tsdf_pack_colors", colors.contiguous(), packed.numel(), packed)
+    call("pc_tsdf_pack_colors", colors, packed.numel(), packed)
     return packed
 
 
+@kernel("find_blocks", "cpu")
 def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
     """Ask a hash table of the rows, which learns here of the blocks added since the last time."""
     if blocks.table is None or 2 * len(blocks) > len(blocks.table):
@@ -48,15 +52,17 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
         blocks.table, blocks.in_table = torch.from_numpy(np.full(slots, -1, np.int32)), 0
     rows, missing, count = room(keys.shape, torch.int64), room(keys.shape, torch.int64), room(1, torch.int64)
     table = (blocks.keys, len(blocks), blocks.table, len(blocks.table), blocks.in_table)
-    call("pc_tsdf_find", *table, keys.contiguous(), len(keys), rows, missing, count)
+    call("pc_tsdf_find", *table, keys, len(keys), rows, missing, count)
     blocks.in_table = len(blocks)
     return rows, missing[: int(count)]
 
 
+@kernel("integrate_view", "cpu")
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
     """Update every block on its own, 4, 8 or 16 voxels at a time."""
     if view.depth.numel() > _MOST_PIXELS:
-        return integrate.integrate_view(blocks, rows, view, grid, carve=carve)
+        OPERATIONS["integrate_view"].reference(blocks, rows, view, grid, carve=carve)
+        return
     lens = None
     if view.distortion is not None:
         lens = torch.cat([view.distortion.float(), view.depth.new_tensor([view.fold])])
@@ -84,7 +90,8 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
     del kept  # until here the addresses are good
 
 
-def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False) -> Crossings:
+@kernel("find_crossings", "cpu")
+def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int, edges: bool) -> Crossings:
     """Count the edges of every block that cross zero, then write their points where they belong."""
     count = len(blocks)
     planes, kept = plane_addresses(blocks)
@@ -124,7 +131,8 @@ def _room_for_crossings(total: int, dropped: int, blocks: VoxelBlocks, edges: bo
     )
 
 
-def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int = 1) -> tuple[Tensor, Tensor]:
+@kernel("find_triangles", "cpu")
+def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int) -> tuple[Tensor, Tensor]:
     """Pack the signs of every block into words, count its triangles, write them, and number the vertices in use."""
     count, keys = len(blocks), blocks.sorted_keys
     planes, kept = plane_addresses(blocks)
@@ -153,11 +161,3 @@ def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
             kept.append(numbers(plane.data_ptr() for plane in chunks))  # a view: the core knows a chunk's layout
             table[place] = address(kept[-1])
     return table, kept
-
-
-BODIES["pack_colors", "cpu"] = pack_colors
-BODIES["find_blocks", "cpu"] = find_blocks
-BODIES["touched_blocks", "cpu"] = touched_blocks
-BODIES["integrate_view", "cpu"] = integrate_view
-BODIES["find_crossings", "cpu"] = find_crossings
-BODIES["find_triangles", "cpu"] = find_triangles
