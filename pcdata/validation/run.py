@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataError, PoseError, UnitError
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of
 from pcdata.io.sources.source import stored_captures
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
@@ -50,7 +50,7 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
 
 
 def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
-    """Check every capture of a source, in order, and compare each with those before it; yields one report for each.
+    """Check every capture of a source, and compare it with those of its recording before it; yields a report for each.
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
     report with a failed check, and the others follow. After a recording a last report, with the sample id
@@ -65,15 +65,17 @@ def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = Non
         DTypeError: it is no source.
         CaptureError: it has no captures, or two with one id.
     """
-    return _reports(source, checked_ids("validate_source", source), limits or CaptureLimits())
+    checked_ids("validate_source", source)
+    return _reports(source, limits or CaptureLimits())
 
 
-def _reports(source: CaptureSource, ids: list[str], limits: CaptureLimits) -> Iterator[SampleReport]:
-    series = _Series(limits)
-    for sample_id in ids:
-        yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
-    if whole := series.whole():
-        yield SampleReport(WHOLE, tuple(whole))
+def _reports(source: CaptureSource, limits: CaptureLimits) -> Iterator[SampleReport]:
+    for ids in recordings_of(source):
+        series = _Series(limits)
+        for sample_id in ids:
+            yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
+        if whole := series.whole():
+            yield SampleReport(WHOLE, tuple(whole))
 
 
 def check_of_error(error: PcdataError) -> Finding:

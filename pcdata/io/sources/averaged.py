@@ -11,7 +11,7 @@ import torch
 from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.average import DepthAverage, average_depth
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of
 from pcdata.io.sources.combine import CombinedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.still_camera import check_still_camera
@@ -27,8 +27,9 @@ class AveragedSource(CombinedSource):
     readings and of pixels, and the median standard deviation of a single reading in metres.
 
     Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
-    readings. Groups follow the order of the ids; every group must show a still scene from still cameras. Moving cameras
-    are told by their poses, and where there are none, as moving scenes, by readings that jump to another surface.
+    readings. Groups follow the order of the ids within one recording; every group must show a still scene from still
+    cameras. Moving cameras are told by their poses, and where there are none, as moving scenes, by readings that jump
+    to another surface.
 
     Args:
         source: the captures, in the order of time.
@@ -66,13 +67,15 @@ class AveragedSource(CombinedSource):
                 f"{where}: needs mad_factor > 0, resolution >= 0 and max_jump > 0, got {self.mad_factor}, "
                 f"{self.resolution}, {self.max_jump}"
             )
-        ids = checked_ids(where, self.source)
-        if len(ids) % self.num_frames:
-            raise CaptureError(
-                f"{where}: {len(ids)} captures are no whole number of groups of {self.num_frames}; take a subset or "
-                "another num_frames"
-            )
-        groups = {ids[start]: ids[start : start + self.num_frames] for start in range(0, len(ids), self.num_frames)}
+        checked_ids(where, self.source)
+        groups: dict[str, list[str]] = {}
+        for ids in recordings_of(self.source):
+            if len(ids) % self.num_frames:
+                raise CaptureError(
+                    f"{where}: {len(ids)} captures are no whole number of groups of {self.num_frames}; take a subset "
+                    f"or another num_frames ({ids[0]!r} .. {ids[-1]!r})"
+                )
+            groups |= {ids[n]: ids[n : n + self.num_frames] for n in range(0, len(ids), self.num_frames)}
         object.__setattr__(self, "_groups", groups)
 
     @property

@@ -77,6 +77,15 @@ def all_within(source: Any) -> Iterator[Any]:
         yield from all_within(inner)
 
 
+def recordings_of(source: Any) -> list[list[str]]:
+    """Return the ids by the recording that they are of, in order: nothing is averaged or compared from one to the next.
+
+    There is one, unless sources were joined.
+    """
+    recordings = getattr(source, "recordings", None)
+    return recordings() if callable(recordings) else [list(source.ids)]
+
+
 def inputs_of(source: Any) -> Inputs:
     """Return what was read to open a source, and the sources that it is made of."""
     found = Inputs()

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from pcdata.errors import CaptureError, DTypeError, PcdataError, add_note, near_matches
 from pcdata.files.sample_names import check_known, check_text, name_some
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids, skipped_of, unread_of
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of, skipped_of, unread_of
 from pcdata.structures import DepthFrame, PointCloud
 
 Part = TypeVar("Part")
@@ -129,6 +129,12 @@ class CombinedSource(Selectable["SubsetSource"]):
     def skipped(self) -> dict[str, str]:
         """What was left out of the sources: id -> why."""
         return {sample_id: why for source in self.sources for sample_id, why in skipped_of(source).items()}
+
+    def recordings(self) -> list[list[str]]:
+        """Return the ids by the recording that they are of: as the sources have them, where the ids are theirs."""
+        own = set(self.ids)
+        found = [[one for one in ids if one in own] for source in self.sources for ids in recordings_of(source)]
+        return [ids for ids in found if ids] if sum(map(len, found)) == len(own) else [self.ids]
 
     def unread(self) -> list[str]:
         """Say in words what lies in the captures but is not read."""
@@ -254,6 +260,14 @@ class JoinedSource(CombinedSource):
             for name, source in self._sources.items()
             for sample_id, why in skipped_of(source).items()
         }
+
+    def recordings(self) -> list[list[str]]:
+        """Return the ids by the recording that they are of, one or more for each source."""
+        return [
+            [f"{name}/{sample_id}" for sample_id in ids]
+            for name, source in self._sources.items()
+            for ids in recordings_of(source)
+        ]
 
     def unread(self) -> list[str]:
         """Say in words what lies in each of the captures but is not read."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from itertools import islice
 from typing import ClassVar
 
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth
 from pcdata.functional.depth.temporal import PERSISTENCE_RULES, TemporalState, temporal_filter
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of
 from pcdata.io.sources.combine import CombinedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.still_camera import check_still_camera
@@ -80,7 +79,7 @@ class TemporalFilterDepth:
 
 @dataclass(frozen=True, kw_only=True)
 class TemporallyFilteredSource(CombinedSource):
-    """A stream whose captures come filtered with the ``num_frames - 1`` before each of them.
+    """A stream whose captures come filtered with the ``num_frames - 1`` before each of them in its recording.
 
     A window instead of all the past: every sample can be loaded alone, in any order and by any worker, with the same
     result. After 12 frames the weight of older ones is below 0.4 % at the default alpha, and persistence looks at 8.
@@ -104,7 +103,7 @@ class TemporallyFilteredSource(CombinedSource):
     persistence: int = TemporalFilterDepth.persistence
     baseline: float = TemporalFilterDepth.baseline
     filter: TemporalFilterDepth = field(init=False, repr=False)
-    _places: Mapping[str, int] = field(init=False, repr=False, compare=False)  # id -> place in the order
+    _places: Mapping[str, tuple[list[str], int]] = field(init=False, repr=False, compare=False)  # in the recording
 
     def __post_init__(self) -> None:
         check_numbers("TemporallyFilteredSource", self, whole=("num_frames",), real=())
@@ -112,8 +111,9 @@ class TemporallyFilteredSource(CombinedSource):
             raise ConfigError(f"TemporallyFilteredSource: num_frames must be at least 1, got {self.num_frames}")
         settings = {setting.name: getattr(self, setting.name) for setting in fields(TemporalFilterDepth)}
         object.__setattr__(self, "filter", TemporalFilterDepth(**settings))
-        ids = checked_ids("TemporallyFilteredSource", self.source)
-        object.__setattr__(self, "_places", {sample_id: place for place, sample_id in enumerate(ids)})
+        checked_ids("TemporallyFilteredSource", self.source)
+        places = {own: (ids, place) for ids in recordings_of(self.source) for place, own in enumerate(ids)}
+        object.__setattr__(self, "_places", places)
 
     @property
     def sources(self) -> tuple[CaptureSource]:
@@ -132,9 +132,8 @@ class TemporallyFilteredSource(CombinedSource):
             CaptureError: no sample has this id.
         """
         check_known("TemporallyFilteredSource", sample_id, self._places)
-        place = self._places[sample_id]
-        first = max(0, place + 1 - self.num_frames)
-        return [(self.source, own) for own in islice(self._places, first, place + 1)]
+        ids, place = self._places[sample_id]
+        return [(self.source, own) for own in ids[max(0, place + 1 - self.num_frames) : place + 1]]
 
     def load(self, sample_id: str) -> DepthFrame:
         """Load a capture and those before it, and return it filtered.

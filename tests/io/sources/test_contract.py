@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from pcdata import open_source
+from pcdata import open_source, validate_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CaptureError, ConfigError, DTypeError, PcdataError
 from pcdata.exports.export_source import BuiltClouds
@@ -236,6 +236,22 @@ def test_a_pattern_joins_what_fits_it_in_order(tmp_path: Path) -> None:
         open_source(tmp_path / "captures" / "scene_*")
     literal = folder_capture(tmp_path / "captures [1]")
     assert open_source(literal).ids == ["a_1", "a_2", "a_10"]
+
+
+def test_nothing_is_averaged_or_compared_from_one_recording_to_the_next(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        still(tmp_path / name)
+    source = open_source(tmp_path / "*", skip=["a/frame-000000"], temporal={"num_frames": 3})
+    assert [own for _, own in source.made_of("b/frame-000000")] == ["b/frame-000000"]
+    assert [own for _, own in source.made_of("a/frame-000040")] == ["a/frame-000020", "a/frame-000040"]
+    one = open_source(tmp_path / "b", temporal={"num_frames": 3}).load("frame-000020")
+    assert torch.equal(source.load("b/frame-000020").depth, one.depth)
+    with pytest.raises(CaptureError, match="3 captures are no whole number of groups of 2"):
+        open_source(tmp_path / "*", averaged={"num_frames": 2, "min_count": 1})  # six captures, but three of each
+    assert len(open_source(tmp_path / "*", averaged={"num_frames": 3, "min_count": 1})) == 2
+    reports = list(validate_source(open_source(tmp_path / "*")))
+    alone = list(validate_source(open_source(tmp_path / "b")))
+    assert [report.findings for report in reports[len(reports) // 2 :]] == [report.findings for report in alone]
 
 
 def test_only_keeps_what_fits_a_pattern(tmp_path: Path) -> None:
