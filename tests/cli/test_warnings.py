@@ -16,8 +16,8 @@ from pcdata.cli.main import main
 from pcdata.cli.warning_lines import warnings_in_one_line
 from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.errors import PcdataWarning, SlowBackendWarning
+from pcdata.transforms.chain_rules import PipelineOrderWarning
 from pcdata.transforms.clusters import LeftOutWarning
-from pcdata.transforms.compose import PipelineOrderWarning
 
 
 @pytest.fixture(autouse=True)
