@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -65,7 +65,8 @@ class Transform(nn.Module):
 
     def __post_init__(self) -> None:
         for name, value in validated_fields(type(self), self.config_fields()).items():
-            setattr(self, name, value)
+            if not isinstance(value, nn.Module):  # a step within is one of the module's own already
+                self.__dict__[name] = value
         self.check_fields()
 
     # -- what a subclass writes ------------------------------------------------------------------------------------
@@ -106,9 +107,9 @@ class Transform(nn.Module):
         """The unit of the result, or None when it is the input's."""
         return None
 
-    def parts(self) -> Iterator[Transform]:
+    def parts(self) -> list[Transform]:
         """The steps that do the work: those within a step that is made of others, else the step itself."""
-        yield self
+        return [self]
 
     # -- what everybody calls --------------------------------------------------------------------------------------
 
@@ -137,16 +138,14 @@ class Transform(nn.Module):
 
     def to_config(self) -> dict[str, dict[str, Any]]:
         """Return ``{name: fields}`` with plain values, the form that YAML holds."""
-        return {type(self).__name__: {name: _plain(value) for name, value in self.config_fields().items()}}
+        return {type(self).__name__: _each(_plain, self.config_fields())}
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of names, versions and fields: equal for equal behaviour."""
-        text = json.dumps(self._identity(), sort_keys=True, separators=(",", ":"), allow_nan=False)
-        return hashlib.sha256(text.encode()).hexdigest()
+        return sha256_of(self._identity())
 
     def _identity(self) -> Any:
-        fields = {name: _identify(value) for name, value in self.config_fields().items()}
-        return [type(self).__name__, self.version, fields]
+        return [type(self).__name__, self.version, _each(_identify, self.config_fields())]
 
     def __repr__(self) -> str:
         defaults = {f.name: f.default for f in dataclasses.fields(self)}  # type: ignore[arg-type]
@@ -216,12 +215,24 @@ class Transform(nn.Module):
                     f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
                     "before left none (masks, ranges, crops); leave the capture out, or widen those"
                 )
-            steps.append({**self._step(), "params": _small(params, b, len(after)), **facts})
+            small = _small(params, b, len(after)) if params else {}
+            steps.append({**self._step(), "params": small, **facts})
         return result.with_steps(steps)
 
     def _step(self) -> dict[str, Any]:
-        (name, fields), *_ = self.to_config().items()
-        return {"step": name, "version": self.version, "fields": fields}
+        """The beginning of an entry in a history; it may be changed there, so lists are given anew."""
+        own = self.__dict__
+        given = tuple(map(own.get, field_names(type(self))))
+        before, told = own.get("_told", (None, {}))
+        if before != given or self._modules:  # a field was set since, or may have been in a step within
+            (told,) = self.to_config().values()
+            own["_told"] = given, told
+        fields = {}
+        for name, value in told.items():
+            if type(value) is list:  # of numbers, or of rows of numbers
+                value = [*map(list, value)] if value and type(value[0]) is list else [*value]
+            fields[name] = value
+        return {"step": type(self).__name__, "version": self.version, "fields": fields}
 
 
 class SpatialTransform(Transform, abstract=True):
@@ -275,12 +286,28 @@ def sample_name(cloud: PointCloud, b: int) -> str:
     return f" (sample {sample!r})" if sample else ""
 
 
+_LEAVES = {str, int, float, bool, type(None)}
+
+
+def _each(convert: Callable[[Any], Any], fields: dict[str, Any]) -> dict[str, Any]:
+    converted = {}
+    for name, value in fields.items():
+        converted[name] = value if type(value) in _LEAVES else convert(value)
+    return converted
+
+
+def sha256_of(identity: Any) -> str:
+    """Return the SHA-256 of plain data."""
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def _plain(value: Any) -> Any:
     """Turn a field into what YAML and JSON hold."""
     if isinstance(value, Transform):
         return value.to_config()
     if isinstance(value, (list, tuple, nn.ModuleList)):
-        return [_plain(item) for item in value]
+        return [*value] if _LEAVES.issuperset(map(type, value)) else [_plain(item) for item in value]
     return value
 
 
@@ -289,7 +316,7 @@ def _identify(value: Any) -> Any:
     if isinstance(value, Transform):
         return value._identity()
     if isinstance(value, (list, tuple, nn.ModuleList)):
-        return [_identify(item) for item in value]
+        return [*value] if _LEAVES.issuperset(map(type, value)) else [_identify(item) for item in value]
     return value
 
 

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
-from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.field_checks import FaultyConfigError, field_names, field_types, has_fields, validated_fields
 from pcdata.transforms.sensor_words import (
     SENSOR,
     check_sensor_unit,
-    is_sensor_word,
+    sensor_fields,
     sensor_from_node,
     sensor_hint,
     sensor_value,
@@ -75,8 +75,12 @@ def _steps_of_list(document: Document, node: Any, what: str) -> list[Placed]:
     if len(items) > _MAX_STEPS:
         document.fault(node, f"{what} has {len(items)} steps; at most {_MAX_STEPS} are read")
         return []
-    built = [(_step_of_node(document, item), item) for item in items]
-    return [(step, item) for step, item in built if step is not None]
+    placed = []
+    for item in items:
+        step = _step_of_node(document, item)
+        if step is not None:
+            placed.append((step, item))
+    return placed
 
 
 def _step_of_node(document: Document, node: Any) -> Transform | None:
@@ -109,7 +113,8 @@ def _build(document: Document, cls: type[Transform], name_node: Any, fields_node
         read = _field_value(document, cls, key, value)
         if len(document.faults) == known:
             fields[key] = read
-    check_sensor_unit(document, cls, {key: node for key, (_, node) in entries.items()}, fields)
+    if fields.get("unit", METRE) != METRE:
+        check_sensor_unit(document, cls, {key: node for key, (_, node) in entries.items()}, fields)
     try:
         if len(document.faults) == before and has_fields(cls, fields):
             return cls(**fields)
@@ -133,7 +138,7 @@ def _field_value(document: Document, cls: type[Transform], key: str, node: Any) 
         return _step_of_node(document, node)
     if declared == Sequence[Transform]:
         return [step for step, _ in _steps_of_list(document, node, f"{cls.__name__}.{key}")]
-    if is_sensor_word(document.word(node), declared):
+    if key in sensor_fields(cls) and document.word(node) == SENSOR:
         return sensor_value(document, node, cls, key)
     return document.plain(node)
 

@@ -16,11 +16,6 @@ class PipelineOrderWarning(PcdataWarning):
     """A pipeline is valid but its order costs time or quality."""
 
 
-def takes_clouds(step: Transform) -> bool:
-    """Whether a cloud may enter a chain at this step."""
-    return issubclass(PointCloud, step.takes)
-
-
 def check_chain(steps: Sequence[Transform]) -> None:
     """Require that neighbours fit: capture or cloud, frame, unit.
 
@@ -36,9 +31,9 @@ def check_chain(steps: Sequence[Transform]) -> None:
                 f"{before.gives.__name__}" + ("; put Deproject between them" if before.gives is not PointCloud else ""),
             )
     frame: str | None = None
-    unit = METRE if steps and not takes_clouds(steps[0]) else None  # None: that of whatever comes in
+    unit = METRE if steps and not issubclass(PointCloud, steps[0].takes) else None  # None: that of whatever comes in
     for position, outer in enumerate(steps):
-        for step in outer.parts():
+        for step in outer.parts() if outer._modules else (outer,):
             needed = step.frame_needed()
             if frame is not None and needed is not None and needed != frame:
                 raise _misfit(position, step, f"works in frame {needed!r} but the cloud is in {frame!r} there")
@@ -55,9 +50,12 @@ def check_chain(steps: Sequence[Transform]) -> None:
 
 def warn_of_order(steps: Sequence[Transform], *, stacklevel: int) -> None:
     """Warn where statistics run before the crop."""
-    flat = [step for outer in steps for step in outer.parts()]
+    flat = [step for outer in steps for step in (outer.parts() if outer._modules else (outer,))]
     names = [type(step).__name__ for step in flat]
-    early = next((i for i, step in enumerate(flat) if step.runs_statistics), len(flat))
+    statistics = [i for i, step in enumerate(flat) if step.runs_statistics]
+    if not statistics or "CropWorkspace" not in names:
+        return
+    early = statistics[0]
     if "CropWorkspace" in names[early:] and "CropWorkspace" not in names[:early]:
         warnings.warn(
             f"{names[early]} runs before CropWorkspace: cropping first is cheaper, and statistics of the workspace "

@@ -14,9 +14,9 @@ from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Data, GeneratorLike, Transform, num_clouds
+from pcdata.transforms.base import Data, GeneratorLike, Transform, num_clouds, sha256_of
 from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
-from pcdata.transforms.chain_rules import check_chain, takes_clouds, warn_of_order
+from pcdata.transforms.chain_rules import check_chain, warn_of_order
 from pcdata.transforms.field_checks import FaultyConfigError, validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
 from pcdata.transforms.plain_document import PlainDocument
@@ -38,7 +38,9 @@ class Compose(Transform):
 
     def __init__(self, steps: Sequence[Transform]) -> None:
         given = validated_fields(Compose, {"steps": list(steps)})["steps"]
-        flat = [one for step in given for one in _opened(step)]
+        flat: list[Transform] = []
+        for step in given:
+            flat += step.steps if isinstance(step, Compose) else [step]
         check_chain(flat)
         warn_of_order(flat, stacklevel=2)
         self._hold(flat)
@@ -53,13 +55,17 @@ class Compose(Transform):
 
     def _hold(self, steps: Sequence[Transform]) -> None:
         self._beginning = find_beginning(steps)
-        entry = next((i for i, step in enumerate(steps) if takes_clouds(step)), len(steps))
-        # A chain of images alone has no place for a cloud: its first step says so.
-        self._cloud_entry = 0 if steps and not issubclass(steps[-1].gives, PointCloud) else entry
-        self._last_random = max((i for i, step in enumerate(steps) if step.is_random), default=-1)
+        random, clouds, keeps = [], [], True
+        for position, step in enumerate(steps):
+            random += [position] * step.is_random
+            clouds += [position] * issubclass(PointCloud, step.takes)
+            keeps = keeps and step.keeps_clouds
+        self._captures = clouds[0] if clouds else len(steps)  # so many steps take captures alone
+        self._stored = random[0] if random else len(steps)  # so many steps may be stored
+        self._last_random = random[-1] if random else -1
         self.steps = nn.ModuleList(steps)  # type: ignore[assignment]
-        self.is_random = self._last_random >= 0  # type: ignore[misc]
-        self.keeps_clouds = all(step.keeps_clouds for step in steps)  # type: ignore[misc]
+        self.is_random = bool(random)  # type: ignore[misc]
+        self.keeps_clouds = keeps  # type: ignore[misc]
         self.takes = steps[0].takes if steps else PointCloud  # type: ignore[misc]
         self.gives = steps[-1].gives if steps else PointCloud  # type: ignore[misc]
 
@@ -74,10 +80,9 @@ class Compose(Transform):
         units = [step.unit_given() for step in self.steps]
         return next((unit for unit in reversed(units) if unit is not None), None)
 
-    def parts(self) -> Iterator[Transform]:
+    def parts(self) -> list[Transform]:
         """The steps, with those within them."""
-        for step in self.steps:
-            yield from step.parts()
+        return [part for step in self.steps for part in step.parts()]
 
     # -- running ---------------------------------------------------------------------------------------------------
 
@@ -106,7 +111,8 @@ class Compose(Transform):
 
     def _enter(self, data: Data, generator: GeneratorLike | None) -> tuple[int, GeneratorLike | None]:
         """Return the first step to run, and the generator or one for each cloud."""
-        position = self._cloud_entry if isinstance(data, PointCloud) else 0
+        # A chain of images alone has no place for a cloud: its first step says so.
+        position = self._captures if isinstance(data, PointCloud) and issubclass(self.gives, PointCloud) else 0
         if self._last_random < position:
             return position, None
         generator = self._generator(generator)
@@ -119,19 +125,19 @@ class Compose(Transform):
     def split(self) -> tuple[Compose, Compose]:
         """Return the longest deterministic beginning, which a dataset may store, and the rest."""
         steps = list(self.steps)
-        first = next((i for i, step in enumerate(steps) if step.is_random), len(steps))
-        return self._of(steps[:first]), self._of(steps[first:])
+        return self._of(steps[: self._stored]), self._of(steps[self._stored :])
 
     def stored_fingerprint(self) -> str:
         """SHA-256 of what may be stored: equal for datasets that hold the same clouds."""
-        stored = list(self.split()[0].steps)
-        # Of captures, of clouds, and of nothing random.
-        parts = [self._of(part).fingerprint() for part in (*self._at_entry(stored), [])]
-        return hashlib.sha256("".join(parts).encode()).hexdigest()
+        steps = list(self.steps)[: self._stored]
+        text = ""
+        for part in (steps[: self._captures], steps[self._captures :], []):  # of captures, of clouds, nothing random
+            text += sha256_of(["Compose", Compose.version, {"steps": [step._identity() for step in part]}])
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def difference(self, other: Compose) -> str:
         """Say where the steps of two chains that may be stored first differ."""
-        pairs = zip_longest(self.split()[0].steps, other.split()[0].steps)
+        pairs = zip_longest(list(self.steps)[: self._stored], list(other.steps)[: other._stored])
         for position, (mine, stored) in enumerate(pairs, start=1):
             if mine is None or stored is None or mine.fingerprint() != stored.fingerprint():
                 return f"step {position}: {mine or 'nothing'} here, {stored or 'nothing'} there"
@@ -144,9 +150,11 @@ class Compose(Transform):
 
         ``depth`` takes captures, ``cloud`` clouds, and ``augment`` begins with the first random step on clouds.
         """
-        depth, clouds = self._at_entry(list(self.steps))
-        first = next((i for i, step in enumerate(clouds) if step.is_random), len(clouds))
-        parts = (depth, clouds[:first], clouds[first:])
+        steps = list(self.steps)
+        end = max(self._captures, self._stored)
+        if self._stored < self._captures:  # a random step on captures: it is not that one
+            end = next((i for i in range(end, len(steps)) if steps[i].is_random), len(steps))
+        parts = (steps[: self._captures], steps[self._captures : end], steps[end:])
         return {section: [step.to_config() for step in part] for section, part in zip(SECTIONS, parts)}
 
     def to_yaml(self) -> str:
@@ -196,26 +204,17 @@ class Compose(Transform):
         try:
             return cls([step for step, _ in placed])
         except FaultyConfigError as error:
-            places = [node for step, node in placed for _ in _opened(step)]
+            places = [node for step, node in placed for _ in (step.steps if isinstance(step, Compose) else [step])]
             for (position, *_), message in error.faults:
                 document.fault(places[int(position)], message)
             document.raise_faults()
             raise
-
-    def _at_entry(self, steps: list[Transform]) -> tuple[list[Transform], list[Transform]]:
-        """Return the steps before the first that takes a cloud, and the others."""
-        entry = next((i for i, step in enumerate(steps) if takes_clouds(step)), len(steps))
-        return steps[:entry], steps[entry:]
 
     def __len__(self) -> int:
         return len(self.steps)
 
     def __repr__(self) -> str:
         return f"Compose([{', '.join(map(repr, self.steps))}])"
-
-
-def _opened(step: Transform) -> Sequence[Transform]:
-    return step.steps if isinstance(step, Compose) else [step]
 
 
 def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:

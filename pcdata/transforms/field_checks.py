@@ -16,12 +16,12 @@ from pcdata.transforms.field_types import LengthIn
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _cached(function: _Function) -> _Function:
+def cached(function: _Function) -> _Function:
     """functools.cache under the function's own type: to a type checker no class of modules can be hashed."""
     return functools.cache(function)  # type: ignore[return-value]
 
 
-@_cached
+@cached
 def field_names(cls: type) -> tuple[str, ...]:
     """Return the names of the declared fields, in order."""
     return tuple(f.name for f in dataclasses.fields(cls))
@@ -29,25 +29,24 @@ def field_names(cls: type) -> tuple[str, ...]:
 
 def has_fields(cls: type, given: Mapping[str, Any]) -> bool:
     """Whether all that must be given is given, and nothing that is no field."""
-    known = field_names(cls)
-    return all(name in known for name in given) and required_fields(cls) <= given.keys()
+    return field_types(cls).keys() >= given.keys() >= required_fields(cls)
 
 
-@_cached
+@cached
 def required_fields(cls: type) -> frozenset[str]:
     """Return the names of the fields without a default."""
     missing = dataclasses.MISSING
     return frozenset(f.name for f in dataclasses.fields(cls) if f.default is missing and f.default_factory is missing)
 
 
-@_cached
+@cached
 def field_types(cls: type) -> dict[str, Any]:
     """Return the declared fields' types with their limits."""
     hints = get_type_hints(cls, include_extras=True)
     return {name: hints[name] for name in field_names(cls)}
 
 
-@_cached
+@cached
 def length_fields(cls: type) -> dict[str, str]:
     """Return the unit of every declared field that is a length in a unit."""
     found = {name: _length_unit(hint) for name, hint in field_types(cls).items()}
@@ -59,7 +58,7 @@ def _length_unit(hint: Any) -> str | None:
     return next(iter(own), None) or next(filter(None, map(_length_unit, get_args(hint))), None)
 
 
-@_cached
+@cached
 def _field_model(cls: type) -> Any:
     import pydantic  # imported late: only needed once a transform is made
 
@@ -78,6 +77,7 @@ def _field_model(cls: type) -> Any:
 
 
 Path = tuple[int | str, ...]
+_LEAVES = {str, int, float, bool, type(None)}
 
 
 class FaultyConfigError(ConfigError):
@@ -97,12 +97,12 @@ def validated_fields(cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
     import pydantic
 
     try:
-        model = _field_model(cls)(**{name: _as_plain(value) for name, value in fields.items()})
+        model = _field_model(cls)(**_as_plain(fields))
     except pydantic.ValidationError as error:
         faults = [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
         lines = [f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults]
         raise FaultyConfigError("\n".join(lines), faults) from None
-    return {name: getattr(model, name) for name in field_names(cls)}
+    return dict(vars(model))
 
 
 def _fault_message(cls: type, fault: Any) -> str:
@@ -116,6 +116,13 @@ def _fault_message(cls: type, fault: Any) -> str:
 
 def _as_plain(value: Any) -> Any:
     """Turn arrays into numbers and lists into tuples, so that fields cannot change under a transform."""
+    if isinstance(value, Mapping):
+        plain = {}
+        for name, field in value.items():
+            plain[name] = field if type(field) in _LEAVES else _as_plain(field)
+        return plain
     if isinstance(value, (Tensor, np.ndarray, np.generic)):
         value = value.tolist()
-    return tuple(map(_as_plain, value)) if isinstance(value, (list, tuple)) else value
+    if not isinstance(value, (list, tuple)):
+        return value
+    return tuple(value) if _LEAVES.issuperset(map(type, value)) else tuple(_as_plain(item) for item in value)

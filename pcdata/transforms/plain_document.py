@@ -8,6 +8,8 @@ from typing import Any
 from pcdata.errors import ConfigError, first_lines
 from pcdata.yaml_nodes import SensorChoice
 
+_TEXT = {str}
+
 
 class PlainDocument:
     """What :class:`pcdata.yaml_nodes.YamlDocument` is for text; faults say the name of the step and the field."""
@@ -33,10 +35,10 @@ class PlainDocument:
         """Read a mapping as key -> (key, value); None is an empty mapping."""
         if node is None:
             return {}
-        if not isinstance(node, Mapping) or not all(isinstance(key, str) for key in node):
+        if not isinstance(node, Mapping) or not _TEXT.issuperset(map(type, node)):
             self.fault(node, f"{what} must be a mapping of names to values, not {type(node).__name__} {node!r:.60}")
             return {}
-        return {key: (key, value) for key, value in node.items()}
+        return dict(zip(node, node.items()))
 
     def sequence(self, node: Any, what: str) -> list[Any]:
         """Read a list; None is an empty list."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from pcdata.errors import ConfigError
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
@@ -25,7 +23,7 @@ class RandomApply(Transform):
             raise ConfigError(f"RandomApply: {type(self.step).__name__} does not turn clouds into clouds")
         self.keeps_clouds = self.step.keeps_clouds  # type: ignore[misc]
 
-    def parts(self) -> Iterator[Transform]:
+    def parts(self) -> list[Transform]:
         """The step that is applied, or its parts."""
         return self.step.parts()
 

@@ -14,9 +14,8 @@ from typing import Annotated, Any, get_args, get_origin
 
 from pcdata.errors import ConfigError
 from pcdata.sensors import sensor_profile
-from pcdata.structures import METRE
 from pcdata.transforms.base import REGISTRY, Transform
-from pcdata.transforms.field_checks import field_types
+from pcdata.transforms.field_checks import cached, field_types
 from pcdata.transforms.field_types import FromSensor
 from pcdata.yaml_nodes import Document, SensorChoice
 
@@ -55,9 +54,10 @@ def sensor_from_node(document: Document, node: Any) -> SensorChoice | None:
     return SensorChoice(profile, float(depth))
 
 
-def is_sensor_word(word: str | None, declared: Any) -> bool:
-    """Say whether a field's value is the word ``sensor`` and the field may say so."""
-    return word == SENSOR and _mark(declared) is not None
+@cached
+def sensor_fields(cls: type) -> frozenset[str]:
+    """Return the fields of a step for which a configuration may say ``sensor``."""
+    return frozenset(key for key, kind in field_types(cls).items() if _mark(kind) is not None)
 
 
 def sensor_value(document: Document, node: Any, cls: type[Transform], key: str) -> float | str | None:
@@ -76,10 +76,10 @@ def sensor_value(document: Document, node: Any, cls: type[Transform], key: str) 
 def check_sensor_unit(
     document: Document, cls: type[Transform], nodes: Mapping[str, Any], fields: Mapping[str, Any]
 ) -> None:
-    """Note a fault where a step says ``sensor``, which means metres, for a length in another unit."""
-    unit = fields.get("unit", METRE)
+    """Note a fault where a step that names another unit than metres says ``sensor``, which means metres."""
+    unit = fields["unit"]
     for key, node in nodes.items():
-        if unit != METRE and is_sensor_word(document.word(node), _types(cls).get(key)):
+        if key in sensor_fields(cls) and document.word(node) == SENSOR:
             document.fault(
                 node,
                 f"{cls.__name__}.{key}: a sensor's figures are in metres, but unit is {unit!r}; give a number in that "

@@ -147,3 +147,16 @@ def test_a_class_that_no_chain_could_run_is_refused_where_it_is_written(body, wh
 def test_a_step_without_its_work_says_what_to_write():
     with pytest.raises(NotImplementedError, match=r"Mine: write the method transform\(self, data, params\)"):
         written("T.Transform", "n: int = 1")()(cloud_in_base())
+
+
+def test_the_record_of_a_step_follows_its_fields_and_is_the_clouds_own():
+    step, cloud = T.CropWorkspace(frame="base", lower=(-1, -1, -1), upper=(1, 1, 1)), cloud_in_base()
+    first = step(cloud).history[0][-1]["fields"]
+    first["lower"][0] = 5.0
+    step.upper = (2.0, 2.0, 2.0)
+    again = step(cloud).history[0][-1]["fields"]
+    assert again == {**step.to_config()["CropWorkspace"], "lower": [-1.0, -1.0, -1.0], "upper": [2.0, 2.0, 2.0]}
+    apply = T.RandomApply(step=T.RandomScale(), probability=1.0)
+    apply(cloud, generator=seeded(0))
+    apply.step.low = 0.5
+    assert apply(cloud, generator=seeded(0)).history[0][-1]["fields"]["step"]["RandomScale"]["low"] == 0.5
