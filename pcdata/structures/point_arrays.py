@@ -15,7 +15,7 @@ from pcdata.structures.kinds import FIELDS, KINDS, METRE, Kind, attributes, kind
 
 _ROUNDED = 1e-5  # that a float colour may lie above 1
 _FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
-
+_COLUMNS = {"colors": (3,), "normals": (3,), "labels": (), "source_index": ()}  # of one row
 # What torch can hold and compute with; unsigned integers go to the next wider signed type.
 _HOLDABLE = {"u1": "u1", "i1": "i1", "u2": "i4", "i2": "i2", "u4": "i8", "i4": "i4", "u8": "i8", "i8": "i8"}
 
@@ -136,11 +136,11 @@ def attributes_of_arrays(
 
 
 def _point_tensors(
-    where: str, fields: Mapping[str, ArrayLike], kinds: Mapping[str, Kind], unit: float
+    where: str, fields: Mapping[str, NDArray[Any]], kinds: Mapping[str, Kind], unit: float
 ) -> dict[str, torch.Tensor]:
     tensors: dict[str, torch.Tensor] = {}
-    for name, given in fields.items():
-        values = np.asarray(given)
+    num_points = len(fields["points"])
+    for name, values in fields.items():
         if values.dtype.kind not in "biuf":
             raise DTypeError(f"{where}: {name} must be an array of numbers, got {values.dtype}")
         if name not in FIELDS and name not in kinds:
@@ -149,6 +149,10 @@ def _point_tensors(
                 f"kinds={{{name!r}: ...}}, one of {', '.join(repr(kind.value) for kind in KINDS)}"
             )
         of = f"{where}: {name}"
+        columns = _COLUMNS.get(name, values.shape[1:])
+        if values.shape[:1] != (num_points,) or values.shape[1:] != columns:
+            wanted = ", ".join(map(str, (num_points, *columns)))
+            raise ShapeError(f"{of} must be ({wanted}) for {num_points} points, got {values.shape}")
         if name == "colors":
             tensors[name] = torch.from_numpy(unit_colors(of, values))
         elif name == "normals":

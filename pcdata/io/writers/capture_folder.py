@@ -22,11 +22,15 @@ def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
     Depth is a 16-bit PNG in the unit the capture came in where that loses nothing, else float32 metres.
 
     Raises:
-        WriteError: a file cannot be written.
+        WriteError: a view is there already, or a file cannot be written.
     """
+    frame = frame.cpu()
+    views = [Path(folder) / f"view{v}" for v in range(frame.num_views)]
+    if there := [view.name for view in views if os.path.lexists(view)]:
+        raise WriteError(f"{folder}: has {there[0]} already, and nothing is written over; choose a new folder")
     try:
-        for v in range(frame.num_views):
-            _write_view(frame, v, Path(folder) / f"view{v}")
+        for v, view in enumerate(views):
+            _write_view(frame, v, view)
     except OSError as error:
         raise WriteError(f"{folder}: cannot be written: {write_fault(error)}") from error
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pcdata import Camera, DepthFrame, open_source
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, WriteError
 from pcdata.io.writers.capture_folder import write_capture
 from pcdata.synthetic import tabletop
 
@@ -101,3 +101,20 @@ def test_a_folder_that_cannot_be_written_is_a_capture_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CaptureError, match="cannot be written"):
         write_capture(_frame(torch.full((1, 12, 16), 1.5)), tmp_path / "file")
+
+
+def test_nothing_is_written_over_or_beside(tmp_path):
+    frame = tabletop(1, num_views=2, size=(24, 32)).frame
+    (tmp_path / "view1").mkdir()
+    with pytest.raises(WriteError, match=r"has view1 already.*choose a new folder"):
+        write_capture(frame, str(tmp_path))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["view1"]
+
+
+def test_the_views_of_a_capture_are_read_back_as_one(tmp_path):
+    frame = tabletop(1, num_views=2, size=(24, 32)).frame
+    write_capture(frame, str(tmp_path / "capture"))
+    source = open_source(str(tmp_path / "capture"))
+    read = source.load(source.ids[0])
+    for name in ("depth", "colors", "labels", "world_from_camera"):
+        assert torch.equal(getattr(read, name), getattr(frame, name)), name
