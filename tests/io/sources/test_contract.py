@@ -140,6 +140,16 @@ def test_a_process_that_opened_none_of_them_loads_every_source(tmp_path: Path) -
     assert found == [[number for _, number in reversed(numbers(one))] for one in sources], done.stderr
 
 
+@pytest.mark.parametrize("name", ["graspnet_frame", "osd", "pcd", "realsense_bag", "seven_scenes"])
+def test_a_real_capture_keeps_the_laws(name: str, test_data: Path) -> None:
+    source = open_source(test_data / name, limit=2)
+    again = pickle.loads(pickle.dumps(source))
+    assert source.ids == in_order(source.ids) == again.ids
+    assert same(source.load(source.ids[-1]), again.load(source.ids[-1]))
+    with pytest.raises(CaptureError, match=r"no sample .*did you mean"):
+        source.load(f"{source.ids[0]}x")
+
+
 def test_an_unknown_id_is_an_error_that_names_those_nearest(source: CaptureSource) -> None:
     near = source.ids[0][:-1] + "x" * (len(source.ids[0]) > 1)
     for wrong in (near, f"{source.ids[0]}x", "absent", "", 3):
