@@ -1,6 +1,6 @@
 """Transforms: configured steps from captures to clouds, composed into pipelines."""
 
-from pcdata.transforms.base import REGISTRY, SelectTransform, SpatialTransform, Transform
+from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.chain_rules import PipelineOrderWarning
 from pcdata.transforms.clusters import ClusterObjects, LeftOutWarning, SplitObjects
 from pcdata.transforms.completion import CompleteDepth
@@ -11,6 +11,7 @@ from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, Spati
 from pcdata.transforms.depth_inpainting import InpaintDepth
 from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, ResizeDepth
 from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
+from pcdata.transforms.families import SelectTransform, SpatialTransform
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.keep_confidence import KeepConfidence

@@ -1,6 +1,6 @@
 """Transform: a module that first decides, then does.
 
-To write one, subclass :class:`SpatialTransform` (a 4x4 per cloud), :class:`SelectTransform` (which rows stay), or
+To write one, subclass ``SpatialTransform`` (a 4x4 per cloud), ``SelectTransform`` (which rows stay), or
 :class:`Transform` itself; declare the fields as annotations. Construction is keyword-only and validated; repr, YAML,
 fingerprint and pickling come from the fields; every instance joins the contract suite through its class name.
 """
@@ -13,7 +13,6 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-import torch
 from torch import Generator, Tensor, nn
 from typing_extensions import dataclass_transform
 
@@ -235,31 +234,6 @@ class Transform(nn.Module):
         return {"step": type(self).__name__, "version": self.version, "fields": fields}
 
 
-class SpatialTransform(Transform, abstract=True):
-    """A step that moves every cloud by one 4x4: write ``make_params`` returning ``{"matrix": (B, 4, 4)}``."""
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Move the cloud; the frame and the unit follow :meth:`frame_after` and :meth:`unit_given`."""
-        return data.transformed(params["matrix"], frame_id=self.frame_after(data.frame_id), unit=self.unit_given())
-
-
-class SelectTransform(Transform, abstract=True):
-    """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
-
-    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
-        """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,)."""
-        raise NotImplementedError
-
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Decide which rows stay."""
-        index, ptr = self.pick(data, streams)
-        return {"index": index, "ptr": ptr}
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Pick the rows of every field."""
-        return data.select(params["index"], params["ptr"])
-
-
 def unit_advice(step: Transform) -> str:
     """What to do where a step's lengths are not in the unit of the cloud."""
     if step.unit_needed() != METRE:
@@ -329,8 +303,3 @@ def _small(params: Params, b: int, num: int) -> dict[str, Any]:
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16:
             kept[name] = value[b].tolist()
     return kept
-
-
-def rows_of_mask(mask: Tensor) -> Tensor:
-    """Return the (M,) int64 rows where a (N,) bool mask holds."""
-    return torch.nonzero(mask).squeeze(1)

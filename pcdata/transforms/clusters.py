@@ -13,7 +13,7 @@ from pcdata.functional.clusters import dbscan
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, Transform, rows_of_mask, sample_name
+from pcdata.transforms.base import Params, Transform, sample_name
 from pcdata.transforms.field_types import Count, Metres
 
 
@@ -121,7 +121,7 @@ class SplitObjects(Transform):
                 )
             unlabelled = int((cloud.labels < 0).sum())
             for label in found:
-                rows = rows_of_mask(cloud.labels == label)
+                rows = torch.nonzero(cloud.labels == label).squeeze(1)
                 ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
                 parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabelled": unlabelled}]))
         return PointCloud.cat(parts)

@@ -10,7 +10,7 @@ from pcdata.functional.rows import inside_box, ptr_after_mask, transform_points
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import SelectTransform
+from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Matrix4, Name, Vec3
 
 

@@ -15,7 +15,8 @@ from pcdata.rng import Streams, seeded
 from pcdata.sensors import SensorProfile
 from pcdata.structures import METRE, PointCloud
 from pcdata.structures.kinds import fillers
-from pcdata.transforms.base import Params, SelectTransform, Transform, sample_name
+from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Count, Fraction, FromSensor, IfShort, Metres, Unit
 
 

@@ -16,7 +16,8 @@ from pcdata.functional.voxels import voxel_downsample, voxel_majority
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud
-from pcdata.transforms.base import Params, SpatialTransform, Transform
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.field_types import Matrix4, Metres, Name
 
 

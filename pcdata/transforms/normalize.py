@@ -11,7 +11,8 @@ from pcdata.functional.rows import cloud_of_rows, segment_max, segment_mean
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import NORMALIZED, PointCloud
-from pcdata.transforms.base import Params, SpatialTransform, sample_name
+from pcdata.transforms.base import Params, sample_name
+from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.field_types import Name, Vec3
 
 

@@ -17,7 +17,8 @@ from pcdata.geometry import rigid
 from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SelectTransform, sample_name
+from pcdata.transforms.base import Params, sample_name
+from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.

@@ -11,7 +11,8 @@ from pcdata.errors import ConfigError, DTypeError
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SelectTransform, Transform
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Fraction, NonNegative, Positive
 
 

@@ -13,7 +13,8 @@ from pcdata.functional.rows import segment_mean
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, SpatialTransform
+from pcdata.transforms.base import Params
+from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.field_types import Fraction, NonNegative, Positive, Vec3
 
 About = Literal["origin", "centroid"]

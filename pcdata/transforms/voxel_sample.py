@@ -10,7 +10,7 @@ from torch import Tensor
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import SelectTransform
+from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Positive, Unit
 
 
