@@ -152,10 +152,9 @@ def _require_rows(where: str, ptr: Tensor, spec: TensorSpec, rows: str) -> None:
     counts = [stop - start for start, stop in pairwise(bounds)]
     if min(counts) < spec.least:
         short = [cloud for cloud, count in enumerate(counts) if count < spec.least]
-        found = f"has {counts[short[0]]} rows" if counts[short[0]] else "is empty"
+        found = f"has {counts[short[0]]} of the {spec.least} points it needs" if counts[short[0]] else "is empty"
         raise TooFewPointsError(
-            f"{where}: cloud {short[0]} of {rows} {found}, but at least {spec.least} are needed; {len(short)} of "
-            f"{len(counts)} clouds have too few, leave them out"
+            f"{where}: cloud {short[0]} of {rows} {found}; leave such clouds out ({len(short)} of {len(counts)})"
         )
 
 

@@ -38,7 +38,7 @@ def dbscan(
         points: the clouds, in any unit of length.
         ptr: row pointers of the points.
         eps: in the unit of the points.
-        min_points: neighbours that make a core point, itself included.
+        min_points: neighbors that make a core point, itself included.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 

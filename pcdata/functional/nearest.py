@@ -17,7 +17,7 @@ _PAIRS = 1 << 20  # looked at together: a few images of 4 MB
 
 @dataclass(frozen=True)
 class Neighbors:
-    """The neighbours of some queries, ascending by (squared distance, row); padding is (inf, N)."""
+    """The neighbors of some queries, ascending by (squared distance, row); padding is (inf, N)."""
 
     query: Tensor  # (m,) int64, row of the caller's queries
     squared: Tensor  # (m, k) float32
@@ -25,7 +25,7 @@ class Neighbors:
 
     @property
     def found(self) -> Tensor:
-        """(m, k) bool: a real neighbour, not padding."""
+        """(m, k) bool: a real neighbor, not padding."""
         return torch.isfinite(self.squared)
 
     @property

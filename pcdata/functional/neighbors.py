@@ -1,9 +1,9 @@
-"""Nearest neighbours and neighbours within a radius, exact, on ragged batches.
+"""Nearest neighbors and neighbors within a radius, exact, on ragged batches.
 
-One convention for all: a point counts itself; squared distance is ((dx*dx)+(dy*dy))+(dz*dz) in float32; neighbours
-ascend by (squared distance, row), so equal distances go to the lowest row; missing neighbours are padded with distance
+One convention for all: a point counts itself; squared distance is ((dx*dx)+(dy*dy))+(dz*dz) in float32; neighbors
+ascend by (squared distance, row), so equal distances go to the lowest row; missing neighbors are padded with distance
 infinity and row N, which makes a gather without a mask fail loudly instead of taking the last point (SciPy's choice).
-Squared distances must fit in float32: points more than 1.8e19 apart are never neighbours.
+Squared distances must fit in float32: points more than 1.8e19 apart are never neighbors.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def knn(
     Args:
         points: the clouds to search, in any unit of length; distances are in the same unit.
         ptr: row pointers of the points.
-        k: neighbours per query, the point itself included when the queries are the points.
+        k: neighbors per query, the point itself included when the queries are the points.
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
@@ -88,7 +88,7 @@ def ball_query(
 ) -> tuple[Tensor, Tensor, Tensor]:  # index (Q, m) int64; distance (Q, m) float32; count (Q,) int64
     """Find the *nearest* ``max_neighbors`` points with d < radius for every query, never just the first ones met.
 
-    The test is ``d2 < float32(radius) * float32(radius)``, strict. ``count`` is the number of neighbours returned:
+    The test is ``d2 < float32(radius) * float32(radius)``, strict. ``count`` is the number of neighbors returned:
     min(points within the radius, max_neighbors). The rest is padded with index N and distance infinity.
 
     Args:

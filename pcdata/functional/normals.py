@@ -1,6 +1,6 @@
 """Surface normals from the covariance of the nearest points, without a batched eigensolver.
 
-Source: Hoppe et al., Surface reconstruction from unorganized points, 1992; the neighbourhood and the fallback are those
+Source: Hoppe et al., Surface reconstruction from unorganized points, 1992; the neighborhood and the fallback are those
 of Open3D's ``estimate_normals`` with ``KDTreeSearchParamHybrid``.
 """
 
@@ -36,11 +36,11 @@ def estimate_normals(
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> Tensor:  # (N, 3) float32, unit length
-    """Estimate each point's normal: the direction in which its neighbourhood varies least.
+    """Estimate each point's normal: the direction in which its neighborhood varies least.
 
-    The neighbourhood is the nearest ``max_neighbors`` points with d < radius, the point itself included; its covariance
-    and eigenvectors are float64. Where no direction stands out, one is agreed on: fewer than three neighbours, or an
-    equal spread in all directions, give (0, 0, 1); neighbours on a line along d, or spread equally across d, give the
+    The neighborhood is the nearest ``max_neighbors`` points with d < radius, the point itself included; its covariance
+    and eigenvectors are float64. Where no direction stands out, one is agreed on: fewer than three neighbors, or an
+    equal spread in all directions, give (0, 0, 1); neighbors on a line along d, or spread equally across d, give the
     direction across d and across (0, d_z, -d_y), or across d and (-d_z, 0, d_x) where d_x is larger than d_y. The sign
     is a convention: the last component of (x, y, z) that is not 0 is positive, so z >= 0; use :func:`orient_normals`
     to face the camera.
@@ -62,7 +62,7 @@ def estimate_normals(
     wide = points.double()
     for near in nearest_chunks(points, ptr, max_neighbors, radius=radius, backend=backend):
         count = near.found.sum(1)
-        # A missing neighbour points at the query itself: offset 0 adds nothing to the sums below.
+        # A missing neighbor points at the query itself: offset 0 adds nothing to the sums below.
         index = torch.where(near.found, near.index, near.query[:, None])
         # Offsets from the query keep all digits however far the cloud lies from the origin.
         offset = wide[index] - wide[near.query][:, None]
@@ -116,7 +116,7 @@ Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # xx, xy, xz,
 
 
 def _covariance(offset: Tensor, count: Tensor) -> Symmetric:
-    """Return the covariances of (m, k, 3) offsets, of which ``count`` (m,) are neighbours and the rest 0."""
+    """Return the covariances of (m, k, 3) offsets, of which ``count`` (m,) are neighbors and the rest 0."""
     number = count.clamp(min=1).double()
     x, y, z = offset.unbind(-1)
     mean_x, mean_y, mean_z = (axis.sum(1) / number for axis in (x, y, z))

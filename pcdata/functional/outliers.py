@@ -35,7 +35,7 @@ def statistical_outlier_mask(
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> Tensor:  # (N,) bool, True = outlier
-    """Mark points whose mean distance to their nearest neighbours is unusual for their cloud.
+    """Mark points whose mean distance to their nearest neighbors is unusual for their cloud.
 
     A point stays when 0 < mean < mu + std_ratio * sigma. ``mean`` is over its ``num_neighbors`` nearest points, itself
     included at distance 0 (all points, in a smaller cloud); mu is the average of the means over the cloud; sigma their
@@ -87,7 +87,7 @@ def radius_outlier_mask(
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> Tensor:  # (N,) bool, True = outlier
-    """Mark points with too few neighbours: a point stays when more than ``min_neighbors`` points have d < radius.
+    """Mark points with too few neighbors: a point stays when more than ``min_neighbors`` points have d < radius.
 
     As in Open3D the point counts itself and both tests are strict; d < radius is
     ``d2 < float32(radius) * float32(radius)``.

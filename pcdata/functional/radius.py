@@ -13,7 +13,7 @@ from torch import Tensor
 from pcdata.errors import ConfigError
 from pcdata.functional.rows import counts_from_ptr, segment_max, segment_min
 
-# Faster backends cut a cloud into cells whose points are all neighbours: the diagonal of a cell is just under the
+# Faster backends cut a cloud into cells whose points are all neighbors: the diagonal of a cell is just under the
 # radius, by far more than float32 distances (2e-7) and cell borders (2e-6) can err.
 _MARGIN = 1e-4
 # Up to here a float64 cell coordinate errs by less than 2^-16 of a cell, and (column, coordinate) fits in 64 bits.
@@ -21,7 +21,7 @@ _MAX_CELLS_PER_AXIS = 2**36
 
 
 def squared_radius(radius: float | None, device: torch.device) -> Tensor:
-    """Return the () float32 that d2 of a neighbour is below; infinite when there is no radius."""
+    """Return the () float32 that d2 of a neighbor is below; infinite when there is no radius."""
     limit = torch.tensor(math.inf if radius is None else radius, dtype=torch.float32, device=device)
     return limit * limit
 

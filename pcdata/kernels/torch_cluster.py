@@ -1,7 +1,7 @@
 """torch-cluster as a backend, on the CPU and where it can keep pcdata's contract; taken only when asked for by name.
 
 It is refused on CUDA: its farthest point sampling starts from squared distances of 5e4, so larger ones tie, and its
-radius search keeps the first neighbours it meets, not the nearest.
+radius search keeps the first neighbors it meets, not the nearest.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def ball_query(
     queries_ptr: Tensor | None,
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Search with ``torch_cluster.radius``, asking for *all* neighbours, then keep the nearest by the contract's order.
+    """Search with ``torch_cluster.radius``, asking for *all* neighbors, then keep the nearest by the contract's order.
 
     Memory grows with the number of pairs within the radius, unlike the reference.
 
@@ -97,7 +97,7 @@ def _require_cpu(name: str, points: Tensor) -> None:
 def _sample_cloud(points: Tensor, count: int, cloud: int) -> Tensor:
     if count == 0:
         return torch.empty(0, dtype=torch.int64, device="cpu")
-    # It takes ceil(ratio * n) points in float32; half a point below the count cannot round to a neighbour.
+    # It takes ceil(ratio * n) points in float32; half a point below the count cannot round to a neighbor.
     index: Tensor = _load().fps(points, ratio=(count - 0.5) / len(points), random_start=False)
     if len(index) != count or len(index.unique()) != count:
         raise BackendError(

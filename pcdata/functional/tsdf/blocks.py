@@ -17,7 +17,7 @@ from pcdata.functional.tsdf.grid import VOXELS
 CHUNK = 8192  # blocks
 TSDF_SCALE = 32767  # of a stored distance: one truncation. Rounding costs 1e-5 of it, at most, per view
 MAX_WEIGHT = 32767  # a voxel's weight stops here: from then on its average forgets
-COLOR_SCALE = 4  # steps of a stored colour per 8-bit level; three channels of 10 bits fill an int32
+COLOR_SCALE = 4  # steps of a stored color per 8-bit level; three channels of 10 bits fill an int32
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Planes:
 
     @property
     def bytes_per_block(self) -> int:
-        """The memory of one block: 4 bytes a voxel, 8 with colour."""
+        """The memory of one block: 4 bytes a voxel, 8 with color."""
         return VOXELS * sum(dtype.itemsize for dtype in self.dtypes.values())
 
 
@@ -47,7 +47,7 @@ class Planes:
 class Chunk:
     """The voxels of ``CHUNK`` blocks; all zero = never seen.
 
-    The planes of one block lie behind one another, so that a block is one stretch of memory: with colour, a page.
+    The planes of one block lie behind one another, so that a block is one stretch of memory: with color, a page.
     """
 
     tsdf: Tensor  # (C, 512) int16: signed distance / truncation * TSDF_SCALE, positive in front of the surface

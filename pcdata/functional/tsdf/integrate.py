@@ -17,7 +17,7 @@ from pcdata.functional.tsdf.views import VIEW, FusionView
 
 _TOGETHER = 2048  # blocks updated in one go: a million voxels
 _FURTHEST = 2.0**40  # blocks; beyond what keys reach
-_SHARE_STEPS = 1 << 15  # of a pixel's share in a colour, which is mixed in integers
+_SHARE_STEPS = 1 << 15  # of a pixel's share in a color, which is mixed in integers
 
 
 @op(view=VIEW, grid=GRID, gradient=False)
@@ -163,7 +163,7 @@ def bend(x: Tensor, y: Tensor, r2: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mixed_color(old: Tensor, pixel: Tensor, share: Tensor, count: Tensor) -> Tensor:
-    """Average a pixel's colour into the stored one.
+    """Average a pixel's color into the stored one.
 
     Rounded up or down in turn, by the multiples of the golden ratio: rounding to nearest would ignore small
     differences for good once the weights are large.

@@ -1,7 +1,7 @@
 """Triangles between zero crossings: marching cubes with tables made from the faces of the cube.
 
 Source: Lorensen & Cline, Marching Cubes, 1987. On a face with two opposite corners inside, those two are kept apart in
-every cube, so that neighbouring cubes agree and the surface has no cracks.
+every cube, so that neighboring cubes agree and the surface has no cracks.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import Count
 from pcdata.functional.tsdf.blocks import BLOCKS, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
-from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
+from pcdata.functional.tsdf.margins import SIDE, Neighborhood, own_places
 
 _TOGETHER = 512  # blocks
 Edge = tuple[int, int]  # the corners it joins; corner c lies at (c & 1, c >> 1 & 1, c >> 2)
@@ -81,7 +81,7 @@ def find_triangles(
     keys = blocks.sorted_keys
     tables = tensor_tables(blocks.device)
     parts = [
-        _triangles_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), keys, min_weight, tables)
+        _triangles_of(Neighborhood.of(blocks, keys[start : start + _TOGETHER]), keys, min_weight, tables)
         for start in range(0, len(keys), _TOGETHER)
     ]
     edges = torch.cat(parts) if parts else torch.empty((0, 3), dtype=torch.int64, device=blocks.device)
@@ -106,7 +106,7 @@ def tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _triangles_of(
-    some: Neighbourhood, keys: Tensor, min_weight: int, tables: tuple[Tensor, Tensor, Tensor]
+    some: Neighborhood, keys: Tensor, min_weight: int, tables: tuple[Tensor, Tensor, Tensor]
 ) -> Tensor:  # (T, 3) int64 edges, numbered as in Crossings
     counts, starts, axes = tables
     count = len(some.corner)
@@ -129,7 +129,7 @@ def _triangles_of(
 
 
 def _edge_numbers(
-    some: Neighbourhood, keys: Tensor, block: Tensor, voxel: Tensor, corner: Tensor, axis: Tensor
+    some: Neighborhood, keys: Tensor, block: Tensor, voxel: Tensor, corner: Tensor, axis: Tensor
 ) -> Tensor:
     """Number the edges that start at a corner (T, 3) of the cubes at these voxels (T,) and run along an axis (T, 3)."""
     at = [((voxel // size % EDGE)[:, None] + (corner >> bit & 1)) for bit, size in enumerate((1, EDGE, EDGE * EDGE))]

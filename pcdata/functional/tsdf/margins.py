@@ -1,4 +1,4 @@
-"""Blocks with a margin from their neighbours, so that a block's edges and gradients are read from one array."""
+"""Blocks with a margin from their neighbors, so that a block's edges and gradients are read from one array."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pcdata.functional.tsdf.grid import BLOCKS_PER_SIDE, EDGE, pack_keys, unpack
 
 BEFORE, AFTER = 2, 3  # voxels of the margin: the last ends of a block's edges lie in the margin and have slopes too
 SIDE = BEFORE + EDGE + AFTER  # place p holds voxel p - BEFORE
-# Per step to a neighbour: its voxels, and their places.
+# Per step to a neighbor: its voxels, and their places.
 _PART = {
     -1: (slice(EDGE - BEFORE, EDGE), slice(0, BEFORE)),
     0: (slice(0, EDGE), slice(BEFORE, BEFORE + EDGE)),
@@ -22,7 +22,7 @@ _PART = {
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbourhood:
+class Neighborhood:
     """Some blocks and the rows of the 27 blocks around each, -1 where there is none."""
 
     blocks: VoxelBlocks
@@ -30,8 +30,8 @@ class Neighbourhood:
     rows: Tensor  # (N, 27) int64, in the order of (z, y, x) from -1 to 1
 
     @staticmethod
-    def of(blocks: VoxelBlocks, keys: Tensor) -> Neighbourhood:
-        """Look up the neighbours of the blocks with these keys."""
+    def of(blocks: VoxelBlocks, keys: Tensor) -> Neighborhood:
+        """Look up the neighbors of the blocks with these keys."""
         block = unpack_keys(keys)
         steps = torch.tensor(
             [(x, y, z) for z, y, x in itertools.product((-1, 0, 1), repeat=3)], dtype=torch.int64, device=keys.device
@@ -39,7 +39,7 @@ class Neighbourhood:
         around = (block[:, None] + steps).reshape(-1, 3)
         exists = (around.abs() < BLOCKS_PER_SIDE).all(1)
         rows = blocks.find(pack_keys(torch.where(exists[:, None], around, 0)))
-        return Neighbourhood(blocks, block * EDGE, torch.where(exists, rows, -1).reshape(-1, 27))
+        return Neighborhood(blocks, block * EDGE, torch.where(exists, rows, -1).reshape(-1, 27))
 
     def plane(self, name: str) -> Tensor:
         """Return one plane with its margin (N, SIDE, SIDE, SIDE), indexed z, y, x; 0 where there is no block."""

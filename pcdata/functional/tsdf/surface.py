@@ -13,7 +13,7 @@ from pcdata.contracts.numbers import Count
 from pcdata.functional.rows import pick_rows
 from pcdata.functional.tsdf.blocks import BLOCKS, COLOR_SCALE, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, GRID, VOXELS, VoxelGrid
-from pcdata.functional.tsdf.margins import SIDE, Neighbourhood, own_places
+from pcdata.functional.tsdf.margins import SIDE, Neighborhood, own_places
 
 _TOGETHER = 512  # blocks read in one go: 0.7 million voxels with their margins
 # Ends of one edge that differ by more lie on two surfaces: the front of one seen past the edge of another. A surface
@@ -55,21 +55,21 @@ class Crossings:
 def find_crossings(
     blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int = 1, edges: bool = False, backend: str = "auto"
 ) -> Crossings:
-    """Find every zero crossing between neighbours along x, y and z that were both seen, with ``min_weight`` at least.
+    """Find every zero crossing between neighbors along x, y and z that were both seen, with ``min_weight`` at least.
 
-    Point, colour and gradient are interpolated linearly between the ends; the label is that of the nearer end, of the
+    Point, color and gradient are interpolated linearly between the ends; the label is that of the nearer end, of the
     first at equal distance; the normal is the gradient's direction. An edge whose ends differ by more than a truncation
     belongs to no surface.
     """
     keys = blocks.sorted_keys
     parts = [
-        _crossings_of(Neighbourhood.of(blocks, keys[start : start + _TOGETHER]), start, grid, min_weight, edges)
+        _crossings_of(Neighborhood.of(blocks, keys[start : start + _TOGETHER]), start, grid, min_weight, edges)
         for start in range(0, max(len(keys), 1), _TOGETHER)
     ]
     return Crossings.cat(parts)
 
 
-def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid, min_weight: int, edges: bool) -> Crossings:
+def _crossings_of(some: Neighborhood, first: int, grid: VoxelGrid, min_weight: int, edges: bool) -> Crossings:
     if len(some.corner) == 0:
         return _none(some.blocks)
     count = len(some.corner)
@@ -105,12 +105,12 @@ def _crossings_of(some: Neighbourhood, first: int, grid: VoxelGrid, min_weight: 
 
 
 def _gradient(value: Tensor, block: Tensor, start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
-    """Return (M, 3): the slope per voxel at a crossing, smoothed; 0 along an axis without a seen neighbour.
+    """Return (M, 3): the slope per voxel at a crossing, smoothed; 0 along an axis without a seen neighbor.
 
     The mean rise between the two voxels on one side and the two on the other, over the nine lines along the axis,
     weighted 4, 2, 1 from the middle to the corners: per step the weighted rises of the pairs that were seen whole, by
     their weighted steps. Both ends of the edge count by how near they are. Where no pair was seen whole, it is the
-    difference to the one neighbour of the nearer end that was.
+    difference to the one neighbor of the nearer end that was.
 
     A distance is that of the nearest pixel, so the field has stairs a pixel wide, and the difference of the next two
     voxels alone follows them. Source: the operator of Sobel & Feldman, A 3x3 Isotropic Gradient Operator, 1968, with a
@@ -162,12 +162,12 @@ def _unit(gradient: Tensor, axis: Tensor, step: Tensor) -> Tensor:
     return torch.where((length > 0)[:, None], gradient / length[:, None], along)
 
 
-def _least_views(some: Neighbourhood, block: Tensor, start: Tensor, end: Tensor) -> Tensor:
+def _least_views(some: Neighborhood, block: Tensor, start: Tensor, end: Tensor) -> Tensor:
     views = some.plane("views").reshape(len(some.corner), -1)
     return torch.minimum(views[block, start], views[block, end]).long()
 
 
-def _colors(some: Neighbourhood, block: Tensor, start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
+def _colors(some: Neighborhood, block: Tensor, start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
     packed = some.plane("color").reshape(len(some.corner), -1)
     first, second = packed[block, start], packed[block, end]
     channels = []

@@ -1,4 +1,4 @@
-"""One view, prepared for integration: its camera, and images of depth, weight, colour and label."""
+"""One view, prepared for integration: its camera, and images of depth, weight, color and label."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FusionView:
     distortion: Tensor | None  # (12,) float64 coefficients
     world_from_camera: Tensor  # (4, 4) float64
     weight: Tensor | None = None  # (H, W) int32 at least 1; None = 1 everywhere
-    color: Tensor | None = None  # (H, W) int32: r | g << 10 | b << 20, in steps of a stored colour
+    color: Tensor | None = None  # (H, W) int32: r | g << 10 | b << 20, in steps of a stored color
     label: Tensor | None = None  # (H, W) int32
 
     @property
@@ -65,7 +65,7 @@ def pack_colors(
     *,
     backend: str = "auto",
 ) -> Tensor:  # (H, W) int32
-    """Pack colours into one number each, as voxels store them."""
+    """Pack colors into one number each, as voxels store them."""
     r, g, b = (colors.int() * COLOR_SCALE).unbind(-1)
     return r | (g << 10) | (b << 20)
 
@@ -91,7 +91,7 @@ def weight_image(
     """Say how much every reading counts.
 
     ``inverse_square`` is ``(1 m / depth)^2``, the inverse variance of a sensor whose noise grows with the depth;
-    ``angle`` the cosine between the ray and the surface's normal, 0.1 where neighbours without reading hide it.
+    ``angle`` the cosine between the ray and the surface's normal, 0.1 where neighbors without reading hide it.
     """
     if weighting == "constant":
         return None
@@ -103,7 +103,7 @@ def weight_image(
 
 
 def _cosines(depth: Tensor, rays: Tensor) -> Tensor:
-    """Return |cos| between every pixel's ray and the normal from its four neighbours (H, W) float64."""
+    """Return |cos| between every pixel's ray and the normal from its four neighbors (H, W) float64."""
     ones = torch.ones_like(rays[..., :1])
     directions = torch.cat([rays, ones], dim=-1).nan_to_num()
     points = directions * depth.double()[..., None]

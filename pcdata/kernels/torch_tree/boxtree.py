@@ -1,4 +1,4 @@
-"""An implicit tree of boxes over points in Morton order: the structure behind every exact neighbour search.
+"""An implicit tree of boxes over points in Morton order: the structure behind every exact neighbor search.
 
 Each cloud is sorted along a Morton (Z-order) curve, every 16 consecutive points form a leaf, every 8 consecutive nodes
 a parent, up to one root per cloud. There are no tuning parameters that depend on the data, so dense and sparse regions

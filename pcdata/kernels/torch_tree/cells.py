@@ -1,4 +1,4 @@
-"""Cells so small that all points in one are neighbours: what makes counting and clustering cheap.
+"""Cells so small that all points in one are neighbors: what makes counting and clustering cheap.
 
 A cell's side is the radius over sqrt(3), so its diagonal is just under the radius. Only occupied cells exist.
 """
@@ -15,7 +15,7 @@ from pcdata.functional.radius import cell_side, require_cells
 from pcdata.functional.rows import cloud_of_rows
 from pcdata.kernels.torch_tree.boxtree import expand_ranges
 
-_REACH = 2  # ceil(sqrt(3)), and a margin: neighbours within the radius are at most two cells away on every axis
+_REACH = 2  # ceil(sqrt(3)), and a margin: neighbors within the radius are at most two cells away on every axis
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Cells:
         scaled = (points - low[cloud]) / cell_side(radius)
         if len(points):
             require_cells(where, radius, float(scaled.max()))
-        # Room of _REACH on both sides, so that a neighbour's coordinate never runs into the next column.
+        # Room of _REACH on both sides, so that a neighbor's coordinate never runs into the next column.
         coordinate = scaled.long() + _REACH
         spans = tuple(int(axis.max()) + _REACH + 1 if len(axis) else 1 for axis in coordinate.unbind(1))
         number, keys = cloud, []

@@ -20,7 +20,7 @@ from pcdata.kernels.torch_tree.boxtree import box_gap, expand_ranges
 from pcdata.kernels.torch_tree.cells import Cells
 from pcdata.kernels.torch_tree.search import nearest_chunks
 
-_SAMPLES = 4  # points per cell in the quick test; 16 distances join nearly all neighbouring cells
+_SAMPLES = 4  # points per cell in the quick test; 16 distances join nearly all neighboring cells
 _PAIRS_PER_CHUNK = 1 << 15
 _ROWS_PER_CHUNK = 1 << 18
 

@@ -1,4 +1,4 @@
-"""Exact k nearest neighbours by a walk down the box tree, in chunks of bounded memory.
+"""Exact k nearest neighbors by a walk down the box tree, in chunks of bounded memory.
 
 Queries are grouped like the points, 16 at a time. Each group takes a first bound from the leaves around it, walks the
 tree level by level with it, keeps per query the leaves within that query's own bound, and sorts only those points.
@@ -80,7 +80,7 @@ class _Search:
     home: Tensor  # (G, 16) a leaf of points near each query, -1 for none
     foreign: bool  # queries may lie far from all points
     k: int
-    limit: Tensor  # () float32, neighbours have d2 <= limit
+    limit: Tensor  # () float32, neighbors have d2 <= limit
 
     @cached_property
     def cloud(self) -> Tensor:

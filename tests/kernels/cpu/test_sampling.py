@@ -263,14 +263,13 @@ def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses,
 
 def test_inlier_counts_equal_the_reference():
     from pcdata.functional import planes
-    from pcdata.kernels.cpu import sampling as cpu_sampling
 
     points, ptr = organised(100, 101), torch.tensor([0, 4000, 4003, 10100])
     triples, which = planes._draw_triples([4000, 3, 6097], 77, [0, 1, 2])
-    drawn = [draw(points, ptr, triples, which) for draw in (cpu_sampling._draw, planes._draw)]
+    drawn = [planes.draw_planes(points, ptr, triples, which, backend=name) for name in ("cpu", "torch")]
     torch.testing.assert_close(*drawn, rtol=0, atol=1e-12, equal_nan=True)
     ours, reference = (
-        count(points, ptr, drawn[1], 0.004) for count in (cpu_sampling._count_inliers, planes._count_inliers)
+        planes.count_near_planes(points, ptr, drawn[1], 0.004, backend=name) for name in ("cpu", "torch")
     )
     assert torch.equal(ours, reference)
 
