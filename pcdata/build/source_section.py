@@ -120,7 +120,7 @@ def source_settings(document: Document, node: Any, folder: Path | None) -> Sourc
     known = list(dict.fromkeys([*OPENING, *COMBINATORS, *(name for layout in layouts for name in options_of(layout))]))
     for key in values:
         if key not in known:
-            hint = near_matches(key, known) or f"; known: {', '.join(known)}"
+            hint = near_matches(key, known) or f"; known: {', '.join(known)}; those of your own need --import FILE.py"
             document.fault(entries[key][0], f"source.{key}: no such setting{hint}")
         elif key in OPENING and (wrong := _wrong(key, values[key])):
             document.fault(entries[key][1], f"source.{key}: {wrong}, got {values[key]!r:.100}")
@@ -151,7 +151,8 @@ def _wrong(key: str, value: Any) -> str:
     if value is None:
         return ""
     if key == "kind" and value not in [*LAYOUTS]:
-        return f"must be one of {', '.join(LAYOUTS)}{near_matches(str(value), LAYOUTS)}"
+        hint = near_matches(str(value), LAYOUTS) or "; one of your own needs --import FILE.py"
+        return f"must be one of {', '.join(LAYOUTS)}{hint}"
     if key in ("path", "skip_file") and (not isinstance(value, str) or not value):
         return "must be a path"
     if key == "limit" and (type(value) is not int or value < 1):

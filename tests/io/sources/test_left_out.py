@@ -219,6 +219,8 @@ def test_options_of_the_layout_come_from_the_configuration_and_may_not_be_contra
         ("{averaged: {num_frame: 3}}", "2:20.*did you mean 'num_frames'"),
         ("{kind: graspnet, frame_id: base}", "no such setting"),
         ("{only: 5}", "a pattern of ids"),
+        ("{sieve: {step: 2}}", "--import FILE"),
+        ("{kind: own_frames}", "--import FILE"),
         ("[a]", "must be a mapping"),
     ],
 )
