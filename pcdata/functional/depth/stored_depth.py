@@ -72,7 +72,7 @@ def depth_in_metres(
         raise UnitError(f"{where}: depth is {stored.dtype} in a unit that nobody states; {ways(length)}")
     unit = 1.0 if metres_per_unit is None else check_metres_per_unit(where, metres_per_unit)
     if stored.dtype == np.uint16:
-        depth = (stored.astype(np.float64) * unit).astype(np.float32)
+        depth = np.multiply(stored, unit, dtype=np.float64).astype(np.float32)
         for mark in invalid_values:
             depth[stored == mark] = 0.0
     else:
@@ -81,7 +81,9 @@ def depth_in_metres(
     sample = depth.reshape(-1)[some]
     if len(valid := sample[sample > 0]):
         _warn_of_marks(stored.reshape(-1)[some][sample > 0], DepthUnit(unit))
-        if not _NEAREST <= float(np.median(valid)) <= _FARTHEST:  # the units that would fit are told from whole images
+        if (
+            not _NEAREST <= float(np.median(valid[:: max(1, len(valid) >> 12)])) <= _FARTHEST
+        ):  # the units that would fit are told from whole images
             check_plausible(
                 where, depth.reshape(-1, depth.shape[-1]), DepthUnit(unit), stored.reshape(-1, depth.shape[-1])
             )
@@ -114,16 +116,15 @@ def check_plausible(where: str, depth: NDArray[np.float32], unit: DepthUnit, sto
 
 def _warn_of_marks(stored: NDArray[Any], unit: DepthUnit) -> None:
     """Say once that a number which usually marks "no reading" becomes points; the text is the same for every file."""
-    if stored.dtype != np.uint16 or len(stored) < _FEW:
+    if stored.dtype != np.uint16 or len(stored) < _FEW or (mark := int(stored.max())) not in MARKS:
         return
-    for mark in MARKS:
-        # At the end of the range and more than just below it: a wall that happens to be there has noise.
-        share, beside = (stored == mark).mean(), ((stored >= 0.98 * mark) & (stored < mark)).mean()
-        if share > max(_MARKED, beside) and stored.max() == mark:
-            metres = float(metres_of_value(unit.metres, unit.encoding)[mark])
-            warnings.warn(
-                f"depth images hold {mark}, {MARKS[mark]}, at more than {_MARKED:.1%} of their readings: it becomes "
-                f"points at {metres:.5g} m. If it marks 'no reading', say invalid_values=[{mark}]",
-                PcdataWarning,
-                stacklevel=2,
-            )
+    # At the end of the range and more than just below it: a wall that happens to be there has noise.
+    share, beside = (stored == mark).mean(), ((stored >= 0.98 * mark) & (stored < mark)).mean()
+    if share > max(_MARKED, beside):
+        metres = float(metres_of_value(unit.metres, unit.encoding)[mark])
+        warnings.warn(
+            f"depth images hold {mark}, {MARKS[mark]}, at more than {_MARKED:.1%} of their readings: it becomes "
+            f"points at {metres:.5g} m. If it marks 'no reading', say invalid_values=[{mark}]",
+            PcdataWarning,
+            stacklevel=2,
+        )
