@@ -43,7 +43,7 @@ class BuiltSample:
     """What happened to one capture."""
 
     id: str
-    entered_at: str  # the first pipeline section that ran: "depth" or "cloud"
+    entered_at: str  # "depth", or "cloud" where the capture was one already
     counts: list[tuple[str, int]]  # step name -> points after it, over all clouds of the sample
     seconds: float
 

@@ -31,7 +31,7 @@ def build_text(report: BuildReport) -> str:
     as_clouds = sum(sample.entered_at == "cloud" for sample in report.samples)
     head = f"{len(report.samples)} samples in {seconds:.1f} s"
     if as_clouds:
-        head += f"; {as_clouds} captures were clouds already and entered at the section 'cloud'"
+        head += f"; {as_clouds} captures were clouds already and entered at the first step that takes one"
     table = f"{head}\n\n{text_table(['points after', 'fewest', 'median', 'most'], rows)}"
     return f"{table}\n\n{skipped_text(report.skipped)}" if report.skipped else table
 

@@ -26,9 +26,9 @@ from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 class Compose(Transform):
     """Run steps one after another, on captures or on clouds; check at construction that neighbours fit.
 
-    A cloud enters at the first step that takes one, so one chain serves depth images and PLY files. The steps before
-    the first random one always give the same: a dataset may store what they leave (:meth:`split`). A chain within is
-    opened: it adds nothing to its steps.
+    A cloud enters at the first step that takes one, so one chain serves depth images and PLY files; where every step
+    takes captures and the last gives clouds, it stays as it is. The steps before the first random one always give the
+    same: a dataset may store what they leave (:meth:`split`). A chain within is opened: it adds nothing to its steps.
 
     Raises:
         ConfigError: a step cannot take what the step before it gives (capture or cloud, frame, unit).
