@@ -319,7 +319,7 @@ def test_a_summary_counts_verdicts_and_names_the_first_of_the_worst() -> None:
     assert entry.examples == ["f3"]
     plain = json.loads(json.dumps(summary.to_json(), allow_nan=False))
     assert plain["verdict"] == "fail"
-    assert plain["samples"] == {"pass": 3, "warn": 0, "fail": 1}
+    assert plain["samples"] == {"pass": 3, "unknown": 0, "warn": 0, "fail": 1}
     assert json.loads(json.dumps(reports[3].to_json(), allow_nan=False))["verdict"] == "fail"
 
 
