@@ -3,7 +3,7 @@
     PCDATA_TEST_DATA=... python benchmarks/alignment.py        # prints a table, writes results/ and docs/
 
 Surfaces with known truth: two independent samplings of one surface, with noise, the source off by up to 0.3 m and 30
-degrees in random directions. Real pairs: neighbouring frames of the 7-Scenes recording, off as much from their recorded
+degrees in random directions. Real pairs: neighboring frames of the 7-Scenes recording, off as much from their recorded
 poses. Every library gets the same clouds and normals, the same start and the same first search distance. A start
 succeeds when the pose lies within the limits of the row; ``converged`` is what we say without knowing the truth.
 """
@@ -120,7 +120,7 @@ def with_normals(source: Tensor, target: Tensor, radius: float = 0.08) -> Clouds
 
 
 def real(first: int) -> Clouds:
-    """Return two neighbouring frames in the recording's frame, thinned to 40 mm."""
+    """Return two neighboring frames in the recording's frame, thinned to 40 mm."""
     source = open_source(Path(os.environ["PCDATA_TEST_DATA"]) / "seven_scenes")
     clouds = []
     for index in (first + 1, first):

@@ -4,7 +4,7 @@
 
 The chain: mask and deproject, statistical outliers (20, 2.0), radius outliers (5, 1 cm), plane (1 cm, 1000 hypotheses),
 DBSCAN (2 cm, 50) with objects of 100 to 50,000 points, 1024 farthest points, normals (2 cm, 30). Also its beginning on
-its own, with a crop: mask, deproject with colours, crop.
+its own, with a crop: mask, deproject with colors, crop.
 
 Method: everything runs once to warm up, then ours and the short Open3D chain ``--repeats`` times in turn; Open3D's
 whole chain, which takes a minute, ``--open3d`` times in the same run. Medians and interquartile ranges of wall time,
@@ -166,8 +166,8 @@ def compare_beginnings(times: dict[str, Times]) -> dict[str, Any]:
         report["ratio_process"] = rows["Open3D"]["process_ms"] / rows["pcdata"]["process_ms"]
         if len(theirs.points) == cloud.num_points:
             report["largest_difference_m"] = float(np.abs(np.asarray(theirs.points) - cloud.points.numpy()).max())
-            report["largest_colour_difference"] = float(np.abs(np.asarray(theirs.colors) - cloud.colors.numpy()).max())
-    print("mask, deproject with colours, crop")
+            report["largest_color_difference"] = float(np.abs(np.asarray(theirs.colors) - cloud.colors.numpy()).max())
+    print("mask, deproject with colors, crop")
     table = [[name, *(f"{row[key]:.2f}" for key in row)] for name, row in rows.items()]
     print(text_table(["", "wall ms", "IQR", "best", "process ms"], table))
     print({key: value for key, value in report.items() if key != "times"}, "\n")
@@ -252,7 +252,7 @@ def pipeline_steps(whole: pcdata.Compose, frame: pcdata.DepthFrame) -> Iterator[
 
 
 def by_functions(frame: pcdata.DepthFrame) -> Iterator[Step]:
-    """The same with tensors alone: points, and the colours and pixels that belong to them."""
+    """The same with tensors alone: points, and the colors and pixels that belong to them."""
     intrinsics, size = frame.camera.intrinsics, frame.size
     depth = frame.depth if frame.mask is None else torch.where(frame.mask, frame.depth, 0.0)
     points, _, pixel = F.deproject_depth(depth, intrinsics)
@@ -320,7 +320,7 @@ def by_open3d(frame: pcdata.DepthFrame) -> Iterator[Step]:
     cloud = cloud.farthest_point_down_sample(1024)
     yield "farthest points", cloud
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=0.02, max_nn=30))
-    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    cloud.orient_normals_toward_camera_location(np.zeros(3))
     yield "normals", cloud
 
 

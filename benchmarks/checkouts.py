@@ -70,11 +70,11 @@ def jobs() -> dict[str, Callable[[], Any]]:
 
     return {
         "deproject": lambda: F.deproject_depth(frame.depth, frame.camera.intrinsics),
-        "statistical outliers, organised": lambda: F.statistical_outlier_mask(points, grid=grid),
+        "statistical outliers, organized": lambda: F.statistical_outlier_mask(points, grid=grid),
         "statistical outliers": lambda: F.statistical_outlier_mask(points),
-        "radius outliers, organised": lambda: F.radius_outlier_mask(points, grid=grid),
+        "radius outliers, organized": lambda: F.radius_outlier_mask(points, grid=grid),
         "radius outliers": lambda: F.radius_outlier_mask(points),
-        "normals, organised": lambda: F.estimate_normals(points, grid=grid),
+        "normals, organized": lambda: F.estimate_normals(points, grid=grid),
         "normals": lambda: F.estimate_normals(points),
         "plane": lambda: F.ransac_plane(points),
         "DBSCAN": lambda: F.dbscan(above),

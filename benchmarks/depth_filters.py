@@ -157,7 +157,7 @@ def registration_cases(frame: DepthFrame) -> Iterator[Case]:
     for size in (SIZE, (1080, 1920)):
         color = frame.camera.resized(size).intrinsics
         yield Case(
-            f"register to {size[1]}x{size[0]} colour",
+            f"register to {size[1]}x{size[0]} color",
             lambda size=size, color=color: F.register_depth(depth, k, color, color_from_depth, color_size=size),
             "remap INTER_NEAREST", lambda: cv2.remap(depth[0].numpy(), *grid, cv2.INTER_NEAREST),
             "a fixed map: no projection, no z-buffer",

@@ -74,7 +74,7 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "slightly moved pose": lambda frame: moved(frame, shift=0.004),
     "turned poses": _turned,
     "intrinsics of another size": _other_lens,
-    "colour aside": _color_aside,
+    "color aside": _color_aside,
     "hole": _with_hole,
     "saturated": _saturated,
     "no pose": lambda frame: replace(frame, world_from_camera=None, frame_id=None),
@@ -160,7 +160,7 @@ def _part(name: str, count: int, change: Callable[[Any], Any] = lambda frame: fr
 def _validations() -> Iterator[Case]:
     for name, change in FAULTS.items():
         yield f"check/frame {name}", lambda change=change: _frame_checked(change(scene()))
-    for name in ("clean", "unit x 10", "moved pose", "turned poses", "colour aside"):
+    for name in ("clean", "unit x 10", "moved pose", "turned poses", "color aside"):
         yield f"check/series {name}", lambda name=name: _checked(_series(FAULTS[name]))
     yield "check/series repeated", lambda: _checked(_repeated())
     yield "check/clouds", lambda: _checked(_clouds())

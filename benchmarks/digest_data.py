@@ -135,7 +135,7 @@ def _models() -> Iterator[Case]:
 
 
 def _cloud(count: int, seed: int, **changes: Any) -> Any:
-    """Points in the unit sphere with colours of 8 bits, normals and labels."""
+    """Points in the unit sphere with colors of 8 bits, normals and labels."""
     generator = seeded(seed)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     fields: dict[str, Any] = {
@@ -149,7 +149,7 @@ def _cloud(count: int, seed: int, **changes: Any) -> Any:
 
 
 def _view(size: tuple[int, int], seed: int) -> Any:
-    """A view in whole millimetres with one hole, colour, a mask, labels -1, 1 and 2, and a pose."""
+    """A view in whole millimetres with one hole, color, a mask, labels -1, 1 and 2, and a pose."""
     generator, (height, width) = seeded(seed), size
     units = torch.randint(400, 900, (1, height, width), generator=generator)
     units[0, 1, 2] = 0

@@ -33,7 +33,7 @@ def source_of(name: str) -> Any:
     return open_source(root / name)
 
 
-# Depth and colour images by a pattern of the number, numbers, and what intrinsics.json says.
+# Depth and color images by a pattern of the number, numbers, and what intrinsics.json says.
 COPIED: dict[str, dict[str, Any]] = {
     "tabletop_stream": {
         "depth": "depth_{:03d}.npy",
@@ -118,7 +118,7 @@ def real_frames() -> dict[str, Any]:
 
 @functools.cache
 def real_clouds() -> dict[str, Any]:
-    """One organised cloud, one whose rows are in no image, and a batch of two; in the frame "base"."""
+    """One organized cloud, one whose rows are in no image, and a batch of two; in the frame "base"."""
     root = real_folder()
     if root is None:
         return {}

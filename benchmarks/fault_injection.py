@@ -182,7 +182,7 @@ def followed(recordings: Sequence[Recording], pixels: int = 3) -> dict[str, dict
 
 
 def speed(repeats: int = 15) -> dict[str, float]:
-    """Milliseconds of wall clock and of processor time for one view of 1280x720 with colour and pose."""
+    """Milliseconds of wall clock and of processor time for one view of 1280x720 with color and pose."""
     frame = tabletop(3, num_views=1, noise="stereo", size=(720, 1280)).frame
     source = Frames([frame])
     threads = torch.get_num_threads()

@@ -55,7 +55,7 @@ def synthetic(seeds: int) -> Iterator[Recording]:
 
 
 def with_color_noise(frame: DepthFrame) -> DepthFrame:
-    """The renderer's colours are the same in every capture; a sensor's never are."""
+    """The renderer's colors are the same in every capture; a sensor's never are."""
     generator = seeded(frame.capture_index)
     noise = (2.0 * torch.randn(frame.colors.shape, generator=generator)).round()
     return replace(frame, colors=(frame.colors + noise).clamp(0, 255).byte())
@@ -70,9 +70,9 @@ def real(folder: Path) -> Iterator[Recording]:
         recording = [scenes.load(name) for name in scenes.ids[begin : begin + 10]]
         yield Recording(f"seven_scenes {begin}", recording, office)
     yield Recording("tabletop_stream", list(stream(folder / "tabletop_stream")))
-    yield Recording("pcl stereo table", [organised(folder / "pcd" / "table_scene_mug_stereo_textured.pcd")])
+    yield Recording("pcl stereo table", [organized(folder / "pcd" / "table_scene_mug_stereo_textured.pcd")])
     for file in sorted((folder / "osd").glob("*.pcd")):
-        yield Recording(f"osd {file.stem}", [organised(file)])
+        yield Recording(f"osd {file.stem}", [organized(file)])
 
 
 def stream(folder: Path) -> Iterator[DepthFrame]:
@@ -88,11 +88,11 @@ def stream(folder: Path) -> Iterator[DepthFrame]:
         yield DepthFrame(depth=depth[None], camera=camera, colors=colors[None], sample_id=file.stem, provenance=facts)
 
 
-def organised(file: Path) -> DepthFrame:
-    """An organised cloud as the depth and colour image that it was; Open3D keeps the pixels without depth too."""
+def organized(file: Path) -> DepthFrame:
+    """An organized cloud as the depth and color image that it was; Open3D keeps the pixels without depth too."""
     import open3d
 
-    height, width = read_pcd(file).meta[0]["organised_size"]
+    height, width = read_pcd(file).meta[0]["organized_size"]
     cloud = open3d.io.read_point_cloud(str(file), remove_nan_points=False)
     depth = np.nan_to_num(np.asarray(cloud.points)[:, 2]).reshape(height, width)
     colors = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8).reshape(height, width, 3)
@@ -130,7 +130,7 @@ def shifted_color(pixels: int) -> Fault:
         x, y = (round(pixels * part) for part in DIRECTIONS[draw])
         return [replace(frame, colors=frame.colors.roll((y, x), (1, 2))) for frame in frames]
 
-    return Fault("colour shifted", f"{pixels} px", "color_registration", inject, draws=len(DIRECTIONS))
+    return Fault("color shifted", f"{pixels} px", "color_registration", inject, draws=len(DIRECTIONS))
 
 
 def missing(percent: int) -> Fault:

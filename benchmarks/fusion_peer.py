@@ -51,7 +51,7 @@ class Open3DView(NamedTuple):
 
 
 class Open3DGrid:
-    """A tensor grid with distance, weight and colour; ``multiple`` is its truncation in voxels.
+    """A tensor grid with distance, weight and color; ``multiple`` is its truncation in voxels.
 
     It takes room for ``num_blocks`` at once, and doubles that when it is used up.
     """

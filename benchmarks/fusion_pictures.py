@@ -46,7 +46,7 @@ def room(folder: Path) -> list[Tensor]:
 
 
 def table() -> list[Tensor]:
-    """One noisy view and four, and the four without noise; lit, without their colours."""
+    """One noisy view and four, and the four without noise; lit, without their colors."""
     pictures = []
     pose = look_at((0.75, -0.55, 0.6), (0.0, 0.0, 0.05))
     for views, noise in ((1, "stereo"), (4, "stereo"), (4, "none")):
@@ -93,7 +93,7 @@ def pixels(u: Tensor, v: Tensor, step: tuple[int, int], size: tuple[int, int]) -
 
 
 def save(name: str, pictures: list[Tensor]) -> None:
-    """Set pictures side by side, in a palette of 256 colours."""
+    """Set pictures side by side, in a palette of 256 colors."""
     gap = torch.ones(pictures[0].shape[0], 8, 3)
     row = torch.cat([part for picture in pictures for part in (picture, gap)][:-1], dim=1)
     image = Image.fromarray((255 * row.numpy()).round().astype(np.uint8))

@@ -100,7 +100,7 @@ def workspace_rate() -> dict[str, Any]:
     extract = (time.process_time() - started) / 5
     typical = statistics.median(seconds[1:])
     return {
-        "captures": "4 views of 640x480, 3 mm, colour and labels",
+        "captures": "4 views of 640x480, 3 mm, color and labels",
         "first ms": 1000 * seconds[0],
         "median ms": 1000 * typical,
         "captures per second": 1 / typical,

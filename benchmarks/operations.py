@@ -149,8 +149,8 @@ def open3d_cases(points: torch.Tensor, shuffled: torch.Tensor, above: torch.Tens
         return one.normals
 
     variants = [
-        ("organised", points, cloud, grid),
-        ("unorganised", points, cloud, None),
+        ("organized", points, cloud, grid),
+        ("unorganized", points, cloud, None),
         ("shuffled", shuffled, mixed, None),
     ]
     for variant, p, c, g in variants:
@@ -200,15 +200,15 @@ def open3d_tensor_cases(points: torch.Tensor, above: torch.Tensor, grid: Any) ->
         return cloud.point.normals
 
     yield Case(
-        "statistical outliers 20, 2.0, organised", count, lambda: F.statistical_outlier_mask(points, grid=grid),
+        "statistical outliers 20, 2.0, organized", count, lambda: F.statistical_outlier_mask(points, grid=grid),
         "Open3D tensor", lambda: cloud.remove_statistical_outliers(20, 2.0), masks,
     )  # fmt: skip
     yield Case(
-        "radius outliers 5, 1 cm, organised", count, lambda: F.radius_outlier_mask(points, grid=grid),
+        "radius outliers 5, 1 cm, organized", count, lambda: F.radius_outlier_mask(points, grid=grid),
         "Open3D tensor", lambda: cloud.remove_radius_outliers(5, 0.01), masks,
     )  # fmt: skip
     yield Case(
-        "normals 2 cm, 30, organised", count, lambda: F.estimate_normals(points, grid=grid),
+        "normals 2 cm, 30, organized", count, lambda: F.estimate_normals(points, grid=grid),
         "Open3D tensor", their_normals, normals,
     )  # fmt: skip
     yield Case(

@@ -3,7 +3,7 @@
     python benchmarks/scaling.py             # 50k to 5M points; prints a table, writes results/scaling.json
     python benchmarks/scaling.py --only dbscan --points 5000000
 
-A synthetic surface, hills on a table at an even density: a neighbourhood holds about as many points at every size.
+A synthetic surface, hills on a table at an even density: a neighborhood holds about as many points at every size.
 Every measurement is a process of its own: it makes the cloud, runs the operation once (its peak of resident memory
 above what was there before, less the result, is the working space), then ``--repeats`` times for the median.
 
@@ -35,13 +35,13 @@ RESULTS = Path(__file__).parent / "results"
 POINTS = (50_000, 200_000, 800_000, 2_000_000, 5_000_000)
 BATCHES = (1, 8, 32)  # clouds, of 800,000 points together
 BATCH_POINTS = 800_000
-SPACING = 0.001  # metres between neighbours
+SPACING = 0.001  # metres between neighbors
 BYTES_PER_POINT = 100
 DBSCAN_BYTES = 1 << 30
 
 Operation = Callable[[torch.Tensor, torch.Tensor], Any]
 
-# Radii of three spacings hold 28 neighbours on average.
+# Radii of three spacings hold 28 neighbors on average.
 OPERATIONS: dict[str, Operation] = {
     "statistical_outlier_mask": lambda p, ptr: F.statistical_outlier_mask(p, ptr, num_neighbors=20),
     "radius_outlier_mask": lambda p, ptr: F.radius_outlier_mask(p, ptr, min_neighbors=5, radius=3 * SPACING),

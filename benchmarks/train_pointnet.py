@@ -2,7 +2,7 @@
 
     python benchmarks/train_pointnet.py     # some minutes; writes results/train_pointnet.json and a picture
 
-Task: say where the one object on a synthetic table is (its centre in the robot base frame), from the 512 points of the
+Task: say where the one object on a synthetic table is (its center in the robot base frame), from the 512 points of the
 DP3 preset. Three trainings see the same points: in the base frame in metres, as the contract says; in each camera's own
 frame (from capture to capture the camera moves by up to 14 degrees around, 7 up or down and 8 cm in distance); in the
 base frame in millimetres. ``check`` refuses the second and the third; here they are forced. Accuracy: the share of 100
@@ -48,7 +48,7 @@ class SmallPointNet(nn.Module):
 
 
 def captured(count: int) -> tuple[dict[str, ModelBatch], Tensor]:
-    """The same captures in three ways, and the true centres (count, 3)."""
+    """The same captures in three ways, and the true centers (count, 3)."""
     source = SyntheticSource(num_scenes=count, num_objects=1, size=(96, 128), floor=False)
     made = preset("dp3_sim", frame=BASE_FRAME, crop=WORKSPACE, channels=["xyz"])
     clouds, centers = [], []

@@ -49,7 +49,7 @@ OPTION = re.compile(r"metres_per_unit=([0-9.e-]+)(?:, depth_encoding=(\w+))?")
 FITS = 0.3  # of the pixels must fit into 16 bits
 
 
-Judgement = tuple[Verdict, str, float]  # on a declared unit, in words, and the median in metres
+Judgment = tuple[Verdict, str, float]  # on a declared unit, in words, and the median in metres
 
 
 class Scene(NamedTuple):
@@ -90,7 +90,7 @@ def real(folder: Path) -> Iterator[Scene]:
     yield Scene("d415", png("d3roma_ir_stereo/0000_depth.png") / 1000.0, 450.0)
     for file in sorted((folder / "osd").glob("*.pcd"))[::5]:
         cloud = read_pcd(file)
-        height, width = cloud.meta[0]["organised_size"]
+        height, width = cloud.meta[0]["organized_size"]
         depth = np.zeros(height * width)
         depth[cloud.source_index.numpy()] = cloud.points[:, 2].numpy()
         yield Scene("osd", depth.reshape(height, width), 525.0)
@@ -107,15 +107,15 @@ def stored_as(metres: NDArray[np.float64], unit: DepthUnit) -> NDArray[Any] | No
 
 
 def judge_once(
-    seen: dict[DepthUnit, Judgement], stored: NDArray[Any], focal: float, limits: CaptureLimits, unit: DepthUnit
-) -> Judgement:
+    seen: dict[DepthUnit, Judgment], stored: NDArray[Any], focal: float, limits: CaptureLimits, unit: DepthUnit
+) -> Judgment:
     """Judge a unit, the first time that it is asked for."""
     if unit not in seen:
         seen[unit] = judge(stored, unit, focal, limits)
     return seen[unit]
 
 
-def judge(stored: NDArray[Any], unit: DepthUnit, focal: float, limits: CaptureLimits) -> Judgement:
+def judge(stored: NDArray[Any], unit: DepthUnit, focal: float, limits: CaptureLimits) -> Judgment:
     """Return the verdict on a declared unit, the words, and the median in metres."""
     if stored.dtype != np.uint16 and unit.encoding != "plain":
         return Verdict.FAIL, "", float("nan")  # refused by the reader: floats have no order of bits
@@ -146,7 +146,7 @@ def main() -> None:
             if stored is None or not (stored > 0).any():
                 continue
             median = float(np.median(decoded(stored, true.encoding)[stored > 0])) * true.metres
-            seen: dict[DepthUnit, Judgement] = {}
+            seen: dict[DepthUnit, Judgment] = {}
             judged = functools.partial(judge_once, seen, stored, scene.focal, limits)
             for declared in UNITS:
                 verdict, words, found = judged(declared)

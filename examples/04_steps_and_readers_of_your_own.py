@@ -32,7 +32,7 @@ class Frames(Source):
         self.focal = focal
         super().__init__(path, [file.stem for file in path.glob("*.npy")])
     @classmethod
-    def recognises(cls, path):
+    def recognizes(cls, path):
         return any(path.glob("*.npy"))
     def files(self, sample_id):
         return {"depth": self.path / f"{sample_id}.npy"}

@@ -82,7 +82,7 @@ class ConfigError(PcdataError, ValueError):
 
 
 class CaptureError(PcdataError, ValueError):
-    """A raw capture (depth, colour, intrinsics, pose, cloud file) cannot be trusted."""
+    """A raw capture (depth, color, intrinsics, pose, cloud file) cannot be trusted."""
 
 
 class WriteError(CaptureError):

@@ -23,7 +23,7 @@ def seeded(seed: int) -> Generator:
 def generator_for(seed: int, epoch: int, sample_id: str, *, copy: int = 0) -> Generator:
     """Return the generator that belongs to one sample in one epoch, or to one of several copies of it.
 
-    The key is hashed (SHA-256), so neighbouring seeds and ids give unrelated streams.
+    The key is hashed (SHA-256), so neighboring seeds and ids give unrelated streams.
     """
     key = f"{seed}\0{epoch}\0{sample_id}" + (f"\0{copy}" if copy else "")
     digest = hashlib.sha256(key.encode(errors="surrogatepass")).digest()  # file names may be no UTF-8

@@ -124,7 +124,7 @@ def tabletop_frame(num_views: int = 2, *, seed: int = 0, num_objects: int = 3) -
 
 
 def depth_edges(depth: Tensor, jump: float) -> tuple[Tensor, Tensor]:
-    """The depth of the 4-neighbour that differs most, and where it differs by more than ``jump`` of the nearer one."""
+    """The depth of the 4-neighbor that differs most, and where it differs by more than ``jump`` of the nearer one."""
     across = facing_depth(depth)
     return across, (across - depth).abs() > jump * torch.minimum(depth, across)
 

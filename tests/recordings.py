@@ -13,7 +13,7 @@ typesys = pytest.importorskip("rosbags.typesys")
 TYPES = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
 DEPTH, COLOR = "/device_0/sensor_0/Depth_0", "/device_0/sensor_1/Color_0"
 SIZE = (24, 32)
-SHIFT = 0.02  # metres from the depth to the colour camera, along x
+SHIFT = 0.02  # metres from the depth to the color camera, along x
 MILLISECOND = 1_000_000
 
 
@@ -49,7 +49,7 @@ def transform(x: float):
 
 
 def recording() -> list[tuple[str, int, object]]:
-    """Topic, nanoseconds, message: three depth images, 5 cm apart in depth, and two colour images."""
+    """Topic, nanoseconds, message: three depth images, 5 cm apart in depth, and two color images."""
     info = types("diagnostic_msgs/msg/KeyValue")
     messages = [
         ("/device_0/info", 1, info("Name", "Intel RealSense D435")),

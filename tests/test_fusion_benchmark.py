@@ -21,7 +21,7 @@ VOXEL, MULTIPLE = 0.01, 5.0
 
 @pytest.fixture
 def benchmark(monkeypatch: pytest.MonkeyPatch):
-    """Import a script of benchmarks/ by name, as it would import its neighbours."""
+    """Import a script of benchmarks/ by name, as it would import its neighbors."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module
 

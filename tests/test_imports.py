@@ -51,7 +51,7 @@ class OwnFolder(FolderSource):
         super().__init__(path, **options)
 
     @classmethod
-    def recognises(cls, path):
+    def recognizes(cls, path):
         return (path / "OWN").exists()
 """
 
@@ -119,7 +119,7 @@ def test_a_file_is_run_once_under_a_private_name(tmp_path, step):
         (READER.replace("own_folder", "rig"), "a layout called rig is registered already"),
         (
             "import pcdata\nfrom pcdata.io import Source\n@pcdata.register_layout\nclass A(Source): kind = 'a'\n",
-            "A does not say _load, files, recognises",
+            "A does not say _load, files, recognizes",
         ),
         ("import pcdata\npcdata.register_layout(3)\n", "must be a subclass of pcdata.io.Source, got 3"),
         (READER.replace('"own_folder"', "7"), "OwnFolder.kind must be a text"),

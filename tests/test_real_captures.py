@@ -14,7 +14,7 @@ OSD = [f"learn{number}" for number in (0, 8, 16, 17, 20, 24, 25, 28, 32, 33, 38,
 
 
 @pytest.mark.parametrize("scene", OSD)
-def test_the_table_is_found_in_every_labelled_scene(test_data: Path, scene: str) -> None:
+def test_the_table_is_found_in_every_labeled_scene(test_data: Path, scene: str) -> None:
     cloud = read_pcd(test_data / "osd" / f"{scene}.pcd")
     assert cloud.labels is not None
     is_table = cloud.labels // 10 == 0

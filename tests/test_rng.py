@@ -17,7 +17,7 @@ def test_the_same_key_gives_the_same_stream():
     assert first_draws(rng.generator_for(3, 1, "scene/7")) == first_draws(rng.generator_for(3, 1, "scene/7"))
 
 
-def test_neighbouring_keys_give_different_streams():
+def test_neighboring_keys_give_different_streams():
     keys = itertools.product(range(4), range(4), ["a", "b", "1", "11", ""])
     draws = [first_draws(rng.generator_for(*key)) for key in keys]
     assert len(set(draws)) == len(draws)
@@ -28,7 +28,7 @@ def test_a_key_cannot_be_shifted_into_another():
     assert len({first_draws(rng.generator_for(*key)) for key in keys}) == len(keys)
 
 
-def test_neighbouring_seeds_are_uncorrelated():
+def test_neighboring_seeds_are_uncorrelated():
     draws = torch.stack([torch.rand(2000, generator=rng.generator_for(seed, 0, "s")) for seed in range(8)])
     correlation = torch.corrcoef(draws) - torch.eye(8)
     assert float(correlation.abs().max()) < 0.1  # 4.5 standard deviations of 1 / sqrt(2000)

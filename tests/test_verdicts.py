@@ -1,4 +1,4 @@
-"""One form for every judgement: verdicts in order, numbers with their limits, tables of limits that hold together."""
+"""One form for every judgment: verdicts in order, numbers with their limits, tables of limits that hold together."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ class CloudPair:
         if len(found.residual) < MIN_MATCHES:
             return None
         # Where each normal was measured: at the source point it would be off by the curvature in between, which looks
-        # like relief (a sphere's normals at neighbours do not meet in its centre).
+        # like relief (a sphere's normals at neighbors do not meet in its center).
         points = self.target[found.target_index].double()
         system = self.system(found, points, distance, pivot, self.noise(pose, distance))
         return solve_observable(system, num_open=num_open, max_feigned_share=max_feigned_share)

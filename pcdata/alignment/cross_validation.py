@@ -11,7 +11,7 @@ from torch import Tensor
 from pcdata.alignment.surfaces import Samples, Surface
 from pcdata.alignment.view_alignment import align_views, measure_pairs
 
-_BLOCK = 0.05  # metres: wider than the windows of neighbouring samples, narrower than most objects
+_BLOCK = 0.05  # metres: wider than the windows of neighboring samples, narrower than most objects
 _REACH = 0.03  # metres: partners farther apart than this, before or after, are not what they seem
 
 

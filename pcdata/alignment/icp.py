@@ -31,7 +31,7 @@ _NEAR = 3.0  # times the last distance
 _MIN_SUPPORT = 0.5  # most of what is near has to be on the surface
 _CHANCE = 0.5  # of the distance; evenly spread residuals have 1 / sqrt(3) = 0.58
 _NORMAL_RADIUS = 0.02  # metres for clouds in metres: a depth camera's noise at 1 m tilts such normals by 2 degrees
-_NORMAL_SPACINGS = 4.0  # times the median distance of neighbours: a dozen points on a surface
+_NORMAL_SPACINGS = 4.0  # times the median distance of neighbors: a dozen points on a surface
 _LEAST_WIDTH = 0.1  # of the last distance
 _MOST_OPEN = 3  # directions: a plane's, a sphere's
 
@@ -101,7 +101,7 @@ def icp_point_to_plane(
             Tukey's weight reaches 0. The spread of the residuals would be no good guide: on a table most of them are
             small however far the cloud slid along it, and would have the sides of the objects thrown out.
         max_normal_angle: in radians.
-        normal_radius: neighbourhood of the estimated normals, in the points' unit; None = 0.02, but no less than four
+        normal_radius: neighborhood of the estimated normals, in the points' unit; None = 0.02, but no less than four
             times the spacing of the points.
         max_iterations: per scale.
 
@@ -112,7 +112,7 @@ def icp_point_to_plane(
         TooFewPointsError: a cloud of fewer than 20 points, or fewer than 20 source points overlap the target at the
             start.
 
-    Source: Chen & Medioni, Object modelling by registration of multiple range images, 1992.
+    Source: Chen & Medioni, Object modeling by registration of multiple range images, 1992.
     """
     where = "icp_point_to_plane"
     _check_schedule(where, max_distances, kernel, scale, max_iterations)
@@ -239,7 +239,7 @@ def _judged(
 
 
 def _normals_of(where: str, name: str, points: Tensor, radius: float | None) -> Tensor:
-    """Estimate normals from neighbourhoods that hold enough points; without neighbours all would be (0, 0, 1)."""
+    """Estimate normals from neighborhoods that hold enough points; without neighbors all would be (0, 0, 1)."""
     distance = knn(points, k=3, queries=points)[1]  # to itself, the nearest, the next
     if radius is None:
         return estimate_normals(points, radius=max(_NORMAL_RADIUS, _NORMAL_SPACINGS * float(distance[:, 1].median())))
@@ -247,7 +247,7 @@ def _normals_of(where: str, name: str, points: Tensor, radius: float | None) -> 
     third = float(distance[:, 2].median())
     if third >= radius:
         raise ConfigError(
-            f"{where}: within normal_radius {radius:g} most points of the {name} have fewer than two neighbours, which "
+            f"{where}: within normal_radius {radius:g} most points of the {name} have fewer than two neighbors, which "
             f"give no normal; give more than {third:.3g}, None, or the normals themselves"
         )
     return estimate_normals(points, radius=radius)

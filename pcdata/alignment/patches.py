@@ -24,18 +24,18 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v, in the
 
 @dataclass(frozen=True, eq=False)
 class DepthPatches:
-    """A grid of patches 1/z = a + b u + c v + d u^2 + e u v + f v^2, u and v pixels from the centre of each."""
+    """A grid of patches 1/z = a + b u + c v + d u^2 + e u v + f v^2, u and v pixels from the center of each."""
 
     coefficients: Tensor  # (h, w, 6) float64, 1/metre
-    points: Tensor  # (h, w, 3) float64, where the ray of the window's centre meets the patch
-    normals: Tensor  # (h, w, 3) float64 unit, towards the camera, there
+    points: Tensor  # (h, w, 3) float64, where the ray of the window's center meets the patch
+    normals: Tensor  # (h, w, 3) float64 unit, toward the camera, there
     depth: Tensor  # (h, w) float64 of the points, 0 = the window holds no patch
     sigma: Tensor  # (h, w) float64 metres along the normal, of a patch whose pixels are its own; see fit_depth_patches
     normal_sigma: Tensor  # (h, w) float64 radians, standard deviation of the normal along each tangent
-    half: Tensor  # (h, w) int64 pixels from the centre to the rim of the window taken, 0 = none
+    half: Tensor  # (h, w) int64 pixels from the center to the rim of the window taken, 0 = none
     ray_steps: Tensor  # (h, w, 2, 2) float64, how (x/z, y/z) changes from one pixel to the next along u, and along v
-    first: int  # pixel coordinate of the first window's centre, both ways
-    stride: int  # pixels between centres
+    first: int  # pixel coordinate of the first window's center, both ways
+    stride: int  # pixels between centers
 
 
 def fit_depth_patches(
@@ -53,13 +53,13 @@ def fit_depth_patches(
     than 12 degrees.
 
     Windows overlap, so their patches share pixels; ``sigma`` is what a patch would have of the pixels nearer to its
-    centre than to any other, so that summing over patches counts every pixel once.
+    center than to any other, so that summing over patches counts every pixel once.
     """
     fx = float(intrinsics[0, 0])
     halves = sorted({max(_LEAST_HALF, round(tangent * fx)) for tangent in _HALF_WINDOWS})
     first = stride = halves[0]
     size = (depth.shape[0], depth.shape[1])
-    rays, steps = _rays_at_centres(intrinsics, size, distortion, first, stride)
+    rays, steps = _rays_at_centers(intrinsics, size, distortion, first, stride)
     taken = _fit(depth, halves[0], first, stride)
     holds = taken.holds
     floor = _FLOOR_ROUGHNESS * taken.coefficients[..., 0].square()
@@ -102,7 +102,7 @@ def patch_normals(
     plane: Tensor,  # (..., 3) float64: 1/z, and its derivatives by u and v
     rays: Tensor,  # (..., 3) float64: x/z, y/z, 1
     ray_steps: Tensor,  # (..., 2, 2) float64: the derivatives of x/z and y/z by u, and by v
-) -> Tensor:  # (..., 3) float64 unit, towards the camera
+) -> Tensor:  # (..., 3) float64 unit, toward the camera
     """Return the normals of surfaces X = ray / d from d and its derivatives: the cross product of dX/du and dX/dv."""
     d, by_u, by_v = plane[..., None].unbind(-2)
     along_u, along_v = torch.nn.functional.pad(ray_steps, (0, 1)).unbind(-2)
@@ -121,7 +121,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(depth: Tensor, half: int, first: int, stride: int) -> _Fit:
-    """Fit the windows that reach ``half`` pixels from their centres; pixels beyond the image have no reading."""
+    """Fit the windows that reach ``half`` pixels from their centers; pixels beyond the image have no reading."""
     valid = (depth > 0).double()
     inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0).double(), 0.0)
     weight = _window_moments(valid, half, first, stride, 4)
@@ -156,7 +156,7 @@ def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: i
     if height <= 2 * first or width <= 2 * first:
         down, across = (len(range(first, length - first, stride)) for length in (height, width))
         return image.new_zeros(down, across, degree + 1, degree + 1)
-    # Row i of the padded image is row i - half of the image: the window about centre c starts at row c.
+    # Row i of the padded image is row i - half of the image: the window about center c starts at row c.
     padded = torch.nn.functional.pad(image, (half,) * 4)[
         first : height - first + 2 * half, first : width - first + 2 * half
     ]
@@ -164,10 +164,10 @@ def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: i
     return (along_u.unfold(0, 2 * half + 1, stride) @ powers).transpose(-1, -2)
 
 
-def _rays_at_centres(
+def _rays_at_centers(
     intrinsics: Tensor, size: tuple[int, int], distortion: Tensor | None, first: int, stride: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the rays (h, w, 3) of the windows' centres and how they change from pixel to pixel (h, w, 2, 2)."""
+    """Return the rays (h, w, 3) of the windows' centers and how they change from pixel to pixel (h, w, 2, 2)."""
     rays = pixel_rays(intrinsics[None].double(), size, None if distortion is None else distortion[None].double())[0]
     rows, columns = (slice(first, max(length - first, first), stride) for length in size)
     by_v, by_u = torch.gradient(rays, dim=(0, 1)) if min(size) > 1 else (torch.zeros_like(rays),) * 2

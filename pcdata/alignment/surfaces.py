@@ -28,7 +28,7 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class _Matches:
     """Samples of another view that have a partner on this one; all in this view's frame."""
 
     row: Tensor  # (M,) int64 rows of the samples asked for
@@ -56,7 +56,7 @@ class Surface(Protocol):
         """Return the same surface with other samples."""
         ...
 
-    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> _Matches:
         """Compare samples (N, 3), given in this view's frame, with this surface."""
         ...
 
@@ -101,8 +101,8 @@ class DepthSurface:
         """Return the same surface with other samples."""
         return replace(self, samples=samples)
 
-    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
-        """Project samples into the image and measure them against the patch whose centre is nearest."""
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> _Matches:
+        """Project samples into the image and measure them against the patch whose center is nearest."""
         patches = self.patches
         pixels, z = project_points(
             points,
@@ -136,7 +136,7 @@ class DepthSurface:
             torch.tensor(max_angle, dtype=torch.float32, device="cpu")
         ).item()
         index = index[near]
-        return Matches(
+        return _Matches(
             rows[near],
             (normal * residual[:, None])[near],
             normal[near],
@@ -148,7 +148,7 @@ class DepthSurface:
 
 @dataclass(frozen=True, eq=False)
 class CloudSurface:
-    """A bare cloud: partners are nearest neighbours, and visibility is unknown."""
+    """A bare cloud: partners are nearest neighbors, and visibility is unknown."""
 
     patches: Samples  # the targets, denser than the samples
     samples: Samples
@@ -164,7 +164,7 @@ class CloudSurface:
         radius: float = 0.012,
         max_neighbors: int = 100,
     ) -> CloudSurface:
-        """Average the neighbourhoods of evenly spaced rows; four times as many patches as samples are kept."""
+        """Average the neighborhoods of evenly spaced rows; four times as many patches as samples are kept."""
         rows = evenly(torch.arange(len(points), dtype=torch.int64, device=points.device), 4 * max_samples)
         index, _, count = ball_query(points, radius=radius, max_neighbors=max_neighbors, queries=points[rows])
         enough = count >= 8
@@ -198,7 +198,7 @@ class CloudSurface:
         """Return the same surface with other samples."""
         return replace(self, samples=samples)
 
-    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> Matches:
+    def match(self, points: Tensor, normals: Tensor, *, max_distance: float, max_angle: float) -> _Matches:
         """Measure samples against the plane of the nearest patch; the side that a normal points to is ignored."""
         index, distance = knn(self.patches.points.float(), k=1, queries=points.float())
         rows = (distance[:, 0] < max_distance).nonzero().squeeze(1)
@@ -210,7 +210,7 @@ class CloudSurface:
         normal = torch.where(cosine[alike, None] < 0, -normal[alike], normal[alike])
         patches = self.patches
         offset = points[rows] - patches.points[index]
-        return Matches(rows, offset, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
+        return _Matches(rows, offset, normal, patches.sigma[index], patches.normal_sigma[index], len(points))
 
 
 def evenly(rows: Tensor, count: int) -> Tensor:

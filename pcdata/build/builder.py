@@ -69,7 +69,7 @@ def build_dataset(
 ) -> BuildReport:
     """Store every capture of a source as the pipeline's deterministic steps leave it.
 
-    The dataset appears under its name only when it is complete: everything is written to a hidden neighbour first, and
+    The dataset appears under its name only when it is complete: everything is written to a hidden neighbor first, and
     a failure removes that and leaves what was there before. Nothing is deleted that no build made: a folder that
     somebody else makes under the name meanwhile makes the build fail.
 

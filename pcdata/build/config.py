@@ -49,7 +49,7 @@ class Output(BaseModel):
 
     format: Format = "hdf5"
     compression: Compression = "none"  # lzf (hdf5) or gzip; reads are 2-4 times faster without
-    keep_raw: bool = False  # also deliver depth, colour and calibration beside the clouds
+    keep_raw: bool = False  # also deliver depth, color and calibration beside the clouds
 
 
 class Loader(BaseModel):

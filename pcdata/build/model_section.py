@@ -42,7 +42,7 @@ def stored_preset(made: Preset) -> Preset:
         ConfigError: the model takes depth images, or clouds with a point for every pixel.
     """
     is_image = made.contract.takes == "depth image"
-    if is_image or made.contract.main.content == "organised":
+    if is_image or made.contract.main.content == "organized":
         name = made.contract.name
         what = "depth images" if is_image else "clouds with a point for every pixel"
         raise ConfigError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcdata.errors import ConfigError, near_matches
 from pcdata.extras import require
 
-GreyImage = NDArray[np.uint8]  # (H, W)
+GrayImage = NDArray[np.uint8]  # (H, W)
 
 _SYNTAX = "chessboard:COLSxROWS:SQUARE or charuco:COLSxROWS:SQUARE:MARKER:DICT[:legacy]"
 _LARGEST_SQUARE = 1.0  # metres; "25" was meant as millimetres
@@ -25,15 +25,15 @@ class BoardView:
     """The corners of one board that were seen in one image."""
 
     board_points: NDArray[np.float64]  # (N, 3) metres on the board, z = 0
-    pixels: NDArray[np.float64]  # (N, 2) u, v; integers are pixel centres
+    pixels: NDArray[np.float64]  # (N, 2) u, v; integers are pixel centers
 
 
 class Board(ABC):
     """A flat pattern of known size; x runs along its columns, y along its rows, z into it."""
 
     @abstractmethod
-    def find(self, image: GreyImage) -> BoardView | None:
-        """Return the corners seen in a grey image, or None."""
+    def find(self, image: GrayImage) -> BoardView | None:
+        """Return the corners seen in a gray image, or None."""
 
     @abstractmethod
     def alternatives(self) -> list[tuple[Board, str]]:
@@ -55,7 +55,7 @@ class Chessboard(Board):
                 f"millimetres), got {self.cols}x{self.rows} and {self.square:g}"
             )
 
-    def find(self, image: GreyImage) -> BoardView | None:
+    def find(self, image: GrayImage) -> BoardView | None:
         """Return all corners, or None where one is missing.
 
         Source: Duda & Frese, "Accurate Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018.
@@ -69,7 +69,7 @@ class Chessboard(Board):
         points = np.stack([column, row, np.zeros_like(row)], axis=1) * self.square
         return BoardView(points.astype(np.float64), self._refined(cv2, image, corners))
 
-    def _refined(self, cv2: Any, image: GreyImage, corners: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _refined(self, cv2: Any, image: GrayImage, corners: NDArray[np.float32]) -> NDArray[np.float64]:
         """Move each corner to where the gradients around it point: halves the error in all but badly blurred images."""
         grid = corners.reshape(self.rows, self.cols, 2)
         spacing = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
@@ -108,8 +108,8 @@ class Charuco(Board):
                 f"(metres, not millimetres), got {self.cols}x{self.rows}, {self.square:g} and {self.marker:g}"
             )
 
-    def find(self, image: GreyImage) -> BoardView | None:
-        """Return the corners between recognised markers, or None where there are fewer than 6.
+    def find(self, image: GrayImage) -> BoardView | None:
+        """Return the corners between recognized markers, or None where there are fewer than 6.
 
         Raises:
             ConfigError: OpenCV has no such dictionary.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pcdata.calibration.boards import Board, BoardView, GreyImage
+from pcdata.calibration.boards import Board, BoardView, GrayImage
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
 from pcdata.structures import Camera
@@ -77,7 +77,7 @@ class IntrinsicsResult:
         )
 
 
-def find_board(images: Mapping[str, GreyImage], board: Board) -> tuple[dict[str, BoardView], tuple[int, int]]:
+def find_board(images: Mapping[str, GrayImage], board: Board) -> tuple[dict[str, BoardView], tuple[int, int]]:
     """Return the views in which the board was found, by image name, and the size (height, width) of all images.
 
     Raises:

@@ -59,7 +59,7 @@ def pairwise_motions(method: str, captures: Sequence[DepthFrame], pivot: Tensor)
 
 
 def _shared(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Keep the points that have a neighbour in the other cloud: far ones cost both libraries the most time."""
+    """Keep the points that have a neighbor in the other cloud: far ones cost both libraries the most time."""
     near_target = knn(target, k=1, queries=source)[1][:, 0] < _DISTANCES[0]
     near_source = knn(source, k=1, queries=target)[1][:, 0] < _DISTANCES[0]
     return source[near_target], target[near_source]

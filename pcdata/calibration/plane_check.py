@@ -68,7 +68,7 @@ class PlaneResult:
     num_readings: int  # in the region
     fill: float  # part of the region's pixels that have a reading
     inlier_share: float  # part of the readings on the plane; the rest is clutter or flying pixels
-    plane: tuple[float, float, float, float]  # unit normal towards the camera, offset; camera frame
+    plane: tuple[float, float, float, float]  # unit normal toward the camera, offset; camera frame
     plane_rms: float  # of the distances of the inliers to the plane
     depth_rms: float  # of their errors along z: what a sensor's noise model speaks of
     axis_distance: float  # camera to plane along the optical axis
@@ -103,7 +103,7 @@ def check_plane(
 
     Args:
         frame: one view.
-        roi: part of the image's width and height, about its centre, that is looked at.
+        roi: part of the image's width and height, about its center, that is looked at.
         distance: the known distance in metres, from the camera's depth origin (which lies behind the front glass: see
             the data sheet).
         along: how it was measured: ``axis`` along the optical axis, ``normal`` by the shortest way to the plane.
@@ -156,7 +156,7 @@ def check_plane(
 def fit_dominant_plane(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Return the (4,) float64 plane that most of the (N, 3) points scatter about, and which do (N,).
 
-    The normal points towards the origin.
+    The normal points toward the origin.
 
     Raises:
         NoPlaneError: they lie on a line.

@@ -65,7 +65,7 @@ class Refinement:
             camera = poses[name]
             if camera.fixed:
                 continue
-            to, entry = _edge_towards(calibration, self.frame_id, name)
+            to, entry = _edge_toward(calibration, self.frame_id, name)
             matrix = calibration.transform(to, self.frame_id) @ camera.world_from_camera
             evidence = Evidence(
                 method=f"pcdata calib refine, {self.method}, {self._fixed_name} fixed",
@@ -281,12 +281,12 @@ def _steps(calibration: Calibration, frame: str, camera: str) -> int:
     """Return how many transforms lie between a camera and the frame."""
     steps = 0
     while camera != frame:
-        camera, _ = _edge_towards(calibration, frame, camera)
+        camera, _ = _edge_toward(calibration, frame, camera)
         steps += 1
     return steps
 
 
-def _edge_towards(calibration: Calibration, frame: str, start: str) -> tuple[str, str]:
+def _edge_toward(calibration: Calibration, frame: str, start: str) -> tuple[str, str]:
     """Return the next frame on the way, and the name of the transform that leads there."""
     calibration.transform(frame, start)  # says what is missing
     for name in calibration.transforms:
@@ -301,7 +301,7 @@ def _edge_towards(calibration: Calibration, frame: str, start: str) -> tuple[str
         )
         if other == frame or _joined(rest, frame, other):
             return other, name
-    raise CalibrationError(f"refine: no transform leads from {start!r} towards {frame!r}")
+    raise CalibrationError(f"refine: no transform leads from {start!r} toward {frame!r}")
 
 
 def _joined(calibration: Calibration, to: str, from_: str) -> bool:

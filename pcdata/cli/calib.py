@@ -250,10 +250,10 @@ def _locator(arguments: argparse.Namespace) -> Callable[[Path], Any] | None:
 
 def _locate(path: Path, board: Board, camera: Any) -> Any:
     from pcdata.calibration import locate_board
-    from pcdata.calibration.board_images import read_grey
+    from pcdata.calibration.board_images import read_gray
     from pcdata.errors import CaptureError
 
-    image = read_grey(path)
+    image = read_gray(path)
     if image.shape != camera.size:
         raise CaptureError(
             f"{path}: is {image.shape[1]}x{image.shape[0]}, the camera {camera.size[1]}x{camera.size[0]}"

@@ -23,7 +23,7 @@ _DRAWN = {
     "RemoveRadiusOutliers": "voxels, outliers removed",
     "ClusterObjects": "table removed, objects found",
     "FarthestPointSample": "farthest point sample",
-    "NormalizeWorkspace": "normals, normalised",
+    "NormalizeWorkspace": "normals, normalized",
 }
 
 

@@ -55,7 +55,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
     ),
     "registered": (
         "--registered",
-        {"action": "store_const", "const": True, "help": "depth as the colour camera sees it, of realsense_bag"},
+        {"action": "store_const", "const": True, "help": "depth as the color camera sees it, of realsense_bag"},
     ),
     "labels_from": ("--labels-from", {"metavar": "COLUMN", "help": "column of cloud files that holds the labels"}),
     "links_to": (
@@ -64,7 +64,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
     ),
     "max_time_apart": (
         "--max-time-apart",
-        {"type": float, "metavar": "SECONDS", "help": "of depth and colour, of realsense_bag (default 0.034)"},
+        {"type": float, "metavar": "SECONDS", "help": "of depth and color, of realsense_bag (default 0.034)"},
     ),
 }
 _COMBINED = {  # combinator: what its flag makes of N captures; a test holds the table to the registry

@@ -26,7 +26,7 @@ Given = Path | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Episode:
+class _Episode:
     """T timesteps in order."""
 
     name: str
@@ -60,7 +60,7 @@ def episode_names(where: str, given: Given | None) -> list[str]:
     return names
 
 
-def read_episodes(where: str, given: Given, names: Sequence[str]) -> Iterator[Episode]:
+def read_episodes(where: str, given: Given, names: Sequence[str]) -> Iterator[_Episode]:
     """Yield the episodes of these names, one in memory at a time; all have states and actions of one width.
 
     Raises:
@@ -88,7 +88,7 @@ def read_episodes(where: str, given: Given, names: Sequence[str]) -> Iterator[Ep
                 raise ConfigError(
                     f"{place}: {key} has {numbers[key].shape[1]} columns, the episodes before have {width}"
                 )
-        yield Episode(name, tuple(samples.tolist()), **numbers)
+        yield _Episode(name, tuple(samples.tolist()), **numbers)
 
 
 def _numbers(place: str, key: str, value: Any, count: int) -> NDArray[np.float32]:

@@ -194,7 +194,7 @@ def _move(paths: Sequence[str], scratch: Path, folder: Path) -> None:
         with shielded():
             for number, path in enumerate(paths):
                 new, place = scratch / path, folder / path
-                if not new.exists():  # an item may do without, e.g. colour
+                if not new.exists():  # an item may do without, e.g. color
                     continue
                 place.parent.mkdir(parents=True, exist_ok=True)
                 if place.is_dir():  # a folder cannot be renamed onto one

@@ -1,4 +1,4 @@
-"""GG-CNN: depth as TIFF, colour and grasp rectangles, numbered and named as in the Cornell data set.
+"""GG-CNN: depth as TIFF, color and grasp rectangles, numbered and named as in the Cornell data set.
 
 Source: dougsm/ggcnn, ``utils/data/cornell_data.py``, ``utils/dataset_processing/grasp.py`` (load_from_cornell_file),
 ``utils/dataset_processing/image.py``.

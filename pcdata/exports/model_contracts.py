@@ -27,8 +27,8 @@ def require_cloud(where: str, target: Target, cloud: PointCloud, **choices: Any)
     made = contract(target.model, **choices)
     try:
         batch = batch_of([cloud], made, choices)
-        if "normalisation" in target.left_to_loader:
-            batch = replace(batch, steps=None)  # as from a file: not held to the centring in the frame's name
+        if "normalization" in target.left_to_loader:
+            batch = replace(batch, steps=None)  # as from a file: not held to the centering in the frame's name
         _require(where, target, batch)
     except ContractError:
         raise
@@ -50,7 +50,7 @@ def require_depth(where: str, target: Target, frame: DepthFrame) -> None:
 
 
 def require_image(where: str, target: Target, frame: DepthFrame) -> None:
-    """Refuse one view that ``check`` fails, for a loader that feeds depth images: its window, whole and normalised.
+    """Refuse one view that ``check`` fails, for a loader that feeds depth images: its window, whole and normalized.
 
     Raises:
         ContractError: every rule that failed, with what to do.

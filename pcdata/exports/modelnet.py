@@ -35,7 +35,7 @@ class ModelNet(Target):
     name: ClassVar[str] = "modelnet"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointnet2_cls"
-    left_to_loader: ClassVar[frozenset[str]] = frozenset({"count", "unit", "scale", "normalisation"})
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"count", "unit", "scale", "normalization"})
     layout: ClassVar[str] = "a text per shape: x,y,z,nx,ny,nz; modelnet40_train.txt, modelnet40_test.txt, shape names"
 
     table: Given | None = None

@@ -38,7 +38,7 @@ class Pointcept(Target):
     name: ClassVar[str] = "pointcept"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointcept"
-    left_to_loader: ClassVar[frozenset[str]] = frozenset({"normalisation", "duplicates"})
+    left_to_loader: ClassVar[frozenset[str]] = frozenset({"normalization", "duplicates"})
     layout: ClassVar[str] = "a folder per scene: coord, color, normal, segment, instance .npy"
 
     table: Given | None = None

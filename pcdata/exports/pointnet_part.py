@@ -71,7 +71,7 @@ class PointNetPart(PointNet):
         if low < 0 or high >= _MAX_PARTS:
             raise CaptureError(
                 f"{where}: labels must be part numbers 0 .. {_MAX_PARTS - 1} at every point, got {low} .. {high}; give "
-                "unlabelled points (-1) a part, or cut them away, and renumber, before 'pcdata build'"
+                "unlabeled points (-1) a part, or cut them away, and renumber, before 'pcdata build'"
             )
         for part in cloud.labels.unique().tolist():
             owner = class_of_part.setdefault(part, class_name)
@@ -85,7 +85,7 @@ class PointNetPart(PointNet):
         file["pid"][number] = cloud.labels.numpy()
 
     def write_names(self, folder: Path, classes: Sequence[str], class_of_part: Mapping[int, str]) -> None:
-        """Write categories, and for every part number its category and colour."""
+        """Write categories, and for every part number its category and color."""
         categories = "".join(f"{name}\t{name}\n" for name in classes)  # name and WordNet number, which the tree lacks
         (folder / "all_object_categories.txt").write_text(categories, encoding="utf-8")
         count = max(class_of_part) + 1

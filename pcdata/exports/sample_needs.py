@@ -55,8 +55,8 @@ def check_same_count(where: str, cloud: PointCloud, count: int) -> None:
 
 
 def check_channels(where: str, cloud: PointCloud, names: Sequence[str], instead: str = "") -> None:
-    """Require fields of the cloud such as colours; ``instead`` says how to do without."""
-    fixes = {"normals": "add EstimateNormals() to the pipeline", "colors": "build from captures with colour"}
+    """Require fields of the cloud such as colors; ``instead`` says how to do without."""
+    fixes = {"normals": "add EstimateNormals() to the pipeline", "colors": "build from captures with color"}
     for name in names:
         if name not in cloud.fields():
             fix = fixes.get(name, "build from captures that have them")
@@ -93,9 +93,9 @@ def check_size(where: str, frame: DepthFrame, size: tuple[int, int], reason: str
 
 
 def colors_of(where: str, frame: DepthFrame, instead: str = "") -> NDArray[np.uint8]:  # (H, W, 3) RGB
-    """Return the colours of the one view, which must be there."""
+    """Return the colors of the one view, which must be there."""
     if frame.colors is None:
-        raise CaptureError(f"{where}: the loader needs colour, the capture has none; record colour{instead}")
+        raise CaptureError(f"{where}: the loader needs color, the capture has none; record color{instead}")
     array: NDArray[np.uint8] = frame.colors[0].numpy()
     return array
 

@@ -19,7 +19,7 @@ from pcdata.errors import CaptureError
 _SMALL = 1 << 16  # bytes: reading so many again takes no longer than to open the file
 
 
-class State(NamedTuple):
+class _State(NamedTuple):
     """What a file is compared by."""
 
     size: int
@@ -31,7 +31,7 @@ class Inputs:
     """Files by absolute path, and the state in which each was first read."""
 
     def __init__(self) -> None:
-        self._first: dict[str, State] = {}
+        self._first: dict[str, _State] = {}
         self._unchecked: list[str] = []
 
     def note(self, path: str | os.PathLike[str], file: BinaryIO) -> None:
@@ -63,7 +63,7 @@ class Inputs:
         """
         self._check(where, self._first)
 
-    def _check(self, where: str, names: list[str] | dict[str, State]) -> None:
+    def _check(self, where: str, names: list[str] | dict[str, _State]) -> None:
         for name in names:
             try:
                 changed = not _is_unchanged(name, self._first[name])
@@ -98,16 +98,16 @@ def note_input(path: str | os.PathLike[str], file: BinaryIO) -> None:
         inputs.note(path, file)
 
 
-def _state(file: BinaryIO) -> State:
+def _state(file: BinaryIO) -> _State:
     status = os.fstat(file.fileno())
     digest = None
     if status.st_size <= _SMALL:
         digest = hashlib.sha256(file.read(_SMALL + 1)).digest()
         file.seek(0)
-    return State(status.st_size, (status.st_mtime_ns, status.st_ino), digest)
+    return _State(status.st_size, (status.st_mtime_ns, status.st_ino), digest)
 
 
-def _is_unchanged(name: str, first: State) -> bool:
+def _is_unchanged(name: str, first: _State) -> bool:
     status = os.stat(name)
     if status.st_size != first.size or not stat.S_ISREG(status.st_mode):
         return False

@@ -77,19 +77,19 @@ def scratch_beside(folder: Path, *, alone: bool = False, note: Note = silent) ->
 
 
 def hidden_name(folder: Path, what: str) -> str:
-    """Return a new name for a hidden neighbour of a folder; it says who made it, and when."""
+    """Return a new name for a hidden neighbor of a folder; it says who made it, and when."""
     return f"{_prefix(folder, what)}{platform.node()}-{os.getpid()}-{time.time_ns():x}{uuid.uuid4().hex[:4]}"
 
 
 def retired_of(folder: Path) -> list[Path]:
     """Return what killed overwrites of a folder had set aside, the newest first."""
     with suppress(OSError):
-        return sorted(hidden_neighbours(folder, RETIRED), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+        return sorted(hidden_neighbors(folder, RETIRED), key=lambda path: path.stat().st_mtime_ns, reverse=True)
     return []
 
 
-def hidden_neighbours(folder: Path, what: str) -> list[Path]:
-    """Return the hidden neighbours of one kind that a folder has."""
+def hidden_neighbors(folder: Path, what: str) -> list[Path]:
+    """Return the hidden neighbors of one kind that a folder has."""
     return sorted(folder.parent.glob(glob.escape(_prefix(folder, what)) + "*"))
 
 
@@ -101,7 +101,7 @@ def _prefix(folder: Path, what: str) -> str:
 def _settle_others(folder: Path, own: Path, alone: bool, note: Note) -> None:
     """Remove what dead processes left; refuse to be the second writer where only one may be."""
     try:
-        others = [path for path in hidden_neighbours(folder, PARTIAL) if path != own]
+        others = [path for path in hidden_neighbors(folder, PARTIAL) if path != own]
     except OSError:  # a folder that may be written but not listed
         return
     for other in others:

@@ -19,7 +19,7 @@ from pcdata.files.scratch import (
     RETIRED,
     Note,
     hidden_name,
-    hidden_neighbours,
+    hidden_neighbors,
     retired_of,
     scratch_beside,
     silent,
@@ -39,7 +39,7 @@ def never_owned(folder: Path) -> None:
 def complete_or_nothing(
     folder: Path, *, overwrite: bool = False, owned: Owned = never_owned, note: Note = silent
 ) -> Iterator[Path]:
-    """Give a hidden neighbour to write into; rename it into place at the end, remove it on any failure.
+    """Give a hidden neighbor to write into; rename it into place at the end, remove it on any failure.
 
     Args:
         folder: the name that the new folder gets; nothing or an empty folder may be there.
@@ -84,7 +84,7 @@ def restore_retired(folder: Path, owned: Owned, note: Note) -> None:
                 ) from error
             note(f"restored {folder}, which a killed overwrite had set aside as {retired.name}")
     with suppress(OSError):  # a folder that may be written but not listed
-        for old in retired_of(folder) + hidden_neighbours(folder, REPLACED):
+        for old in retired_of(folder) + hidden_neighbors(folder, REPLACED):
             try:
                 remove_owned(old, owned)
             except (CacheError, OSError) as error:

@@ -2,8 +2,8 @@
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
 decimated, resized and filled depth, disparity, Chamfer distance. None flow through decisions (indices, masks, labels,
-planes, sizes, the neighbours and distances of a search), nor through estimated normals, ``register_depth``,
-``spatial_filter`` and TSDF volumes. The distance of neighbours with a gradient is that of the rows that a search named.
+planes, sizes, the neighbors and distances of a search), nor through estimated normals, ``register_depth``,
+``spatial_filter`` and TSDF volumes. The distance of neighbors with a gradient is that of the rows that a search named.
 """
 
 from pcdata.functional.clusters import dbscan

@@ -68,7 +68,7 @@ def _order(squared: Tensor, row: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class _Pairs:
     """Some queries of one cloud with all points of that cloud."""
 
     query: Tensor  # (m,) int64, rows of the queries
@@ -76,14 +76,14 @@ class Pairs:
     squared: Tensor  # (m, n) float32
 
 
-def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor) -> Iterator[Pairs]:
+def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor) -> Iterator[_Pairs]:
     """Yield all pairs of a query and a point of the same cloud; each query is in one chunk."""
     for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):
         row = torch.arange(start, stop, dtype=torch.int64, device=points.device)
         at_once = max(1, _PAIRS // max(1, stop - start))
         for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(at_once):
             if len(query):
-                yield Pairs(query, row, squared_distance(queries[query, None], points[start:stop]))
+                yield _Pairs(query, row, squared_distance(queries[query, None], points[start:stop]))
 
 
 def squared_distance(a: Tensor, b: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Masks of stray points, with Open3D's semantics so that the masks can be compared exactly.
 
 Source: Open3D ``PointCloud.remove_statistical_outlier`` and ``remove_radius_outlier`` (legacy geometry), whose edge
-cases were found by experiment; Rusu et al., Towards 3D point cloud based object maps, RAS 2008.
+cases were found by experiment; Rusu et al., Toward 3D point cloud based object maps, RAS 2008.
 """
 
 from __future__ import annotations

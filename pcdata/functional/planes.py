@@ -145,7 +145,7 @@ def ransac_plane(
     longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
-    The normal points along ``up`` when given, else towards the origin, where the sensor is (d >= 0). A plane nearer to
+    The normal points along ``up`` when given, else toward the origin, where the sensor is (d >= 0). A plane nearer to
     the origin than ``distance`` has no such side: its normal's largest component is positive; noise does not decide.
 
     Args:
@@ -294,13 +294,13 @@ def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple
 
 
 def _face(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
-    """Turn the normals along ``up``, else towards an origin off the plane, else the largest component is positive."""
+    """Turn the normals along ``up``, else toward an origin off the plane, else the largest component is positive."""
     normals, offset = planes[:, :3], planes[:, 3]
     along_up = torch.zeros_like(offset) if ups is None else torch.linalg.vecdot(normals, ups)
-    towards_origin = torch.where(through_origin(planes, distance), 0.0, offset)
+    toward_origin = torch.where(through_origin(planes, distance), 0.0, offset)
     largest = normals.gather(1, normals.abs().argmax(1, keepdim=True)).squeeze(1)
     sign = torch.zeros_like(offset)
-    for deciding in (along_up, towards_origin, largest):
+    for deciding in (along_up, toward_origin, largest):
         sign = torch.where(sign == 0, deciding.sign(), sign)
     return torch.where((sign < 0)[:, None], -planes, planes)
 

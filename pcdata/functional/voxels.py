@@ -30,7 +30,7 @@ from pcdata.functional.rows import (
 # Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
 # A sum fits 63 bits for up to 2^32 points.
 _FIXED_POINT = 2.0**31
-# Beyond this, float64 no longer tells neighbouring voxels apart.
+# Beyond this, float64 no longer tells neighboring voxels apart.
 _MAX_VOXELS_PER_AXIS = 2.0**53
 # find_voxel_size stops when the bracket is this tight; 25 halvings away from a bracket of one octave.
 SIZE_TOLERANCE = 1e-6
@@ -127,7 +127,7 @@ def voxel_mean(
     inverse: Tensor,  # (N,) int64, as voxel_downsample returns it
     num_voxels: int,
 ) -> Tensor:  # (M, C) in the dtype of the values
-    """Average rows per voxel (colours, features), summed in float64; 0 for an empty voxel.
+    """Average rows per voxel (colors, features), summed in float64; 0 for an empty voxel.
 
     Raises:
         DTypeError: integers, which have no mean (labels vote: :func:`voxel_majority`).

@@ -1,6 +1,6 @@
-"""The OpenCV lens model: bending normalised image coordinates, and bending them back.
+"""The OpenCV lens model: bending normalized image coordinates, and bending them back.
 
-Normalised coordinates are (x/z, y/z) of a point in the camera frame. Coefficients come in OpenCV's order,
+Normalized coordinates are (x/z, y/z) of a point in the camera frame. Coefficients come in OpenCV's order,
 ``k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]``: 4, 5, 8 or 12 of them.
 
 Source: OpenCV calib3d, "Detailed description"; the radial part is Brown (1966), the quotient Claus & Fitzgibbon (2005).
@@ -18,7 +18,7 @@ from pcdata.errors import CaptureError, ShapeError
 
 COEFFICIENT_COUNTS = (4, 5, 8, 12)
 
-# Normalised units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
+# Normalized units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
 _CONVERGED = 1e-12
 # Newton needs 4 to 6 steps on real lenses; only pixels beside the fold of the model, where it slows down, need more.
 _MAX_STEPS = 60
@@ -68,12 +68,12 @@ def check_distortion(where: str, distortion: Tensor) -> None:
 
 
 def distort_normalized(
-    xy: Tensor,  # (V, ..., 2) normalised coordinates of undistorted rays
+    xy: Tensor,  # (V, ..., 2) normalized coordinates of undistorted rays
     distortion: Tensor,  # (V, D)
 ) -> Tensor:  # (V, ..., 2) float64
-    """Bend normalised coordinates as each view's lens does (the forward model).
+    """Bend normalized coordinates as each view's lens does (the forward model).
 
-    Coordinates beyond :func:`fold_radius` come out too, folded back towards the image as the polynomial has it; whoever
+    Coordinates beyond :func:`fold_radius` come out too, folded back toward the image as the polynomial has it; whoever
     projects points must reject them.
 
     Raises:
@@ -86,7 +86,7 @@ def distort_normalized(
 
 
 def undistort_normalized(
-    xy: Tensor,  # (V, ..., 2) normalised coordinates as seen in the image
+    xy: Tensor,  # (V, ..., 2) normalized coordinates as seen in the image
     distortion: Tensor,  # (V, D)
 ) -> Tensor:  # (V, ..., 2) float64
     """Invert :func:`distort_normalized` to 1e-12; NaN where the lens model has no inverse.
@@ -104,7 +104,7 @@ def undistort_normalized(
         solved = torch.empty_like(target)
         for view, coefficients in enumerate(distortion):
             fold = float(fold_radius(coefficients[None]))
-            split = _split(_without_cancelled_poles(coefficients)[None], 1)
+            split = _split(_without_canceled_poles(coefficients)[None], 1)
             for begin in range(0, target.shape[1], _CHUNK):
                 some = slice(begin, begin + _CHUNK)
                 solved[view, some] = _invert(target[view, some], split, fold)
@@ -116,7 +116,7 @@ def undistort_normalized(
 def _with_gradient(solved: Tensor, target: Tensor, distortion: Tensor) -> Tensor:
     """Attach the inverse function's derivative to its values (V, P, 2): that of one Newton step at the solution."""
     known = ~solved.isnan().any(-1, keepdim=True)
-    at = torch.where(known, solved, 0.0)  # the centre of the image stands in where there is no solution
+    at = torch.where(known, solved, 0.0)  # the center of the image stands in where there is no solution
     x, y = at.unbind(-1)
     coefficients = _split(distortion, 2)
     with torch.no_grad():
@@ -130,7 +130,7 @@ def _with_gradient(solved: Tensor, target: Tensor, distortion: Tensor) -> Tensor
 
 
 def fold_radius(distortion: Tensor) -> Tensor:
-    """Return (V,) float64: the normalised radius at which each view's radial model stops growing, or infinity.
+    """Return (V,) float64: the normalized radius at which each view's radial model stops growing, or infinity.
 
     It is the first zero of d(r N/D)/dr, or the first pole that no zero cancels; with t = r^2 both are polynomials in t.
     """
@@ -145,7 +145,7 @@ def fold_radius(distortion: Tensor) -> Tensor:
 
 
 def _radial_parts(coefficients: Tensor) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:
-    """Return numerator and denominator of one view's radial quotient in t = r^2, without cancelled poles."""
+    """Return numerator and denominator of one view's radial quotient in t = r^2, without canceled poles."""
     k1, k2, _, _, k3, k4, k5, k6 = _padded(coefficients)[:8].tolist()
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
     denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
@@ -157,7 +157,7 @@ def _radial_parts(coefficients: Tensor) -> tuple[np.polynomial.Polynomial, np.po
     return numerator, denominator
 
 
-def _without_cancelled_poles(coefficients: Tensor) -> Tensor:
+def _without_canceled_poles(coefficients: Tensor) -> Tensor:
     """Return (12,) float64 coefficients of the same lens whose radial quotient is reduced."""
     reduced = _padded(coefficients)
     for part, places in zip(_radial_parts(coefficients), ([0, 1, 4], [5, 6, 7])):

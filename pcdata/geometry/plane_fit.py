@@ -40,15 +40,15 @@ def fit_plane(points: Tensor) -> Tensor | None:
     if len(points) < 3:
         return None
     wide = points.double()
-    centre = wide.mean(dim=0)
-    centred = wide - centre
-    moments = centre.cpu(), ((centred.T @ centred) / len(points)).cpu(), wide.abs().max().cpu()
+    center = wide.mean(dim=0)
+    centered = wide - center
+    moments = center.cpu(), ((centered.T @ centered) / len(points)).cpu(), wide.abs().max().cpu()
     plane = plane_of_moments(*(moment[None] for moment in moments))[0]
     return None if bool(plane[0].isnan()) else plane
 
 
 def plane_of_moments(
-    centre: Tensor,  # (B, 3) float64
+    center: Tensor,  # (B, 3) float64
     covariance: Tensor,  # (B, 3, 3) float64
     largest: Tensor,  # (B,) absolute coordinate
 ) -> Tensor:  # (B, 4) float64
@@ -57,7 +57,7 @@ def plane_of_moments(
     on_line = variance[:, 1].clamp(min=0).sqrt() <= _flat_height(largest)
     normal = directions[:, :, 0]
     # Three products added in one order, whatever library multiplies matrices here.
-    x, y, z = (normal * centre).unbind(1)
+    x, y, z = (normal * center).unbind(1)
     planes = torch.cat([normal, -((x + z) + y)[:, None]], dim=1)
     return planes.masked_fill(on_line[:, None], torch.nan)
 

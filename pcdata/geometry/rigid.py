@@ -42,7 +42,7 @@ def rotation_about_axis(axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return (..., 3, 3) float64 rotations from (..., 4) quaternions in (x, y, z, w) order, normalised first.
+    """Return (..., 3, 3) float64 rotations from (..., 4) quaternions in (x, y, z, w) order, normalized first.
 
     Raises:
         PoseError: a quaternion of length 0, or not finite.

@@ -57,7 +57,7 @@ def plane_system(
 ) -> PlaneSystem:
     """Build the 6x6 normal equations of moving the points onto the planes.
 
-    Source: Chen & Medioni, Object modelling by registration of multiple range images, 1992; Low, Linear least-squares
+    Source: Chen & Medioni, Object modeling by registration of multiple range images, 1992; Low, Linear least-squares
     optimization for point-to-plane ICP surface registration, 2004.
     """
     arm = points - pivot
@@ -76,9 +76,9 @@ def solve_observable(
 ) -> TwistSolution:
     """Solve for the twist that brings the residuals to 0, leaving alone what the surfaces do not determine.
 
-    Directions are the generalised eigenvectors of (feigned, information + feigned), so neither the unit of length nor
+    Directions are the generalized eigenvectors of (feigned, information + feigned), so neither the unit of length nor
     the choice between rotation and translation matters. A direction of which more than a quarter is feigned is
-    unobservable: a plane slides along itself, a sphere turns about its centre. ``unobservable`` lists the most feigned
+    unobservable: a plane slides along itself, a sphere turns about its center. ``unobservable`` lists the most feigned
     first. Where it is known otherwise, ``num_open`` says how many of the most feigned directions are left alone.
 
     Source: the degeneracy test of Zhang, Kaess & Singh, On degeneracy of optimization-based state estimation problems,
@@ -131,7 +131,7 @@ def motion_from_twist(twist: Tensor, pivot: Tensor) -> Tensor:  # (..., 6), (3,)
 def motion_along(twist: Tensor, pivot: Tensor) -> Tensor:  # (6,), (3,) -> (4, 4) float64
     """Return the motion that goes along one screw: the exponential of the twist, whose turning carries its shift along.
 
-    Small twists give what :func:`motion_from_twist` gives. Far along, a sphere that turns about its centre stays where
+    Small twists give what :func:`motion_from_twist` gives. Far along, a sphere that turns about its center stays where
     it is only this way, whatever the pivot.
     """
     x, y, z = twist[:3].double().tolist()

@@ -199,5 +199,5 @@ _MAKERS = {
 
 
 def is_camera(chosen: ModelContract) -> bool:
-    """Whether the coordinates before centring are the camera's own, z forward."""
+    """Whether the coordinates before centering are the camera's own, z forward."""
     return chosen.frame == CAMERA_FRAME

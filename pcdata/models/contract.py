@@ -17,7 +17,7 @@ Sampler = Literal["none", "random", "random with replacement", "farthest point"]
 class Role(str, Enum):
     """What a channel means; it decides which values are sane."""
 
-    POSITION = "position"  # metres, or normalised coordinates
+    POSITION = "position"  # metres, or normalized coordinates
     COLOR = "color"
     DIRECTION = "direction"  # unit vectors
     DEPTH = "depth"  # of an image
@@ -26,7 +26,7 @@ class Role(str, Enum):
 
 @dataclass(frozen=True)
 class Channel:
-    """Neighbouring columns of a tensor that mean one thing."""
+    """Neighboring columns of a tensor that mean one thing."""
 
     name: str  # unique among all contracts for one meaning; COLUMNS of pcdata.models.model_tensors computes it
     width: int = 3
@@ -98,10 +98,10 @@ class ModelContract:
         voxel_count: where voxel is None: the size is found that leaves so many, cloud by cloud.
         voxel_rule: which point stands for a voxel.
         crop_before_voxels: whether the crop comes before the voxels.
-        centring: where the origin is put.
+        centering: where the origin is put.
         scaling: what the coordinates are divided by.
-        normalise: whether clouds are normalized before or after sampling.
-        crop: smallest and largest x, y, z, in the contract's frame before centring.
+        normalize: whether clouds are normalized before or after sampling.
+        crop: smallest and largest x, y, z, in the contract's frame before centering.
         crop_is_open: the crop must be chosen: a box, or None for no crop.
         column: edge length of a random column of the scene, metres.
         window: (height, width) cut from the middle of the image, before it is resized.
@@ -139,9 +139,9 @@ class ModelContract:
     voxel_rule: Literal["mean", "first", "random"] = "mean"
     crop_before_voxels: bool = True
 
-    centring: Literal["none", "mean", "corner", "floor"] = "none"
+    centering: Literal["none", "mean", "corner", "floor"] = "none"
     scaling: Literal["none", "unit sphere"] = "none"
-    normalise: Literal["before sampling", "after sampling"] = "after sampling"
+    normalize: Literal["before sampling", "after sampling"] = "after sampling"
     crop: tuple[Vec3, Vec3] | None = None
     crop_is_open: bool = False
     column: float | None = None
@@ -176,7 +176,7 @@ class ModelContract:
         frame = f"{self.frame}_half_turn" if self.half_turn else self.frame
         if self.scaling != "none":  # NormalizeUnitSphere changes the unit, and keeps the frame's name
             return frame
-        return frame + {"none": "", "mean": "/centered", "corner": "/corner", "floor": "/floor"}[self.centring]
+        return frame + {"none": "", "mean": "/centered", "corner": "/corner", "floor": "/floor"}[self.centering]
 
     def unit_of_tensors(self) -> str:
         """METRE or NORMALIZED."""

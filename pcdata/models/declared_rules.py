@@ -81,12 +81,12 @@ def _frame(batch: ModelBatch, contract: ModelContract) -> Finding:
             found="",
             if_fault=Verdict.UNKNOWN,
         )
-    # Files that others wrote do not say whether they are centred: there the values decide, under normalisation.
+    # Files that others wrote do not say whether they are centered: there the values decide, under normalization.
     whole = batch.steps is not None
     ours, theirs = (batch.frame_id, wanted) if whole else (batch.frame_id.split("/")[0], wanted.split("/")[0])
     fault = "" if ours == theirs else f"the data are in {ours!r}, the model works in {theirs!r}"
     steps = [f"ToFrame(frame={contract.frame!r})"] if ours.split("/")[0] != theirs.split("/")[0] else []
-    steps += ["the preset's centring"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
+    steps += ["the preset's centering"] if ours.split("/")[1:] != theirs.split("/")[1:] else []
     return ruled(
         "frame", fault, f"add {' and '.join(steps)}, or use the preset. {contract.wrong_frame}", found=batch.frame_id
     )
@@ -100,7 +100,7 @@ def _unit(batch: ModelBatch, contract: ModelContract) -> Finding:
         )
     fault = "" if batch.unit == wanted else f"the data are in {batch.unit!r}, the model takes {wanted!r}"
     advice = (
-        "remove the normalisation: the model's radii are in metres"
+        "remove the normalization: the model's radii are in metres"
         if wanted == METRE
         else "add NormalizeUnitSphere where the preset has it"
     )

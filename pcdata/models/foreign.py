@@ -123,7 +123,7 @@ def _check_lengths(arrays: Mapping[str, StoredArray], lengths: Mapping[str, tupl
 def _columns_of(contract: ModelContract, keys: Mapping[str, str]) -> dict[str, tuple[InputTensor, dict[str, Channel]]]:
     """Return tensor key -> its contract and, by role, the channels that the given arrays fill.
 
-    The first tensor has the geometry; of the others, those that hold nothing but colours and normals can be made too.
+    The first tensor has the geometry; of the others, those that hold nothing but colors and normals can be made too.
     """
     plan = {}
     left = set(keys)
@@ -142,7 +142,7 @@ def _columns_of(contract: ModelContract, keys: Mapping[str, str]) -> dict[str, t
 def _joined(
     plan: Mapping[str, tuple[InputTensor, Mapping[str, Channel]]], parts: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[str, ...]]]:
-    """Join points, colours and normals of one sample in the order of each tensor's channels, in its layout."""
+    """Join points, colors and normals of one sample in the order of each tensor's channels, in its layout."""
     whole, channels = {}, {}
     for key, (spec, given) in plan.items():
         rows = np.concatenate([parts[role] for role in given], axis=-1)
@@ -151,7 +151,7 @@ def _joined(
         elif spec.axes[0] == "B":
             rows = rows[None]
         whole[key] = rows
-        # DP3 and others store points and colours in one array: that is more columns than the name says.
+        # DP3 and others store points and colors in one array: that is more columns than the name says.
         known = rows.shape[spec.axes.index("C")] != spec.width or len(given) == len(spec.channels)
         if known:
             channels[key] = tuple(channel.name for channel in given.values())

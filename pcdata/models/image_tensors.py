@@ -26,7 +26,7 @@ def image_tensor(frames: Sequence[DepthFrame], contract: ModelContract, tensor: 
     Raises:
         ShapeError: another image size than the network's.
         NoReadingError: holes are left in the depth.
-        DTypeError: no colours where the network takes some.
+        DTypeError: no colors where the network takes some.
     """
     for frame in frames:
         _check_frame(frame, contract)
@@ -62,7 +62,7 @@ def _relative(frames: Sequence[DepthFrame], contract: ModelContract) -> Tensor:
 def _rgb_minus_mean(frames: Sequence[DepthFrame], contract: ModelContract) -> Tensor:
     images = [frame.colors for frame in frames]
     if any(image is None for image in images):
-        raise CaptureError(f"{contract.name}: takes colours and a capture has none")
+        raise CaptureError(f"{contract.name}: takes colors and a capture has none")
     colors = torch.cat([image for image in images if image is not None]).permute(0, 3, 1, 2).float() / 255.0
     return colors - colors.mean(dim=(1, 2, 3), keepdim=True)
 

@@ -15,7 +15,7 @@ from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import PointCloud
 from pcdata.transforms.voxel_sample import voxel_cells
 
-# torchvision's: the colours that ImageNet backbones were trained with.
+# torchvision's: the colors that ImageNet backbones were trained with.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_STD = (0.229, 0.224, 0.225)
 
@@ -62,7 +62,7 @@ def _category(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) 
 
 
 def _cells_of_batch(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
-    """(S, 4) int32: the cloud's number and its cell, cut towards zero as RISE's cast does, from float64 as there."""
+    """(S, 4) int32: the cloud's number and its cell, cut toward zero as RISE's cast does, from float64 as there."""
     cells = (clouds.points.double() / _CELL).to(torch.int32)
     return torch.cat([cloud_of_rows(clouds.ptr)[:, None].to(torch.int32), cells], dim=1)
 
@@ -104,11 +104,11 @@ def _voxel_grid(clouds: PointCloud, contract: ModelContract, tensor: InputTensor
     return grid
 
 
-def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
+def _organized(clouds: PointCloud, contract: ModelContract, tensor: InputTensor) -> Tensor:
     """(B, V, C, H, W): every point back at its pixel, 0 where there was no reading."""
     if clouds.layout is None or clouds.source_index is None:
         raise ShapeError(
-            f"{contract.name}: takes organised clouds, one point per pixel; these have no pixels: give depth images, "
+            f"{contract.name}: takes organized clouds, one point per pixel; these have no pixels: give depth images, "
             "not cloud files, and remove the steps that sample, merge or average points"
         )
     height, width = clouds.layout.size
@@ -123,14 +123,14 @@ def _organised(clouds: PointCloud, contract: ModelContract, tensor: InputTensor)
 
 
 def _xyz_in_frame(clouds: PointCloud, contract: ModelContract) -> Tensor:
-    """The points before centring, in the contract's frame."""
+    """The points before centering, in the contract's frame."""
     return transform_points(clouds.points, clouds.ptr, clouds.frame_from_cloud(contract.frame))
 
 
 def _colors(clouds: PointCloud, contract: ModelContract) -> Tensor:
     if clouds.colors is None:
         raise DTypeError(
-            f"{contract.name}: takes colours and the cloud has none; give captures with colour, or leave the channel "
+            f"{contract.name}: takes colors and the cloud has none; give captures with color, or leave the channel "
             "out where it is optional (channels=...)"
         )
     return clouds.colors
@@ -148,7 +148,7 @@ def _imagenet(clouds: PointCloud, contract: ModelContract) -> Tensor:
 
 
 def _xyz_column(clouds: PointCloud, contract: ModelContract) -> Tensor:
-    """The points with x and y from the column's centre; z stays."""
+    """The points with x and y from the column's center; z stays."""
     shift = _meta_rows(clouds, contract, "column_center")
     return clouds.points - shift * shift.new_tensor([1.0, 1.0, 0.0])
 
@@ -186,5 +186,5 @@ PACKERS: dict[str, Callable[[PointCloud, ModelContract, InputTensor], Tensor]] =
     "grid_cells": _grid_cells,
     "offset": _offset,
     "voxel_grid": _voxel_grid,
-    "organised": _organised,
+    "organized": _organized,
 }

@@ -41,10 +41,10 @@ def index_page() -> str:
     """Return the list of all models as Markdown."""
     rows = [
         f"| [{one.name}]({one.name}.md) | {one.title} | {one.frame or 'to choose'} | {_count(one)} | "
-        f"{_normalised(one)} |"
+        f"{_normalized(one)} |"
         for one in CONTRACTS.values()
     ]
-    head = "| preset | model | frame | points | normalisation |\n|---|---|---|---|---|"
+    head = "| preset | model | frame | points | normalization |\n|---|---|---|---|---|"
     return (
         "# Models\n\nWhat each model takes, read from its own code; the pages are made from `pcdata/models/tables`.\n\n"
         "`preset(name, ...)` gives the pipeline and the collate function that end in the model's tensors; what\n"
@@ -60,13 +60,13 @@ def _table(contract: ModelContract) -> str:
     rows = {
         "frame": contract.frame or "the model leaves it open: choose `frame`",
         "axes": contract.axes,
-        "unit": "m" if contract.scaling == "none" else "normalised",
+        "unit": "m" if contract.scaling == "none" else "normalized",
         "depth": "all" if contract.far is None else f"up to {contract.far:g} m",
         "points per cloud": _count(contract),
         "sampler": " or ".join([contract.sampler, *contract.samplers]),
         "short clouds": _short(contract),
         "voxels": _voxels(contract),
-        "centring and scaling": _normalised(contract),
+        "centering and scaling": _normalized(contract),
         "crop": _crop(contract),
         "table": {"kept": "kept", "removed": "removed: one object", "open": "left to you"}[contract.table],
     }
@@ -148,17 +148,17 @@ def _short(contract: ModelContract) -> str:
     return words[contract.pad]
 
 
-def _normalised(contract: ModelContract) -> str:
+def _normalized(contract: ModelContract) -> str:
     if contract.scaling != "none":
-        return f"mean to the origin, farthest point to 1; {contract.normalise}"
-    if contract.centring == "none":
+        return f"mean to the origin, farthest point to 1; {contract.normalize}"
+    if contract.centering == "none":
         return "none"
     where = {
         "mean": "mean to the origin",
         "corner": "lowest corner to the origin",
         "floor": "middle of the floor to it",
     }
-    return f"{where[contract.centring]}; {contract.normalise}"
+    return f"{where[contract.centering]}; {contract.normalize}"
 
 
 def _crop(contract: ModelContract) -> str:

@@ -36,7 +36,7 @@ def to_source(
 ) -> Predictions:
     """Move predictions from the coordinates of the clouds they were made on to the source frame, in metres.
 
-    A normalisation's scale moves points and grasp widths, never rotations; directions come back with unit length. For
+    A normalization's scale moves points and grasp widths, never rotations; directions come back with unit length. For
     one cloud the axis B may be left out of the input; the result has it.
 
     Points alone come back from a cloud that was scaled differently along its axes (NormalizeWorkspace): there a tangent
@@ -145,7 +145,7 @@ def _move_directions(matrix: Tensor, directions: Tensor) -> Tensor:
     if not _is_similarity(linear):
         raise PoseError(
             "directions: the cloud was scaled differently along its axes, under which a tangent and a normal that are "
-            "one vector part; give two points of a tangent (points=), or normalise by NormalizeUnitSphere"
+            "one vector part; give two points of a tangent (points=), or normalize by NormalizeUnitSphere"
         )
     length = directions.norm(dim=-1, keepdim=True)
     if bool((length == 0).any()):

@@ -37,7 +37,7 @@ def pipeline_of(contract: ModelContract, *, merge_views: bool) -> Compose:
     if contract.takes == "depth image":
         return Compose(_image_steps(contract))
     depth: list[Transform] = [Deproject()]
-    if contract.image_size is not None:  # organised clouds
+    if contract.image_size is not None:  # organized clouds
         depth = [ResizeDepth(size=contract.image_size), Deproject()]
     if contract.far is not None:
         depth = [MaskDepth(far=contract.far, use_mask=False), *depth]
@@ -59,13 +59,13 @@ def _cloud_steps(contract: ModelContract, merge_views: bool) -> list[Transform]:
     steps: list[Transform] = []
     if not is_camera(contract):
         steps.append(ToFrame(frame=contract.frame))
-        if merge_views and contract.main.content != "organised":
+        if merge_views and contract.main.content != "organized":
             steps.append(MergeViews())
-    if contract.main.content == "organised":  # a crop would be holes; the model keeps every pixel
+    if contract.main.content == "organized":  # a crop would be holes; the model keeps every pixel
         return steps
     crop = _crop(contract)
     voxels = _voxels(contract)
-    shift = [ShiftToOrigin(anchor=contract.centring)] if contract.centring in ("corner", "floor") else []
+    shift = [ShiftToOrigin(anchor=contract.centering)] if contract.centering in ("corner", "floor") else []
     if contract.crop_before_voxels:
         steps += [*crop, *shift, *voxels]
     else:
@@ -74,10 +74,10 @@ def _cloud_steps(contract: ModelContract, merge_views: bool) -> list[Transform]:
         steps.append(EstimateNormals())
     if contract.half_turn:
         steps.append(ToFrame(frame=f"{CAMERA_FRAME}_half_turn", start=CAMERA_FRAME, matrix=_HALF_TURN))
-    normalise, sample = _normalise(contract), _sample(contract)
-    if contract.normalise == "before sampling":
-        return [*steps, *normalise, *sample]
-    return [*steps, *sample, *normalise]
+    normalize, sample = _normalize(contract), _sample(contract)
+    if contract.normalize == "before sampling":
+        return [*steps, *normalize, *sample]
+    return [*steps, *sample, *normalize]
 
 
 def _crop(contract: ModelContract) -> list[Transform]:
@@ -106,7 +106,7 @@ def _sample(contract: ModelContract) -> list[Transform]:
     return [*column, RandomSample(num_points=contract.count, if_short=contract.pad, with_replacement=replace)]
 
 
-def _normalise(contract: ModelContract) -> list[Transform]:
+def _normalize(contract: ModelContract) -> list[Transform]:
     if contract.scaling == "unit sphere":
         return [NormalizeUnitSphere()]
-    return [Center()] if contract.centring == "mean" else []
+    return [Center()] if contract.centering == "mean" else []

@@ -1,4 +1,4 @@
-"""Rules that read the values: ranges, scale, normalisation, crop, duplicates, the table."""
+"""Rules that read the values: ranges, scale, normalization, crop, duplicates, the table."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from pcdata.verdicts import Finding, Verdict, graded
 EXTENT = (0.005, WIDEST)
 
 _STRAY = 0.01  # share of values that sensor noise may put outside a crop or behind the camera
-_TOLERANCE = 1e-3  # of a normalised coordinate
+_TOLERANCE = 1e-3  # of a normalized coordinate
 _PLANE_SAMPLE = 2000  # points that the search for a table looks at
 _OBJECT_STEPS = {"RemovePlane", "ClusterObjects", "SplitObjects"}
 
-# Of colours by their extremes: the encodings that they can have, narrowest first.
+# Of colors by their extremes: the encodings that they can have, narrowest first.
 _ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.118, 2.6401), "rgb_255": (0.0, 255.0)}
 
 
@@ -46,17 +46,17 @@ def value_checks(batch: ModelBatch, contract: ModelContract) -> Iterator[Finding
         return
     if contract.takes == "depth image":
         yield _image_scale(batch[contract.main.key], contract)
-        yield _image_normalisation(batch[contract.main.key], contract)
+        yield _image_normalization(batch[contract.main.key], contract)
         return
     clouds = [cloud for cloud in positions(batch, contract) if len(cloud)]
     if not clouds:
         yield ruled("scale", "there are no points", "check crop and frame", found="")
         return
     yield _scale(clouds, contract)
-    yield _normalisation(clouds, contract)
-    if is_camera(contract) and not contract.half_turn and contract.centring == "none":
+    yield _normalization(clouds, contract)
+    if is_camera(contract) and not contract.half_turn and contract.centering == "none":
         yield _in_front(clouds)
-    if contract.crop is not None and contract.centring == "none":
+    if contract.crop is not None and contract.centering == "none":
         yield _crop(clouds, contract)
     yield _duplicates(clouds, contract)
     yield _table(batch, clouds, contract)
@@ -83,7 +83,7 @@ def positions(batch: ModelBatch, contract: ModelContract) -> list[Tensor]:
     for one in tensor.movedim(spec.axes.index("C"), -1).flatten(1, -2):
         if spec.content == "voxel_grid":
             one = one[one[:, -1] > 0]
-        elif spec.content == "organised" or contract.pad == "zeros":
+        elif spec.content == "organized" or contract.pad == "zeros":
             one = one[(one[:, :3] != 0).any(dim=1)]
         clouds.append(one[:, :3].float())
     return clouds
@@ -131,14 +131,14 @@ def _range_fault(values: Tensor, channel: Channel) -> str:
 
 
 def _encoding_fault(values: Tensor, channel: Channel, said: str) -> str:
-    """Find colours that fit another, narrower encoding: nobody's picture is that dark."""
+    """Find colors that fit another, narrower encoding: nobody's picture is that dark."""
     if channel.name == "rgb_minus_mean":
         return f"{channel.name} has the mean {float(values.mean()):.2g}, not 0" if abs(values.mean()) > 0.05 else ""
     used = values[(values != 0).any(dim=1)]  # rows that only fill the tensor say nothing
     lowest, highest = (float(used.min()), float(used.max())) if len(used) else (0.0, 0.0)
     fitting = [name for name, (low, high) in _ENCODINGS.items() if low - 1e-3 <= lowest and highest <= high + 1e-3]
     if channel.name in _ENCODINGS and fitting and fitting[0] == "rgb" and channel.name != "rgb" and highest > lowest:
-        return f"{said}: these look like colours in [0, 1], the model takes {channel.name}"
+        return f"{said}: these look like colors in [0, 1], the model takes {channel.name}"
     return ""
 
 
@@ -148,7 +148,7 @@ def _scale(clouds: list[Tensor], contract: ModelContract) -> Finding:
     found = f"the clouds are {low:.3g} to {high:.3g} long"
     if contract.unit_of_tensors() != METRE:
         fault = found if high > 2 + _TOLERANCE or low < 0.1 else ""
-        return ruled("scale", fault, "normalise as the preset does: the longest side is at most 2", found=found)
+        return ruled("scale", fault, "normalize as the preset does: the longest side is at most 2", found=found)
     fault = found if low < EXTENT[0] or high > EXTENT[1] else ""
     fitting = [f"by {unit:g} if they are {name}" for name, unit in plausible_units(high).items() if unit < 1]
     hint = f"multiply the coordinates {' or '.join(fitting) or 'by their unit'}, where they are read or before"
@@ -156,41 +156,41 @@ def _scale(clouds: list[Tensor], contract: ModelContract) -> Finding:
     return ruled("scale", fault, f"the model works in metres: {hint}", found=f"{found}, in metres")
 
 
-def _normalisation(clouds: list[Tensor], contract: ModelContract) -> Finding:
-    faults = [fault for cloud in clouds if (fault := _normalisation_fault(cloud, contract))]
-    rule = {"none": "not centred", "mean": "mean at the origin", "corner": "corner at the origin", "floor": "on z = 0"}
-    wanted = rule[contract.centring] + (", farthest point at 1" if contract.scaling != "none" else "")
-    if contract.centring != "none":
-        wanted += f", {contract.normalise}"
+def _normalization(clouds: list[Tensor], contract: ModelContract) -> Finding:
+    faults = [fault for cloud in clouds if (fault := _normalization_fault(cloud, contract))]
+    rule = {"none": "not centered", "mean": "mean at the origin", "corner": "corner at the origin", "floor": "on z = 0"}
+    wanted = rule[contract.centering] + (", farthest point at 1" if contract.scaling != "none" else "")
+    if contract.centering != "none":
+        wanted += f", {contract.normalize}"
     advice = f"the model takes clouds that are: {wanted}; follow the preset's order of steps"
-    return ruled("normalisation", faults[0] if faults else "", advice, found=wanted)
+    return ruled("normalization", faults[0] if faults else "", advice, found=wanted)
 
 
-def _normalisation_fault(cloud: Tensor, contract: ModelContract) -> str:
+def _normalization_fault(cloud: Tensor, contract: ModelContract) -> str:
     mean, lower, upper = cloud.double().mean(0), cloud.amin(0), cloud.amax(0)
     extent = max(float((upper - lower).max()), 1e-12)
     offset = float(mean.norm())
-    exact = contract.normalise == "after sampling"
+    exact = contract.normalize == "after sampling"
     if contract.scaling != "none":
         radius = float(cloud.norm(dim=1).max())
         good = abs(radius - 1) <= _TOLERANCE if exact else 0.5 <= radius <= 1 + _TOLERANCE
         if not good or offset > (_TOLERANCE if exact else 0.25):
             return f"mean at {offset:.3g} from the origin, farthest point at {radius:.3g}"
         return ""
-    if contract.centring == "mean":
+    if contract.centering == "mean":
         limit = _TOLERANCE * extent if exact else 0.1 * extent
         return f"the mean is {offset:.3g} from the origin" if offset > limit else ""
-    if contract.centring in ("corner", "floor"):
+    if contract.centering in ("corner", "floor"):
         # A sampled cloud may miss its lowest points, so only what lies below is sure to be wrong.
         if float(lower[2]) < -_TOLERANCE:
             return f"the lowest point is at z = {float(lower[2]):.3g}, not on the floor"
         middle = (lower + upper)[:2].abs().max() / 2
-        if contract.centring == "floor" and float(middle) > 0.1 * extent + _TOLERANCE:
+        if contract.centering == "floor" and float(middle) > 0.1 * extent + _TOLERANCE:
             return f"the middle of the box is {float(middle):.3g} from the origin in x or y"
         half = None if contract.column is None else contract.column / 2
         if half is not None and float(cloud[:, :2].abs().max()) > half + _TOLERANCE:
             return (
-                f"x and y reach {float(cloud[:, :2].abs().max()):.3g} from the column's centre, at most {half:g} fits"
+                f"x and y reach {float(cloud[:, :2].abs().max()):.3g} from the column's center, at most {half:g} fits"
             )
         return ""
     return "the mean is at the origin: it was subtracted" if offset < 1e-5 * extent else ""
@@ -284,17 +284,17 @@ def _image_scale(images: Tensor, contract: ModelContract) -> Finding:
     return ruled("scale", fault, "the model takes metres", found=f"the median depth is {middle:.3g} m")
 
 
-def _image_normalisation(images: Tensor, contract: ModelContract) -> Finding:
+def _image_normalization(images: Tensor, contract: ModelContract) -> Finding:
     channel = contract.main.channels[0]
     depth = channel_values(images, contract.main, channel)
     if channel.name == "depth_relative":
         offset = float(depth.reshape(len(images), -1).mean(dim=1).abs().max())
         return graded(
-            "normalisation",
+            "normalization",
             offset,
             limits=(0.1, 0.5),
             found=f"the mean of an image is at most {offset:.3g} from 0",
             advice="subtract the image's mean, then clip to [-1, 1]; a far background shifts the mean",
         )
     fault = "there are depths of 0 or less" if float(depth.min()) <= 0 else ""
-    return ruled("normalisation", fault, "give plain metres: the network subtracts by itself", found="plain metres")
+    return ruled("normalization", fault, "give plain metres: the network subtracts by itself", found="plain metres")

@@ -30,7 +30,7 @@ def save_pipeline_figure(
     Args:
         path: the PNG file.
         capture: of depth images the first view is drawn; a capture that is a cloud is drawn as one.
-        stages: (caption, cloud) in order; drawn in the camera's colours, by object once clustered, by normal at last.
+        stages: (caption, cloud) in order; drawn in the camera's colors, by object once clustered, by normal at last.
         title: printed above all.
 
     Raises:
@@ -62,7 +62,7 @@ def save_pipeline_figure(
 
 
 def _draw_colors(axis: Any, capture: DepthFrame) -> None:
-    axis.set_title(f"colour, view 1 of {capture.num_views}")
+    axis.set_title(f"color, view 1 of {capture.num_views}")
     axis.set_axis_off()
     if capture.colors is not None:
         axis.imshow(capture.colors[0].cpu().numpy())
@@ -125,7 +125,7 @@ def _view_axes(frame_id: str) -> torch.Tensor:
 
 
 def _point_colors(cloud: PointCloud) -> np.ndarray:
-    """Colour by normal where there are normals, by object once they were clustered, else by the camera's colours."""
+    """Color by normal where there are normals, by object once they were clustered, else by the camera's colors."""
     from matplotlib.colors import to_rgb
 
     if cloud.normals is not None:

@@ -1,4 +1,4 @@
-"""How a sensor's depth error grows with distance: two formulas cover the sensors in the catalogue."""
+"""How a sensor's depth error grows with distance: two formulas cover the sensors in the catalog."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ class SensorProfile:
     """What one depth sensor, in one mode, is known to do; depths in metres along the optical axis.
 
     The thresholds are derived, never tuned: from the noise (standard deviation sigma at that depth) and the pitch (the
-    distance of neighbouring points on a surface facing the sensor). The difference of two readings has a standard
+    distance of neighboring points on a surface facing the sensor). The difference of two readings has a standard
     deviation of sqrt(2) sigma.
 
     Args:
@@ -31,7 +31,7 @@ class SensorProfile:
         size: (height, width) pixels of the mode described; lidar: channels, firings per turn.
         field_of_view: degrees, (vertical, horizontal).
         focal: pixels, nominal, of the mode described; None = not a pinhole camera.
-        angular_step: degrees between neighbouring rays, (vertical, horizontal); lidar only.
+        angular_step: degrees between neighboring rays, (vertical, horizontal); lidar only.
         metres_per_unit: lengths that one stored depth unit is known to have, the default first.
         range: metres, (near, far), where the maker states it works well.
         depth_step: metres: the depth image's own step, on top of the noise.
@@ -57,8 +57,8 @@ class SensorProfile:
         return tuple(name for name, source in self.sources.items() if source.startswith("estimate"))
 
     @property
-    def is_organised(self) -> bool:
-        """Whether its captures are depth images of a pinhole camera; a spinning lidar gives unorganised points."""
+    def is_organized(self) -> bool:
+        """Whether its captures are depth images of a pinhole camera; a spinning lidar gives unorganized points."""
         return self.focal is not None
 
     @property
@@ -76,7 +76,7 @@ class SensorProfile:
         return self.noise.sigma(depth, focal or self.focal or 1.0)
 
     def pitch_at(self, depth: Depth, *, focal: float | None = None) -> Depth:
-        """Return the distance in metres of neighbouring points on a surface that faces the sensor at this depth.
+        """Return the distance in metres of neighboring points on a surface that faces the sensor at this depth.
 
         A lidar's rays are closer together along a turn than between channels: the wider of the two counts.
         """
@@ -85,7 +85,7 @@ class SensorProfile:
         return depth * (1.0 / (focal or self.focal or 1.0))
 
     def outlier_radius(self, depth: float) -> float:
-        """Return the radius in metres within which a surface point has neighbours in spite of noise.
+        """Return the radius in metres within which a surface point has neighbors in spite of noise.
 
         Three pitches along the surface (28 points when it faces the sensor, 14 when it is tilted by 60 degrees) and
         three standard deviations of the difference of two readings across it.
@@ -93,7 +93,7 @@ class SensorProfile:
         return math.hypot(_SIGMAS * self.pitch_at(depth), _SIGMAS * math.sqrt(2.0) * self.noise_at(depth))
 
     def edge_threshold(self, depth: Depth, *, focal: float | None = None) -> Depth:
-        """Return the depth difference of neighbouring pixels, in metres, above which they lie on two surfaces.
+        """Return the depth difference of neighboring pixels, in metres, above which they lie on two surfaces.
 
         What a surface tilted by 80 degrees steps from pixel to pixel, three standard deviations of the difference of
         two readings, and the rounding of both.

@@ -159,10 +159,10 @@ class Calibration:
         waiting = deque([from_])
         while waiting and to not in reached:
             frame = waiting.popleft()
-            for neighbour, matrix, forward in steps.get(frame, ()):
-                if neighbour not in reached:
-                    reached[neighbour] = (matrix if forward else rigid.invert_rigid(matrix)) @ reached[frame]
-                    waiting.append(neighbour)
+            for neighbor, matrix, forward in steps.get(frame, ()):
+                if neighbor not in reached:
+                    reached[neighbor] = (matrix if forward else rigid.invert_rigid(matrix)) @ reached[frame]
+                    waiting.append(neighbor)
         if to not in reached:
             raise FrameError(
                 f"Calibration: nothing joins {to!r} and {from_!r}; from {from_!r} one gets to "
@@ -187,7 +187,7 @@ class Calibration:
         return kept if evidence is None else {**kept, name: evidence}
 
     def _steps(self) -> dict[str, list[tuple[str, Tensor, bool]]]:
-        """Return for each frame its neighbours, the entry between the two, and whether it leads to the neighbour."""
+        """Return for each frame its neighbors, the entry between the two, and whether it leads to the neighbor."""
         steps: dict[str, list[tuple[str, Tensor, bool]]] = {}
         for name, matrix in self.transforms.items():
             to, from_ = FramePair.parse(name)

@@ -22,7 +22,7 @@ MOST_OFF_CENTER = 0.075
 class Camera(Structure):
     """V >= 1 pinhole cameras of one image size.
 
-    Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) with integer coordinates is the centre of that pixel,
+    Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) with integer coordinates is the center of that pixel,
     so an image spans -0.5 .. width-0.5. The intrinsics belong to the stream that the depth is registered to.
 
     Args:
@@ -97,7 +97,7 @@ class Camera(Structure):
     def resized(self, size: tuple[int, int]) -> Camera:
         """Return the camera of the same image sampled at another (height, width).
 
-        Pixel centres are at integers, so c' = (c + 0.5) s - 0.5, not c s.
+        Pixel centers are at integers, so c' = (c + 0.5) s - 0.5, not c s.
         """
         scale_v, scale_u = size[0] / self.size[0], size[1] / self.size[1]
         intrinsics = self.intrinsics.clone()

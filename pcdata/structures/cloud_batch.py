@@ -25,7 +25,7 @@ class CloudBatch(Structure):
 
     Args:
         frame_id: the coordinate frame, e.g. "camera", "base".
-        unit: "m", or "normalized" after a normalisation.
+        unit: "m", or "normalized" after a normalization.
         kinds: the kind of every extra field.
         viewpoint: (B, 3) float32 where the sensor stood; per point: extra["viewpoint"].
         source_from_cloud: (B, 4, 4) float64, back to source_frame in metres.
@@ -81,7 +81,7 @@ class CloudBatch(Structure):
             start, stop, step = clouds.indices(self.num_clouds)
             if step != 1 or stop <= start:
                 raise OutOfRangeError(
-                    f"{name}[...]: a slice must name at least one cloud of {self.num_clouds}, and neighbours, got "
+                    f"{name}[...]: a slice must name at least one cloud of {self.num_clouds}, and neighbors, got "
                     f"{clouds.start}:{clouds.stop}:{clouds.step}"
                 )
             return slice(start, stop)

@@ -24,18 +24,18 @@ def register_to_color(
     *,
     max_jump: float = 0.02,
 ) -> DepthFrame:
-    """Return the capture as the colour camera sees it: its image, its intrinsics, and the depth registered to it.
+    """Return the capture as the color camera sees it: its image, its intrinsics, and the depth registered to it.
 
     Every image follows the depth: a pixel takes the label, confidence and mask of the reading it shows, and -1, 0 and
-    False where it shows none. A surface that only the colour camera sees has colour and no depth; one that only the
-    depth camera sees is dropped, so none takes the colour of what stands before it. The pose becomes that of the colour
+    False where it shows none. A surface that only the color camera sees has color and no depth; one that only the
+    depth camera sees is dropped, so none takes the color of what stands before it. The pose becomes that of the color
     camera.
 
     Args:
-        frame: the depth camera's capture; colours it may have are dropped.
-        colors: the colour image of every view.
+        frame: the depth camera's capture; colors it may have are dropped.
+        colors: the color image of every view.
         color_camera: V cameras, or one for all views.
-        color_from_depth: colour camera from depth camera, one or one per view.
+        color_from_depth: color camera from depth camera, one or one per view.
         max_jump: what counts as one surface, see :func:`pcdata.functional.register_depth`.
 
     Raises:
@@ -51,7 +51,7 @@ def register_to_color(
     cameras = _per_view(color_camera, frame.num_views)
     if tuple(colors.shape[1:3]) != cameras.size:
         raise ShapeError(
-            f"{where}: colors are {tuple(colors.shape[1:3])} but the colour camera describes {cameras.size}; rescale "
+            f"{where}: colors are {tuple(colors.shape[1:3])} but the color camera describes {cameras.size}; rescale "
             "it with Camera.resized"
         )
     motion = color_from_depth.double().expand(frame.num_views, 4, 4).to(frame.device)

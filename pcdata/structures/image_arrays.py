@@ -60,7 +60,7 @@ def _way_out(name: str, given: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     if given[-3:] == (height, width, 4):
         return "drop the alpha channel: color[..., :3]"
     if given[-2:] == (height, width):
-        return "a grey image has no colors: leave it out"
+        return "a gray image has no colors: leave it out"
     return "color is RGB at the depth's pixels: let the camera's driver align it to the depth, or leave it out"
 
 

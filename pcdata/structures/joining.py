@@ -45,7 +45,7 @@ def _check_joinable(first: CloudBatch, other: CloudBatch, position: int) -> None
     if first.unit != other.unit:
         raise UnitError(
             f"PointCloud.cat: cloud {position} has unit {other.unit!r} but cloud 0 has {first.unit!r}; "
-            "normalise both or neither"
+            "normalize both or neither"
         )
     here, there = first.source_from_cloud.device, other.source_from_cloud.device
     if here != there:

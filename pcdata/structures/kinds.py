@@ -83,7 +83,7 @@ class Kind(str, Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class KindRow:
+class _KindRow:
     """All that clouds know about one kind of field; a file keeps the kind's name."""
 
     holds: str  # what its values must be, in words
@@ -98,7 +98,7 @@ class KindRow:
 
 
 KINDS = {
-    Kind.POSITION: KindRow(
+    Kind.POSITION: _KindRow(
         holds="float (N, 3)",
         moves="by the 4x4",
         averages="the mean",
@@ -109,7 +109,7 @@ KINDS = {
         padding=_zero,
         is_length=True,
     ),
-    Kind.DIRECTION: KindRow(
+    Kind.DIRECTION: _KindRow(
         holds="float (N, 3)",
         moves="by the inverse transpose, back to unit length",
         averages="the mean, back to unit length",
@@ -119,7 +119,7 @@ KINDS = {
         average=voxel_mean_direction,
         padding=_zero,
     ),
-    Kind.INVARIANT: KindRow(
+    Kind.INVARIANT: _KindRow(
         holds="numbers (N, ...)",
         moves="not at all",
         averages="of floats the mean; of integers a vote, the lowest of equals: an integer is never averaged",
@@ -128,7 +128,7 @@ KINDS = {
         average=_mean_or_vote,
         padding=_no_number,
     ),
-    Kind.MINIMUM: KindRow(
+    Kind.MINIMUM: _KindRow(
         holds="integers (N, ...)",
         moves="not at all",
         averages="the lowest",
@@ -147,7 +147,7 @@ def kinds_table() -> str:
 
 
 @dataclass(frozen=True)
-class PointField:
+class _PointField:
     """A field that every cloud may have: its kind, its contract, and how it is averaged where not as its kind."""
 
     kind: Kind
@@ -156,11 +156,11 @@ class PointField:
 
 
 FIELDS = {
-    "points": PointField(Kind.POSITION, "N 3"),
-    "colors": PointField(Kind.INVARIANT, "N 3"),
-    "normals": PointField(Kind.DIRECTION, "N 3"),
-    "labels": PointField(Kind.INVARIANT, "N : int64"),
-    "source_index": PointField(Kind.INVARIANT, "N : int64", average=_first),  # a place, of which there is no majority
+    "points": _PointField(Kind.POSITION, "N 3"),
+    "colors": _PointField(Kind.INVARIANT, "N 3"),
+    "normals": _PointField(Kind.DIRECTION, "N 3"),
+    "labels": _PointField(Kind.INVARIANT, "N : int64"),
+    "source_index": _PointField(Kind.INVARIANT, "N : int64", average=_first),  # a place, of which there is no majority
 }
 
 

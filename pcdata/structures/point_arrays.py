@@ -13,7 +13,7 @@ from pcdata.contracts.lengths import check_metres, ways, width_of_points
 from pcdata.errors import CaptureError, DTypeError, NonFiniteError, ShapeError, UnitError, near_matches
 from pcdata.structures.kinds import FIELDS, KINDS, METRE, Kind, attributes, kind_of
 
-_ROUNDED = 1e-5  # that a float colour may lie above 1
+_ROUNDED = 1e-5  # that a float color may lie above 1
 _FINEST = 5e-4  # metres that storing float64 coordinates as float32 may move a point
 _COLUMNS = {"colors": (3,), "normals": (3,), "labels": (), "source_index": ()}  # of one row
 # What torch can hold and compute with; unsigned integers go to the next wider signed type.
@@ -53,7 +53,7 @@ def unit_colors(where: str, rgb: NDArray[Any]) -> NDArray[np.float32]:
     if rgb.dtype.kind == "u" and rgb.dtype.itemsize == 2:
         return (rgb / np.float32(65535)).astype(np.float32)
     raise CaptureError(
-        f"{where}: colours must be whole numbers in 0..255 or unsigned 16 bits, or floats in 0..1, got {rgb.dtype} "
+        f"{where}: colors must be whole numbers in 0..255 or unsigned 16 bits, or floats in 0..1, got {rgb.dtype} "
         f"{low:g} .. {high:g}; rescale them when exporting"
     )
 
@@ -169,7 +169,7 @@ def _point_tensors(
 def _metres_per_unit(
     where: str, xyz: NDArray[Any], stated: float | None, unit: str, viewpoint: ArrayLike | None
 ) -> float:
-    """Return the factor that brings (N, 3) coordinates to metres, or to what a normalisation left: 1.
+    """Return the factor that brings (N, 3) coordinates to metres, or to what a normalization left: 1.
 
     Raises:
         UnitError: whole numbers without a unit, or coordinates that do not look like metres.

@@ -89,7 +89,7 @@ class TSDFVolume:
     def integrate(self, frame: DepthFrame) -> None:
         """Average every view of a capture into the field.
 
-        The first frame decides whether the volume holds colours and labels, and the coordinate frame; those that follow
+        The first frame decides whether the volume holds colors and labels, and the coordinate frame; those that follow
         must agree. A frame that is refused leaves the volume as it was.
 
         Raises:
@@ -170,8 +170,8 @@ class TSDFVolume:
         if self.blocks is not None and self._planes_of(frame) != self.blocks.planes:
             had, has = self.blocks.planes, self._planes_of(frame)
             raise CaptureError(
-                f"TSDFVolume: every frame needs the images of the first, which had colours: {had.colors}, labels: "
-                f"{had.labels}; {frame!r} has colours: {has.colors}, labels: {has.labels}"
+                f"TSDFVolume: every frame needs the images of the first, which had colors: {had.colors}, labels: "
+                f"{had.labels}; {frame!r} has colors: {has.colors}, labels: {has.labels}"
             )
         if frame.labels is not None and not tsdf.fit_labels(frame.labels):
             raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
@@ -214,7 +214,7 @@ class TSDFVolume:
     def extract_points(self, *, min_weight: float = 0.0) -> PointCloud:
         """Return the points where the field crosses zero along the edges of its grid.
 
-        They carry normals out of the surface, colours and labels where the frames had them, and
+        They carry normals out of the surface, colors and labels where the frames had them, and
         ``extra["num_views"]`` and ``extra["weight"]``, of the edge's end that was seen less; views that wear it away
         count too. The label is the one that most views gave if more than half did. The history says what ``min_weight``
         dropped.

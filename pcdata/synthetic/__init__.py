@@ -1,4 +1,4 @@
-"""A small tabletop world, ray-cast analytically: depth, colour, labels, normals and poses with known truth."""
+"""A small tabletop world, ray-cast analytically: depth, color, labels, normals and poses with known truth."""
 
 from pcdata.synthetic.noise import SensorNoise
 from pcdata.synthetic.shapes import Box, Cylinder, Shape, Sphere

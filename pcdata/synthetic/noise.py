@@ -31,7 +31,7 @@ class SensorNoise:
     depth_step: float = 0.001  # metres: the unit of the depth image on the wire
     min_range: float = 0.2  # metres; nearer reads 0
     max_range: float = 6.0  # metres; farther reads 0
-    edge_jump: float = 0.02  # neighbours whose depths differ by more than this part of the nearer one form an edge
+    edge_jump: float = 0.02  # neighbors whose depths differ by more than this part of the nearer one form an edge
     edge_dropout: float = 0.4  # probability that a pixel at an edge reads 0
     dropout: float = 0.005  # probability that any pixel reads 0
     flying_pixels: float = 0.1  # probability that a pixel at an edge reads a mixture of both sides
@@ -87,7 +87,7 @@ class SensorNoise:
         return torch.where(outside, 0.0, reading).float()
 
     def edges(self, depth: Tensor, across: Tensor) -> Tensor:
-        """Find both sides of every jump: (V, H, W) bool from depths and those of the neighbours that differ most."""
+        """Find both sides of every jump: (V, H, W) bool from depths and those of the neighbors that differ most."""
         return (across - depth).abs() > self.edge_jump * torch.minimum(depth, across)
 
 

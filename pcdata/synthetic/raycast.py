@@ -1,4 +1,4 @@
-"""Rays through pixel centres, and the first solid each of them meets."""
+"""Rays through pixel centers, and the first solid each of them meets."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Hits(NamedTuple):
     """What N rays met first."""
 
     distance: Tensor  # (N,) float64, in units of each ray's direction, inf = nothing
-    normals: Tensor  # (N, 3) float64 unit, base frame, towards the ray's origin; zero where nothing was met
+    normals: Tensor  # (N, 3) float64 unit, base frame, toward the ray's origin; zero where nothing was met
     shape_index: Tensor  # (N,) int64 into the list of shapes, -1 = nothing
 
 
 def ray_directions(camera: Camera) -> Tensor:  # (V, H, W, 3) float64
-    """Return the ray through every pixel centre in its camera's frame, with z = 1.
+    """Return the ray through every pixel center in its camera's frame, with z = 1.
 
     A point at ``t`` times this direction therefore has z-depth exactly ``t``. Pixels that a distorting lens cannot
     have lit are NaN, and meet nothing.

@@ -25,7 +25,7 @@ PALETTE: tuple[Color, ...] = (  # linear RGB
 
 
 def make_table() -> Box:
-    """Return the table, label 0: its top is the plane z = 0, centred on the origin."""
+    """Return the table, label 0: its top is the plane z = 0, centered on the origin."""
     return Box(base_from_object=_at(0.0, 0.0, -TABLE_SIZE[2] / 2), size=TABLE_SIZE, label=0, pattern="wood")
 
 
@@ -62,7 +62,7 @@ def place_objects(seed: int, num_objects: int) -> tuple[Shape, ...]:
 
 
 def _random_shape(kind: int, label: int, color: Color, generator: Generator) -> tuple[Shape, float, float]:
-    """Draw a shape about the origin; also the radius of its footprint and how high its centre rests."""
+    """Draw a shape about the origin; also the radius of its footprint and how high its center rests."""
     a, b, c, yaw, flip = torch.rand(5, generator=generator, dtype=torch.float64, device="cpu").tolist()
     turned = _turned((0.0, 0.0, 1.0), 2.0 * math.pi * yaw)
     if kind == 0:

@@ -1,4 +1,4 @@
-"""Colours for the picture: procedural materials, one soft sun, contact shade. Nothing measured depends on this file."""
+"""Colors for the picture: procedural materials, one soft sun, contact shade. Nothing measured depends on this file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pcdata.synthetic.raycast import Hits
 from pcdata.synthetic.shapes import Shape
 from pcdata.synthetic.viewpoints import GOLDEN_ANGLE
 
-SUN = (-0.42, -0.30, 0.86)  # towards the light, base frame
+SUN = (-0.42, -0.30, 0.86)  # toward the light, base frame
 SUN_SPREAD = 0.07  # half-width of the light, as the tangent of an angle: how soft the shadows are
 SUN_SAMPLES = 8
 SUN_COLOR = (0.92, 0.87, 0.79)
@@ -21,15 +21,15 @@ SKY_COLOR = (0.62, 0.66, 0.72)  # where a ray meets nothing
 
 
 def shade(shapes: Sequence[Shape], hits: Hits, eye: Tensor, directions: Tensor, focal: float) -> Tensor:
-    """Return the (N, 3) uint8 sRGB colour of what N rays from ``eye`` (1, 3) along ``directions`` (N, 3) met.
+    """Return the (N, 3) uint8 sRGB color of what N rays from ``eye`` (1, 3) along ``directions`` (N, 3) met.
 
     ``focal`` in pixels says how wide a pixel is on a surface, so that thin lines fade with distance, not break up.
     """
     seen = (hits.shape_index >= 0).nonzero().squeeze(-1)
     points = (eye + hits.distance[seen, None] * directions[seen]).float()
     normals, index = hits.normals[seen].float(), hits.shape_index[seen]
-    towards_eye = -torch.nn.functional.normalize(directions[seen].float(), dim=-1)
-    slant = (normals * towards_eye).sum(-1).clamp(min=0.05)
+    toward_eye = -torch.nn.functional.normalize(directions[seen].float(), dim=-1)
+    slant = (normals * toward_eye).sum(-1).clamp(min=0.05)
     pixel = hits.distance[seen].float() / (focal * slant)  # metres
 
     surface = points.new_zeros(points.shape)
@@ -39,7 +39,7 @@ def shade(shapes: Sequence[Shape], hits: Hits, eye: Tensor, directions: Tensor, 
     sun = _unit(SUN, points)
     lit = ((normals @ sun).clamp(min=0.0) * _sunlight(shapes, points, normals, index))[:, None]
     sky = (_openness(shapes, points, normals, index) * (0.72 + 0.28 * normals[:, 2]))[:, None]
-    halfway = torch.nn.functional.normalize(sun + towards_eye, dim=-1)
+    halfway = torch.nn.functional.normalize(sun + toward_eye, dim=-1)
     gloss = ((normals * halfway).sum(-1).clamp(min=0.0) ** 60)[:, None] * (lit > 0)
     glossy = points.new_tensor([0.2 if shape.pattern == "band" else 0.02 for shape in shapes])[index, None]
     linear = surface * (lit * points.new_tensor(SUN_COLOR) + sky * points.new_tensor(SKY_LIGHT)) + glossy * gloss
@@ -73,8 +73,8 @@ def _wood(local: Tensor, pixel: Tensor) -> Tensor:
     start = _hash(plank)
     ring = y * 95.0 + 1.3 * torch.sin(x * 4.1 + 5.0 * start) + 0.5 * torch.sin(x * 11.0 + 9.0 * start) + 9.0 * start
     grain = 0.5 + 0.5 * torch.sin(2.0 * math.pi * (0.16 * ring + 0.12 * torch.sin(ring)))
-    fibre = torch.sin(y * 900.0 + 6.0 * torch.sin(x * 3.0 + start)) * torch.sin(x * 17.0 + 40.0 * start + y * 60.0)
-    tone = 1.0 + 0.10 * start - 0.20 * grain + 0.03 * fibre
+    fiber = torch.sin(y * 900.0 + 6.0 * torch.sin(x * 3.0 + start)) * torch.sin(x * 17.0 + 40.0 * start + y * 60.0)
+    tone = 1.0 + 0.10 * start - 0.20 * grain + 0.03 * fiber
     from_seam = 0.05 - (y - 0.1 * plank - 0.05).abs()
     tone = tone * (1.0 - 0.5 * _line(from_seam, 0.001, pixel))
     return local.new_tensor((0.60, 0.385, 0.205)) * tone[:, None]
@@ -105,8 +105,8 @@ def _sunlight(shapes: Sequence[Shape], points: Tensor, normals: Tensor, index: T
         for sample in range(SUN_SAMPLES):
             radius = SUN_SPREAD * math.sqrt((sample + 0.5) / SUN_SAMPLES)
             angle = sample * GOLDEN_ANGLE
-            towards = sun + radius * (math.cos(angle) * side + math.sin(angle) * other)
-            dark[sample, rows] |= torch.isfinite(shape.intersect(lifted[rows], towards[None])[0])
+            toward = sun + radius * (math.cos(angle) * side + math.sin(angle) * other)
+            dark[sample, rows] |= torch.isfinite(shape.intersect(lifted[rows], toward[None])[0])
     return 1.0 - dark.float().mean(0)
 
 

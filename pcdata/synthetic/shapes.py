@@ -1,6 +1,6 @@
 """Convex solids with exact ray hits, normals and signed distances: the whole synthetic world is made of these.
 
-Each solid is written in its own coordinates, centred on the origin; :class:`Shape` carries it to the base frame.
+Each solid is written in its own coordinates, centered on the origin; :class:`Shape` carries it to the base frame.
 Everything is float64, on the device of the rays or points it is asked about.
 """
 
@@ -21,22 +21,22 @@ _TINY = 1e-150
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shape(ABC):
-    """A coloured convex solid somewhere in the base frame."""
+    """A colored convex solid somewhere in the base frame."""
 
-    base_from_object: Tensor  # (4, 4) float64 rigid; the object's origin is its centre
+    base_from_object: Tensor  # (4, 4) float64 rigid; the object's origin is its center
     label: int  # 0 = table, 1.. = objects, -1 = background
     color: Color = (0.7, 0.7, 0.7)  # linear RGB in [0, 1]
     pattern: str = "plain"  # a name known to pcdata.synthetic.shading
 
     @property
     def center(self) -> Tensor:
-        """(3,) float64 centre in the base frame."""
+        """(3,) float64 center in the base frame."""
         return self.base_from_object[:3, 3]
 
     @property
     @abstractmethod
     def bounding_radius(self) -> float:
-        """The radius in metres of the smallest sphere around the centre that holds the solid."""
+        """The radius in metres of the smallest sphere around the center that holds the solid."""
 
     def intersect(
         self,
@@ -117,7 +117,7 @@ class Cylinder(Shape):
 
     @property
     def bounding_radius(self) -> float:
-        """From the centre to the rim."""
+        """From the center to the rim."""
         return math.hypot(self.radius, self.height / 2)
 
     def _interval(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

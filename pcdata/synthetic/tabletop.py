@@ -28,7 +28,7 @@ class TabletopTruth:
     """What is true about a scene, in the base frame (z up, table top at z = 0), whatever the sensor reported."""
 
     depth: Tensor  # (V, H, W) float64 metres, exact z-depth, 0 = nothing there
-    normals: Tensor  # (V, H, W, 3) float64 unit, base frame, towards the camera; zero where nothing is
+    normals: Tensor  # (V, H, W, 3) float64 unit, base frame, toward the camera; zero where nothing is
     labels: Tensor  # (V, H, W) int64: 0 table, 1..K objects, -1 floor or nothing
     world_from_camera: Tensor  # (V, 4, 4) float64, the poses the images were rendered from
     camera: Camera

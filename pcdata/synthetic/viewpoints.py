@@ -42,7 +42,7 @@ def place_cameras(seed: int, num_views: int, size: tuple[int, int]) -> tuple[Cam
     """Return V cameras around and above the table, each a little different, and world_from_camera (V, 4, 4).
 
     View v depends on (seed, v) alone. The field of view is that of a common stereo depth camera, about 55 degrees
-    wide; principal points are off centre, as in every real camera.
+    wide; principal points are off center, as in every real camera.
     """
     height, width = size
     intrinsics, poses = [], []
@@ -62,7 +62,7 @@ def place_cameras(seed: int, num_views: int, size: tuple[int, int]) -> tuple[Cam
 
 @dataclass(frozen=True, kw_only=True)
 class Miscalibration:
-    """A known error of the reported camera poses: a turn about, and a shift of, each camera's own centre.
+    """A known error of the reported camera poses: a turn about, and a shift of, each camera's own center.
 
     The amounts are exact, their directions are drawn from the scene's seed. One number holds for every view, a
     sequence has one per view (0 = that view is right).

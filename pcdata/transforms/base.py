@@ -36,7 +36,7 @@ class Transform(nn.Module):
     """A configured step from captures or clouds to clouds; the same for one cloud, a batch, CPU and GPU."""
 
     is_random: ClassVar[bool] = False  # draws from the generator
-    needs_metres: ClassVar[bool] = False  # works in metres, whatever its fields: refuse normalised clouds
+    needs_metres: ClassVar[bool] = False  # works in metres, whatever its fields: refuse normalized clouds
     runs_statistics: ClassVar[bool] = False  # its cost and its answer depend on the rest of the scene
     keeps_clouds: ClassVar[bool] = True  # cloud b of the result is cloud b of the input: none is joined or split
     takes: ClassVar[type] = PointCloud
@@ -140,7 +140,7 @@ class Transform(nn.Module):
         return {type(self).__name__: _each(_plain, self.config_fields())}
 
     def fingerprint(self) -> str:
-        """Return the SHA-256 of names, versions and fields: equal for equal behaviour."""
+        """Return the SHA-256 of names, versions and fields: equal for equal behavior."""
         return sha256_of(self._identity())
 
     def _identity(self) -> Any:
@@ -177,7 +177,7 @@ class Transform(nn.Module):
             )
         unit = self.unit_needed()
         if unit is not None and data.unit != unit:
-            lengths = "metres" if unit == METRE else "the unit of normalised clouds"
+            lengths = "metres" if unit == METRE else "the unit of normalized clouds"
             found = "in metres" if data.unit == METRE else data.unit
             raise UnitError(
                 f"{name}: its fields are lengths in {lengths} but the cloud is {found}; {unit_advice(self)}"
@@ -237,9 +237,9 @@ class Transform(nn.Module):
 def unit_advice(step: Transform) -> str:
     """What to do where a step's lengths are not in the unit of the cloud."""
     if step.unit_needed() != METRE:
-        return "put it after normalising, or leave unit out and give metres"
-    own = ", or say unit: normalized if the length is meant in the normalised cloud"
-    return f"put it before normalising{own if 'unit' in field_names(type(step)) else ''}"
+        return "put it after normalizing, or leave unit out and give metres"
+    own = ", or say unit: normalized if the length is meant in the normalized cloud"
+    return f"put it before normalizing{own if 'unit' in field_names(type(step)) else ''}"
 
 
 def num_clouds(data: Data) -> int:

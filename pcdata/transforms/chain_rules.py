@@ -17,7 +17,7 @@ class PipelineOrderWarning(PcdataWarning):
 
 
 def check_chain(steps: Sequence[Transform]) -> None:
-    """Require that neighbours fit: capture or cloud, frame, unit.
+    """Require that neighbors fit: capture or cloud, frame, unit.
 
     Raises:
         FaultyConfigError: the first step that does not fit; its path is the position of the step from 0.
@@ -39,8 +39,8 @@ def check_chain(steps: Sequence[Transform]) -> None:
                 raise _misfit(position, step, f"works in frame {needed!r} but the cloud is in {frame!r} there")
             wanted = step.unit_needed()
             if unit is not None and wanted is not None and wanted != unit:
-                names = {METRE: "in metres", NORMALIZED: "normalised"}
-                works = "in metres" if wanted == METRE else "on normalised clouds"
+                names = {METRE: "in metres", NORMALIZED: "normalized"}
+                works = "in metres" if wanted == METRE else "on normalized clouds"
                 raise _misfit(
                     position, step, f"works {works} but the cloud is {names[unit]} there; {unit_advice(step)}"
                 )

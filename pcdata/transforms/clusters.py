@@ -32,8 +32,8 @@ class ClusterObjects(Transform):
         LeftOutWarning: a cluster is larger than ``max_size``.
 
     Args:
-        eps: points closer than this are neighbours.
-        min_points: neighbours, the point itself included, that make a core point.
+        eps: points closer than this are neighbors.
+        min_points: neighbors, the point itself included, that make a core point.
         min_size: smaller clusters are not objects.
         max_size: larger clusters are not objects.
         keep: "all": keep the whole scene, with -1 where no object is.
@@ -91,17 +91,17 @@ class ClusterObjects(Transform):
         labels = params["labels"]
         counted = {name: params[name].tolist() for name in ("noise", "too_small", "too_large")}
         others = [{"no_objects": {name: counted[name][b] for name in counted}} for b in range(data.num_clouds)]
-        labelled = data.with_fields(labels=labels).with_meta(_objects(labels, data)).with_meta(others)
+        labeled = data.with_fields(labels=labels).with_meta(_objects(labels, data)).with_meta(others)
         if self.keep == "all":
-            return labelled
+            return labeled
         member = labels >= 0
-        return labelled.select(member, ptr_after_mask(member, data.ptr))
+        return labeled.select(member, ptr_after_mask(member, data.ptr))
 
 
 class SplitObjects(Transform):
     """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped.
 
-    ``meta["object"]`` keeps the label, ``meta["unlabelled"]`` the number of points dropped from the whole cloud.
+    ``meta["object"]`` keeps the label, ``meta["unlabeled"]`` the number of points dropped from the whole cloud.
     """
 
     keeps_clouds = False
@@ -116,14 +116,14 @@ class SplitObjects(Transform):
             found = torch.unique(cloud.labels[cloud.labels >= 0]).tolist()
             if not found:
                 raise TooFewPointsError(
-                    f"SplitObjects: cloud {b}{sample_name(data, b)} has no labelled point among its "
+                    f"SplitObjects: cloud {b}{sample_name(data, b)} has no labeled point among its "
                     f"{cloud.num_points}; check the fields of ClusterObjects"
                 )
-            unlabelled = int((cloud.labels < 0).sum())
+            unlabeled = int((cloud.labels < 0).sum())
             for label in found:
                 rows = torch.nonzero(cloud.labels == label).squeeze(1)
                 ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
-                parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabelled": unlabelled}]))
+                parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabeled": unlabeled}]))
         return PointCloud.cat(parts)
 
 

@@ -32,7 +32,7 @@ class CompleteDepth(Transform):
     (V, 3, H, W) float32 in [0, 1], depth (V, 1, H, W) float32 metres, mask (V, 1, H, W) bool, True = to be completed;
     it returns depth (V, 1, H, W) in metres, 0 = no answer. Under the mask it sees the depth as captured, outside it
     trusted readings alone. It runs without gradients, in evaluation mode, on the capture's device. A module that needs
-    no colours says so by an attribute ``needs_color = False``.
+    no colors says so by an attribute ``needs_color = False``.
 
     A configuration holds no code: of a module of your own it keeps the identity, its class and a hash of its structure
     and weights as they were at construction (not of the code of ``forward``). Such a configuration can be read,
@@ -43,7 +43,7 @@ class CompleteDepth(Transform):
 
     Raises:
         ConfigError: the step was read from a configuration and the module is not at hand.
-        CaptureError: the module needs colours and the capture has none.
+        CaptureError: the module needs colors and the capture has none.
         DTypeError, ShapeError, NonFiniteError: the module's answer is not such a depth image.
     """
 
@@ -113,7 +113,7 @@ class CompleteDepth(Transform):
         rgb = None if data.colors is None else data.colors.permute(0, 3, 1, 2).float() / 255.0
         if rgb is None and getattr(module, "needs_color", True):
             raise CaptureError(
-                f"{where} needs colours, but the capture {data.sample_id!r} has none; use captures with colour "
+                f"{where} needs colors, but the capture {data.sample_id!r} has none; use captures with color "
                 "registered to the depth, or completion='smooth'"
             )
         with torch.no_grad():

@@ -24,7 +24,7 @@ from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
 class Compose(Transform):
-    """Run steps one after another, on captures or on clouds; check at construction that neighbours fit.
+    """Run steps one after another, on captures or on clouds; check at construction that neighbors fit.
 
     A cloud enters at the first step that takes one, so one chain serves depth images and PLY files; where every step
     takes captures and the last gives clouds, it stays as it is. The steps before the first random one always give the

@@ -74,8 +74,8 @@ class MaskDepth(Transform):
 class Deproject(Transform):
     """Turn every depth reading into a point: one cloud per view, each in its own camera's frame.
 
-    Colours become float RGB in [0, 1]; labels and confidence follow; ``source_index`` is the flat pixel index over all
-    views, and the viewpoint is the camera centre. Poses of the capture are kept in ``frames`` for ``ToFrame``.
+    Colors become float RGB in [0, 1]; labels and confidence follow; ``source_index`` is the flat pixel index over all
+    views, and the viewpoint is the camera center. Poses of the capture are kept in ``frames`` for ``ToFrame``.
     """
 
     takes = DepthFrame

@@ -88,7 +88,7 @@ class RemoveFlyingPixels(Transform):
     takes = DepthFrame
     gives = DepthFrame
 
-    # As a part of the depth: neighbours that differ more lie on two surfaces.
+    # As a part of the depth: neighbors that differ more lie on two surfaces.
     tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02
     min_neighbors: Annotated[int, Interval(ge=1, le=8)] = 3
 

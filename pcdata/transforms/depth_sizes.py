@@ -54,7 +54,7 @@ class DecimateDepth(Transform):
     """Make one pixel of every ``factor`` x ``factor`` block from its readings; rows and columns left over are cut off.
 
     Labels, confidence and mask are those of the pixel with the median reading, so they describe the surface that stays;
-    colours are averaged over the block.
+    colors are averaged over the block.
 
     Args:
         rule: what becomes of a block; the mean mixes the surfaces that meet in it.
@@ -87,7 +87,7 @@ class ResizeDepth(Transform):
 
     Depth on one surface is interpolated, exactly on planes; across edges, beside holes, and everywhere if ``max_jump``
     is None, a pixel takes the nearest reading, up to half a pixel off. Labels, confidence and mask are those of the
-    nearest pixel; colours are filtered against aliasing.
+    nearest pixel; colors are filtered against aliasing.
 
     Args:
         size: (height, width) of the result, in pixels.

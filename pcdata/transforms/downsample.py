@@ -23,7 +23,7 @@ from pcdata.transforms.field_types import Count, Fraction, FromSensor, IfShort, 
 class VoxelDownsample(Transform):
     """Average the points of every occupied voxel (Open3D's grid), every field by its kind.
 
-    Positions, colours and other floats are averaged, directions averaged and renormalised, labels and other integers
+    Positions, colors and other floats are averaged, directions averaged and renormalized, labels and other integers
     decided by vote (the lowest wins a tie); confidence is their lowest, as an average is no better than its parts;
     ``source_index`` is that of the first point in the voxel. Give the voxel size, or the count to reach: then every
     cloud gets the largest size that leaves at least so many points.

@@ -86,7 +86,7 @@ class ToFrame(SpatialTransform):
 class MergeViews(Transform):
     """Join the views of each capture, which ToFrame brought into one frame, into one cloud.
 
-    Neighbouring clouds of the batch with the same sample id and capture index are one capture, as long as their view
+    Neighboring clouds of the batch with the same sample id and capture index are one capture, as long as their view
     numbers rise. The frame they share becomes the source frame; every point keeps its ``view`` and the ``viewpoint`` it
     was seen from, and normals are turned to face it.
 
@@ -95,7 +95,7 @@ class MergeViews(Transform):
 
     Args:
         voxel_size: edge of the voxels in which views compete; None = keep every point.
-        face_cameras: turn normals towards the camera that saw the point.
+        face_cameras: turn normals toward the camera that saw the point.
     """
 
     needs_metres = True
@@ -164,7 +164,7 @@ def _one_view_per_voxel(cloud: PointCloud, voxel_size: float) -> PointCloud:
 
 
 def _same_capture(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
-    """Whether two neighbouring clouds are views of one capture.
+    """Whether two neighboring clouds are views of one capture.
 
     Raises:
         ConfigError: nothing says which capture a cloud is from.

@@ -20,11 +20,11 @@ class NormalizeUnitSphere(SpatialTransform):
     """Move the mean of every cloud to the origin and scale its farthest point to distance 1 (PointNet's rule)."""
 
     def unit_given(self) -> str:
-        """The result is normalised."""
+        """The result is normalized."""
         return NORMALIZED
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Measure the centre and the radius of every cloud."""
+        """Measure the center and the radius of every cloud."""
         center = segment_mean(data.points, data.ptr)
         offset = data.points.double() - center[cloud_of_rows(data.ptr)]
         radius = segment_max(offset.norm(dim=1), data.ptr)
@@ -66,7 +66,7 @@ class NormalizeWorkspace(SpatialTransform):
         return self.frame
 
     def unit_given(self) -> str:
-        """The result is normalised."""
+        """The result is normalized."""
         return NORMALIZED
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:

@@ -13,7 +13,7 @@ from pcdata.transforms.field_types import Count, Metres
 
 
 class EstimateNormals(Transform):
-    """Fit a plane to the nearest neighbours within a radius; replaces any normals the cloud had.
+    """Fit a plane to the nearest neighbors within a radius; replaces any normals the cloud had.
 
     After merging, every point's normal faces the camera that saw that point.
 

@@ -17,10 +17,10 @@ from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
 class RemoveStatisticalOutliers(SelectTransform):
-    """Drop points whose mean distance to their nearest neighbours is unusual for their cloud (Open3D's rule).
+    """Drop points whose mean distance to their nearest neighbors is unusual for their cloud (Open3D's rule).
 
     Args:
-        num_neighbors: nearest neighbours, the point itself among them.
+        num_neighbors: nearest neighbors, the point itself among them.
         std_ratio: standard deviations above the cloud's mean that are still usual.
     """
 

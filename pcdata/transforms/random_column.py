@@ -50,7 +50,7 @@ class RandomColumn(Transform):
         }
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Pick the rows and note the centres."""
+        """Pick the rows and note the centers."""
         column = data.select(params["index"], params["ptr"])
         return column.with_meta([{"column_center": center} for center in params["center"].tolist()])
 

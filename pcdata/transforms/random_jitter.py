@@ -75,7 +75,7 @@ class RandomPointDropout(SelectTransform):
 
 
 class RandomColorJitter(Transform):
-    """Change brightness, contrast, saturation and hue of every cloud's colours at random, in that order.
+    """Change brightness, contrast, saturation and hue of every cloud's colors at random, in that order.
 
     Each factor is drawn once per cloud from [1 - x, 1 + x), the hue shift from [-hue, hue) turns; as torchvision's
     ColorJitter. The adjustments are kornia's.
@@ -104,7 +104,7 @@ class RandomColorJitter(Transform):
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Adjust each cloud as an image of one column."""
         if data.colors is None:
-            raise DTypeError("RandomColorJitter: the cloud has no colours")
+            raise DTypeError("RandomColorJitter: the cloud has no colors")
         bounds = data.ptr.tolist()
         parts = [
             _adjust(data.colors[start:stop], params["factors"][b])

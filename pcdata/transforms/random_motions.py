@@ -45,7 +45,7 @@ class RandomRotation(SpatialTransform):
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one rotation per cloud."""
         if self.axis is None:
-            quaternion = streams.normal(4)  # a normalised Gaussian quaternion is uniform over rotations
+            quaternion = streams.normal(4)  # a normalized Gaussian quaternion is uniform over rotations
             rotation = rigid.rotation_from_quaternion(quaternion)
         else:
             limit = torch.deg2rad(torch.tensor(self.degrees, dtype=torch.float64, device="cpu")).item()

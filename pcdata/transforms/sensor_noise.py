@@ -33,8 +33,8 @@ def depth_camera(where: str, name: str) -> SensorProfile:
         ConfigError: there is none of this name, or it is a spinning lidar.
     """
     profile = sensor_profile(name)
-    if not profile.is_organised:
-        raise ConfigError(f"{where}: {name} gives unorganised points, not depth images; name a depth camera")
+    if not profile.is_organized:
+        raise ConfigError(f"{where}: {name} gives unorganized points, not depth images; name a depth camera")
     return profile
 
 
@@ -43,7 +43,7 @@ class RandomSensorNoise(Transform):
 
     The error follows the sensor's profile at the capture's own focal length: stereo errs in disparity and rounds to its
     disparity step, other kinds err by the profile's standard deviation; then depth is rounded to the sensor's step.
-    Where neighbouring depths differ by more than the profile's edge threshold, pixels may read nothing or a mixture of
+    Where neighboring depths differ by more than the profile's edge threshold, pixels may read nothing or a mixture of
     both surfaces; surfaces tilted beyond ``grazing_degrees`` read nothing. On a real capture the noise comes on top of
     what is there.
 

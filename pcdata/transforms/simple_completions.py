@@ -82,7 +82,7 @@ def _membrane(depth: NDArray[np.float64], todo: NDArray[np.bool_]) -> NDArray[np
 
 
 def _neighbor_views(shape: tuple[int, ...]) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Pair every pixel with each of its 4-neighbours, as two views of an image."""
+    """Pair every pixel with each of its 4-neighbors, as two views of an image."""
     every, front, back = slice(None), slice(None, -1), slice(1, None)
     right, down = ((every, front), (every, back)), ((front, every), (back, every))
     return [right, right[::-1], down, down[::-1]]

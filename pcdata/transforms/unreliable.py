@@ -25,12 +25,12 @@ class MarkUnreliableDepth(Transform):
     Two signs, neither with a number to tune. *Enclosed*: readings inside the convex hull of a hole (8-connected pixels
     without a reading, not reaching the image's border); transparent and shiny objects lose readings along their rim,
     and what is read within is seen through them or past them. *Rough*: readings three times as noisy as the sensor's
-    profile allows, or at odds with every neighbour. Other pixels keep their confidence; without one, readings become
+    profile allows, or at odds with every neighbor. Other pixels keep their confidence; without one, readings become
     RELIABLE. Enclosed readings are found by SciPy, on the CPU. A
     1280x720 image takes 1.5 s on one core, nearly all for the second sign.
 
     Measured on two scenes of transparent objects by a RealSense D435, each shot again with the objects painted opaque
-    (ClearGrasp's sample data, depth registered to 1280x720 colour). Wrong = within the objects' mask and more than 1 cm
+    (ClearGrasp's sample data, depth registered to 1280x720 color). Wrong = within the objects' mask and more than 1 cm
     from the painted twin: of 47,361 and 10,291 wrong readings 23 % and 64 % are marked, all by the first sign (this
     depth is smooth: the camera's filters were on); of the 728,267 and 668,370 good ones 8 % and 6 % are lost. The other
     wrong ones show the table through a bottle, as smooth as the table beside it: depth alone cannot tell. For certainty
@@ -90,7 +90,7 @@ def _enclosed_by_holes(depth: Tensor) -> Tensor:
 
 
 def _convex_hull(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Fill the convex hull of the centres of the True pixels, which are not all on one line."""
+    """Fill the convex hull of the centers of the True pixels, which are not all on one line."""
     from scipy.spatial import ConvexHull, QhullError
 
     # The ends of each row span the same hull as all of its pixels.

@@ -54,7 +54,7 @@ def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = Non
 
     One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
     report with a failed check, and the others follow. After a recording a last report, with the sample id
-    :data:`WHOLE`, judges over all captures together what single ones tell less surely: the registration of colour and
+    :data:`WHOLE`, judges over all captures together what single ones tell less surely: the registration of color and
     depth, and the direction of the poses.
 
     Args:

@@ -154,7 +154,7 @@ def test_clouds_farther_apart_than_their_size_are_refused():
         icp_point_to_plane(source + 9.0, target)
 
 
-def test_a_radius_that_holds_no_neighbours_is_refused_and_its_advice_leads_on():
+def test_a_radius_that_holds_no_neighbors_is_refused_and_its_advice_leads_on():
     source, target = clouds(curved, 0.0)
     with pytest.raises(ConfigError, match=r"give more than ([\d.]+)") as caught:
         icp_point_to_plane(source, target, normal_radius=0.001)
@@ -162,7 +162,7 @@ def test_a_radius_that_holds_no_neighbours_is_refused_and_its_advice_leads_on():
     assert icp_point_to_plane(source, target, normal_radius=radius).converged
 
 
-def test_a_screw_turns_a_sphere_about_its_centre_however_far():
+def test_a_screw_turns_a_sphere_about_its_center_however_far():
     center = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
     turn = torch.tensor([0.4, 1.0, -0.3], dtype=torch.float64)
     pivot = torch.tensor([0.1, 0.0, 0.2], dtype=torch.float64)

@@ -102,7 +102,7 @@ def test_a_plane_slides_along_itself_and_is_not_moved_along_it():
     assert float(motion[:2, 3].norm()) < 1e-3
 
 
-def test_a_sphere_turns_about_its_centre():
+def test_a_sphere_turns_about_its_center():
     generator = torch.Generator().manual_seed(0)
     center = torch.tensor([0.3, 0.0, 1.0])
     source, target = (

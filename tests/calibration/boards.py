@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.calibration.boards import BoardView, Charuco, Chessboard, GreyImage
+from pcdata.calibration.boards import BoardView, Charuco, Chessboard, GrayImage
 from pcdata.functional.depth.deproject import pixel_rays, project_points
 from pcdata.functional.rows import transform_points
 from pcdata.geometry import rigid
@@ -24,13 +24,13 @@ CHARUCO = Charuco(9, 7, 0.03, 0.022, "5X5_100")
 
 
 def board_pose(tilt_x: float, tilt_y: float, distance: float, *, aside: tuple[float, float] = (0.0, 0.0)) -> Tensor:
-    """camera_from_board (4, 4) of a board whose centre is ``distance`` away; angles in degrees, ``aside`` in pixels."""
+    """camera_from_board (4, 4) of a board whose center is ``distance`` away; angles in degrees, ``aside`` in pixels."""
     axes = torch.eye(3, dtype=torch.float64)
     angles = torch.deg2rad(torch.tensor([tilt_x, tilt_y], dtype=torch.float64))
     rotation = rigid.rotation_about_axis(axes[0], angles[0]) @ rigid.rotation_about_axis(axes[1], angles[1])
-    centre = torch.tensor([aside[0] / 605 * distance, aside[1] / 605 * distance, distance], dtype=torch.float64)
+    center = torch.tensor([aside[0] / 605 * distance, aside[1] / 605 * distance, distance], dtype=torch.float64)
     middle = torch.tensor([0.1, 0.0625, 0.0], dtype=torch.float64)  # of the 9x6 chessboard's corners
-    return rigid.from_rotation_translation(rotation, centre - rotation @ middle)
+    return rigid.from_rotation_translation(rotation, center - rotation @ middle)
 
 
 def good_poses() -> list[Tensor]:
@@ -54,8 +54,8 @@ def corner_view(pose: Tensor, *, noise: float = 0.0, seed: int = 0, camera: Came
     return BoardView(points.numpy(), pixels.numpy())
 
 
-def rendered(pose: Tensor, board: Chessboard | Charuco) -> GreyImage:
-    """The image of the board before a grey wall, (480, 640)."""
+def rendered(pose: Tensor, board: Chessboard | Charuco) -> GrayImage:
+    """The image of the board before a gray wall, (480, 640)."""
     x, y = _on_board(pose)
     image = _chessboard(x, y, board) if isinstance(board, Chessboard) else _charuco(x, y, board)
     return image.round().clamp(0, 255).to(torch.uint8).numpy()

@@ -146,7 +146,7 @@ def test_a_pose_of_another_moment_is_named_and_does_not_spoil_the_answer():
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-def test_the_wrong_setup_fails_and_is_recognised(setup):
+def test_the_wrong_setup_fails_and_is_recognized(setup):
     other = SETUPS[1 - SETUPS.index(setup)]
     result = calibrate_hand_eye(robot_poses(camera_poses(12), setup=setup, noise=0.2), setup=other)
     assert result.verdict is Verdict.FAIL
@@ -154,7 +154,7 @@ def test_the_wrong_setup_fails_and_is_recognised(setup):
     assert f"the poses fit as {setup}: check --setup" in advice
 
 
-def test_target_poses_the_wrong_way_round_are_recognised():
+def test_target_poses_the_wrong_way_round_are_recognized():
     poses = robot_poses(camera_poses(12), noise=0.2)
     wrong = replace(poses, camera_from_target=rigid.invert_rigid(poses.camera_from_target))
     result = calibrate_hand_eye(wrong, setup="eye-in-hand")

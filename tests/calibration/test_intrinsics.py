@@ -154,13 +154,13 @@ def test_corners_are_found_where_they_are_projected(board: Board):
     assert np.abs((exact.numpy() - found.pixels).mean(axis=0)).max() < 0.15  # no shift by half a pixel
 
 
-def test_a_board_described_by_its_squares_is_recognised_as_that_mistake():
+def test_a_board_described_by_its_squares_is_recognized_as_that_mistake():
     images = {"a": rendered(board_pose(10, 10, 0.45), CHESSBOARD)}
     with pytest.raises(CalibrationError, match=r"count inner corners, not squares: chessboard:9x6:0.025"):
         find_board(images, Chessboard(10, 7, 0.025))
 
 
-def test_a_legacy_charuco_board_is_recognised_as_one():
+def test_a_legacy_charuco_board_is_recognized_as_one():
     legacy = Charuco(8, 6, 0.03, 0.022, "5X5_100", legacy=True)  # the patterns differ for even numbers of rows
     images = {"a": rendered(board_pose(10, 10, 0.45), legacy)}
     with pytest.raises(CalibrationError, match=r"legacy pattern: charuco:8x6:0.03:0.022:5X5_100:legacy"):
@@ -168,11 +168,11 @@ def test_a_legacy_charuco_board_is_recognised_as_one():
 
 
 def test_images_without_a_board_or_of_two_sizes_are_refused():
-    grey = np.full(SIZE, 128, np.uint8)
+    gray = np.full(SIZE, 128, np.uint8)
     with pytest.raises(CalibrationError, match="is in none of the 2 images; is it in focus"):
-        find_board({"a": grey, "b": grey}, CHARUCO)
+        find_board({"a": gray, "b": gray}, CHARUCO)
     with pytest.raises(CaptureError, match="images of one size"):
-        find_board({"a": grey, "b": grey[:100]}, CHARUCO)
+        find_board({"a": gray, "b": gray[:100]}, CHARUCO)
     with pytest.raises(CaptureError, match="got no image"):
         find_board({}, CHARUCO)
 

@@ -30,7 +30,7 @@ def wall(
     noise: float = 0.0,  # metres, along z
     scale: float = 1.0,  # of a depth unit that is wrong
     fill: float = 1.0,
-    bowl: float = 0.0,  # metres, how much deeper the corners of the central half are than its centre
+    bowl: float = 0.0,  # metres, how much deeper the corners of the central half are than its center
     camera: Camera = CAMERA,
 ) -> DepthFrame:
     generator = torch.Generator().manual_seed(0)
@@ -59,7 +59,7 @@ def test_the_noise_put_in_is_the_depth_rms_found(noise: float, tilt: float) -> N
 
 def test_the_plane_rms_of_a_tilted_wall_is_the_noise_across_it() -> None:
     straight, tilted = check_plane(wall(noise=0.003)), check_plane(wall(noise=0.003, tilt=30.0))
-    # The centre of the wall sees noise along z at cos 30; over a ROI of +-15 degrees that is 3 percent off at most.
+    # The center of the wall sees noise along z at cos 30; over a ROI of +-15 degrees that is 3 percent off at most.
     assert tilted.plane_rms / straight.plane_rms == pytest.approx(math.cos(math.radians(30)), rel=0.03)
 
 
@@ -140,9 +140,9 @@ def test_noise_and_tilt_are_no_warp(noise: float) -> None:
 def test_a_bias_of_8_mm_at_1_m_fails_with_and_without_a_sensor_s_model() -> None:
     frame = wall(normal_distance=1.0, scale=0.992, noise=0.001)
     plain = check_plane(frame, distance=1.0)
-    modelled = check_plane(frame, distance=1.0, noise=lambda z: 0.0037 * z**2)
+    modeled = check_plane(frame, distance=1.0, noise=lambda z: 0.0037 * z**2)
     assert failed(plain) == ["bias, part of the distance"]
-    assert failed(modelled) == ["size of the bias"]
+    assert failed(modeled) == ["size of the bias"]
     assert check_plane(frame, distance=1.0, noise=lambda z: 0.0055 * z**2).verdict is Verdict.PASS, (
         "1.5 times 5.5 mm is more than 8"
     )
@@ -153,7 +153,7 @@ def test_no_model_asks_for_more_than_a_wall_and_a_tape_measure_can_show() -> Non
     assert check_plane(frame, distance=1.0, noise=lambda z: 0.0003 * z**2).verdict is Verdict.PASS
 
 
-def test_quantised_depth_without_noise_is_no_clutter() -> None:
+def test_quantized_depth_without_noise_is_no_clutter() -> None:
     frame = wall(tilt=10.0)
     rounded: Tensor = (frame.depth * 1000).round() / 1000
     check = check_plane(DepthFrame(depth=rounded, camera=CAMERA))

@@ -25,6 +25,6 @@ def test_one_sensor_is_shown_with_every_source(name, capsys):
         assert f"{figure}: {' '.join(source.split())}" in text
 
 
-def test_a_misspelt_sensor_is_the_request_at_fault(capsys):
+def test_a_misspelled_sensor_is_the_request_at_fault(capsys):
     assert main(["profiles", "kinekt_v1"]) == 2
     assert "did you mean 'kinect_v1'?" in capsys.readouterr().err

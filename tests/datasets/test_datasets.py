@@ -59,7 +59,7 @@ def test_a_cached_sample_is_the_one_that_the_whole_pipeline_gives_on_the_fly(sou
             assert json.loads(json.dumps([a.meta, a.history])) == json.loads(json.dumps([b.meta, b.history]))
 
 
-def test_a_sample_depends_on_its_id_not_on_its_neighbours_or_the_order(source, config):
+def test_a_sample_depends_on_its_id_not_on_its_neighbors_or_the_order(source, config):
     whole = CloudDataset(source, config.pipeline)
     part = CloudDataset(FixedSource({name: source.load(name) for name in reversed(source.ids[2:5])}), config.pipeline)
     for index, name in enumerate(part.ids):

@@ -34,7 +34,7 @@ class Samples:
 
 
 def cloud(count: int = 40, seed: int = 0, **changes: object) -> PointCloud:
-    """Points in the unit sphere with colours of 8 bits, normals and labels 0..3; metres in "base"."""
+    """Points in the unit sphere with colors of 8 bits, normals and labels 0..3; metres in "base"."""
     generator = seeded(seed)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     fields: dict = {
@@ -54,7 +54,7 @@ def shape(count: int = 2048, seed: int = 0, **changes: object) -> PointCloud:
 
 
 def frame(size: tuple[int, int] = (12, 16), seed: int = 0, **changes: object) -> DepthFrame:
-    """A view in whole millimetres with one hole, colour, a mask, labels -1, 1 and 2, and a pose."""
+    """A view in whole millimetres with one hole, color, a mask, labels -1, 1 and 2, and a pose."""
     generator = seeded(seed)
     height, width = size
     units: Tensor = torch.randint(400, 900, (1, height, width), generator=generator)

@@ -122,7 +122,7 @@ def test_padding_by_zeros_is_noted_with_what_it_does_to_the_statistics(tmp_path)
     [
         (cloud(1024), ShapeError, "the samples before have 512 points, this one has 1024"),
         (cloud(511), ContractError, r"count: 511 points .*FarthestPointSample\(num_points=512"),
-        (cloud(512, unit="normalized"), ContractError, "unit: .*remove the normalisation"),
+        (cloud(512, unit="normalized"), ContractError, "unit: .*remove the normalization"),
         (cloud(512, frame_id="camera"), ContractError, r"frame: .*'camera'.*'base'; add ToFrame"),
         (cloud(512, points=1000 * cloud(512).points), ContractError, "scale: .*millimetres"),
         (cloud(512, colors=None), CaptureError, "colors=false"),

@@ -40,7 +40,7 @@ def load_available_input_data(path: Path):
     return data.get("segmap"), rgb, data["depth"], data["K"].reshape(3, 3)
 
 
-def test_contact_graspnet_gets_metres_intrinsics_segments_and_colours(tmp_path):
+def test_contact_graspnet_gets_metres_intrinsics_segments_and_colors(tmp_path):
     source = captures()
     report = export_dataset(source, "contact_graspnet", tmp_path / "out")
     assert report.notes == []
@@ -173,7 +173,7 @@ def test_graspnet_refuses_what_its_loader_would(tmp_path):
             export_dataset(Samples({"a": sample}), "graspnet", tmp_path / "out", **options)
 
     refused(ShapeError, "must be 1280x720", frame())
-    refused(CaptureError, "needs colour", frame(colors=None), any_size=True)
+    refused(CaptureError, "needs color", frame(colors=None), any_size=True)
     between = torch.where(frame().depth > 0, frame().depth + 0.0003, 0.0)
     refused(CaptureError, "not whole multiples", frame(depth=between), any_size=True)
     refused(CaptureError, "1 .. 255", frame(labels=frame().labels + 255), any_size=True)
@@ -265,7 +265,7 @@ def cornell(folder: Path):
         yield path, np.array(rows).reshape(-1, 4, 2), np.array(Image.open(depth_path)), np.array(Image.open(rgb_path))
 
 
-def test_ggcnn_finds_depth_colour_and_grasps_under_cornells_names(tmp_path):
+def test_ggcnn_finds_depth_color_and_grasps_under_cornells_names(tmp_path):
     source = captures()
     grasps = dict.fromkeys(source.ids, GRASP)
     report = export_dataset(source, "ggcnn", tmp_path / "out", grasps=grasps, any_size=True, holes="zero")

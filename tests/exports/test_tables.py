@@ -84,7 +84,7 @@ def test_pointnet_files_hold_so_many_shapes_and_no_more(tmp_path, monkeypatch):
     ("sample", "fix"),
     [
         (cloud(2048), r"unit: .*add NormalizeUnitSphere"),
-        (shape(points=2 * shape().points), "normalisation: .*farthest point at 2"),
+        (shape(points=2 * shape().points), "normalization: .*farthest point at 2"),
         (shape(1024), r"count: .*num_points=2048"),
         (shape(4096), r"count: .*num_points=2048"),
         (shape(points=shape().points.index_fill(0, torch.tensor([5]), torch.nan)), "finite: "),
@@ -149,8 +149,8 @@ def test_a_part_of_two_classes_is_refused_and_the_fix_that_the_message_names_is_
 def test_captures_with_part_labels_go_through_build_export_and_check_by_commands_alone(tmp_path):
     source = SyntheticSource(num_scenes=2, size=(120, 160), num_objects=2)
     config = "cloud: [{ToFrame: {frame: base}}, {FarthestPointSample: {num_points: 2048}}, NormalizeUnitSphere]"
-    relabelled = {name: partial(part_labels, source, name) for name in source.ids}
-    captures = Samples(relabelled)
+    relabeled = {name: partial(part_labels, source, name) for name in source.ids}
+    captures = Samples(relabeled)
     build_dataset(config_from_yaml(f"depth: [Deproject]\n{config}"), captures, tmp_path / "built")
     table = tmp_path / "table.csv"
     table.write_text("\n".join(["sample,class,split", *(f"{name},mug,train" for name in source.ids)]) + "\n")

@@ -40,8 +40,8 @@ def textbook_dbscan(points: Tensor, eps: float, min_points: int) -> Tensor:
 
 def blobs(seed: int, num_points: int, spread: float) -> Tensor:
     generator = np.random.default_rng(seed)
-    centres = generator.uniform(-1, 1, size=(4, 3))
-    points = centres[generator.integers(0, 4, size=num_points)] + spread * generator.normal(size=(num_points, 3))
+    centers = generator.uniform(-1, 1, size=(4, 3))
+    points = centers[generator.integers(0, 4, size=num_points)] + spread * generator.normal(size=(num_points, 3))
     return torch.from_numpy(points.astype(np.float32))
 
 

@@ -1,4 +1,4 @@
-"""Exact neighbour search against brute force and SciPy, on easy and on hostile clouds."""
+"""Exact neighbor search against brute force and SciPy, on easy and on hostile clouds."""
 
 from __future__ import annotations
 

@@ -135,5 +135,5 @@ def test_normals_agree_with_open3d_on_a_real_frame(test_data: Path):
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(0.02, 30))
     angle = angle_between(estimate_normals(torch.from_numpy(points)), torch.from_numpy(np.asarray(cloud.normals)))
     degrees = torch.rad2deg(torch.minimum(angle, torch.pi - angle))
-    # The rest are ties at the 30th neighbour: depth is in whole millimetres.
+    # The rest are ties at the 30th neighbor: depth is in whole millimetres.
     assert float((degrees < 0.5).double().mean()) >= 0.99

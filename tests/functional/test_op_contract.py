@@ -123,7 +123,7 @@ EXAMPLES = [
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),
-    # Neighbourhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
+    # Neighborhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
     Example("fill_holes", depth_alone, ("row", "row"), {"rule": "nearest"}),

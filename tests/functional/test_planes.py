@@ -49,10 +49,10 @@ def scene(seed: int = 0) -> torch.Tensor:
 def least_squares_inliers(points: np.ndarray, inliers: np.ndarray, distance: float) -> np.ndarray:
     """Refit by singular values (not eigenvalues) and select again, in NumPy."""
     chosen = points[inliers].astype(np.float64)
-    centre = chosen.mean(axis=0)
-    normal = np.linalg.svd(chosen - centre, full_matrices=False)[2][-1]
+    center = chosen.mean(axis=0)
+    normal = np.linalg.svd(chosen - center, full_matrices=False)[2][-1]
     x, y, z = points.T
-    nx, ny, nz, d = np.append(normal, -normal @ centre).astype(np.float32)
+    nx, ny, nz, d = np.append(normal, -normal @ center).astype(np.float32)
     return np.abs(((nx * x + ny * y) + nz * z) + d) < np.float32(distance)
 
 

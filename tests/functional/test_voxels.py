@@ -160,9 +160,9 @@ def test_labels_far_apart_are_not_averaged_or_overflowed():
     assert voxel_majority(labels, torch.zeros(3, dtype=torch.int64), 1).tolist() == [2**62]
 
 
-def test_colours_average_and_keep_their_dtype():
-    colours = torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.5, 0.5]])
-    means = voxel_mean(colours, torch.tensor([0, 0, 2]), 3)
+def test_colors_average_and_keep_their_dtype():
+    colors = torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.5, 0.5]])
+    means = voxel_mean(colors, torch.tensor([0, 0, 2]), 3)
     assert means.tolist() == [[0.5, 0.5], [0.0, 0.0], [0.5, 0.5]]
     assert means.dtype == torch.float32
 

@@ -69,7 +69,7 @@ def test_too_few_points_are_refused_as_by_the_reference():
 @needs_torch_cluster
 @few
 @given(ragged_counts, st.integers(0, 99), st.floats(0.1, 3.0), st.integers(1, 8))
-def test_neighbours_equal_the_reference(counts, seed, radius, max_neighbors):
+def test_neighbors_equal_the_reference(counts, seed, radius, max_neighbors):
     points, ptr = cloud(sum(counts), seed), ptr_from_counts(counts)
     arguments = {"radius": radius, "max_neighbors": max_neighbors}
     for ours, theirs in zip(
@@ -79,7 +79,7 @@ def test_neighbours_equal_the_reference(counts, seed, radius, max_neighbors):
 
 
 @needs_torch_cluster
-def test_neighbours_of_other_queries_equal_the_reference_with_ties_on_the_radius():
+def test_neighbors_of_other_queries_equal_the_reference_with_ties_on_the_radius():
     axis = torch.arange(5.0)
     points = torch.cartesian_prod(axis, axis, axis)
     queries = torch.cat([points[::7], cloud(20) + 2])

@@ -28,7 +28,7 @@ def answers(name: str) -> dict[str, Any]:
 
 @cache
 def capture(size: tuple[int, int] = (240, 320)) -> DepthFrame:
-    """One view of a table with objects, with colour."""
+    """One view of a table with objects, with color."""
     frame = tabletop(3, num_objects=4, num_views=1, size=size, sample_id="scene").frame
     return frame
 

@@ -85,7 +85,7 @@ def test_an_array_without_axes_is_read_from_its_one_chunk(tmp_path):
         zarr_array(tmp_path, "a")[...]
 
 
-def test_neighbouring_rows_decode_their_chunk_once(tmp_path, monkeypatch):
+def test_neighboring_rows_decode_their_chunk_once(tmp_path, monkeypatch):
     array = np.arange(24.0).reshape(8, 3)
     write_zarr(tmp_path / "a", array, (4, 3), "zlib")
     decoded = []
@@ -179,7 +179,7 @@ def test_a_file_is_read_as_the_loaders_read_it_whatever_the_width_of_its_numbers
 
 
 @pytest.mark.parametrize("kind", ["npz", "h5"])
-def test_points_and_colours_by_role_are_joined_in_the_models_order(tmp_path, kind):
+def test_points_and_colors_by_role_are_joined_in_the_models_order(tmp_path, kind):
     cloud = correct_batch("dp3_real")["point_cloud"].numpy()
     path = tmp_path / f"clouds.{kind}"
     if kind == "npz":
@@ -253,7 +253,7 @@ def test_the_models_are_listed_and_shown(capsys):
     listed = capsys.readouterr().out
     assert all(name in listed for name in CONTRACTS)
     assert main(["models", "rise"]) == 0
-    assert "towards zero" in capsys.readouterr().out
+    assert "toward zero" in capsys.readouterr().out
     assert main(["models", "rize"]) == 2
 
 

@@ -21,7 +21,7 @@ GIVEN = {"frame": "base", "frame_id": "base", "unit": "m"}
 
 
 def arrays() -> dict[str, np.ndarray]:
-    """Two clouds of 1024 coloured points, and arrays that do not go with them."""
+    """Two clouds of 1024 colored points, and arrays that do not go with them."""
     cloud = correct_batch("dp3_real")["point_cloud"].numpy()
     xyz, rgb = cloud[..., :3], cloud[..., 3:]
     return {
@@ -180,7 +180,7 @@ def test_hostile_zarr_headers_are_typed_errors(tmp_path, change):
         check_files(tmp_path, "dp3_real", {"points": "xyz"}, **GIVEN)
 
 
-def test_colours_that_a_model_takes_as_a_tensor_of_its_own_are_made_by_role(tmp_path):
+def test_colors_that_a_model_takes_as_a_tensor_of_its_own_are_made_by_role(tmp_path):
     batch = correct_batch("anygrasp")
     count = batch.counts[0]
     np.savez(tmp_path / "a.npz", p=batch["points"][:count].numpy(), c=batch["colors"][:count].numpy())

@@ -50,14 +50,14 @@ def test_each_single_violation_is_caught(name, violation):
             require(broken, name)
 
 
-def test_colours_in_another_encoding_are_told_by_their_values():
+def test_colors_in_another_encoding_are_told_by_their_values():
     batch = correct_batch("dp3_real")
     cloud = batch["point_cloud"]
     dark = with_tensor(batch, "point_cloud", torch.cat([cloud[..., :3], cloud[..., 3:] / 255], dim=-1))
     assert failed(check(dark, "dp3_real")) == {"range"}
 
 
-def test_xyz_and_colours_swapped_without_a_word_are_told_by_their_values():
+def test_xyz_and_colors_swapped_without_a_word_are_told_by_their_values():
     batch = correct_batch("dp3_real")
     cloud = batch["point_cloud"]
     swapped = with_tensor(batch, "point_cloud", torch.cat([cloud[..., 3:], cloud[..., :3]], dim=-1))

@@ -36,7 +36,7 @@ def random_poses(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def changed() -> tuple[PointCloud, torch.Tensor]:
-    """A normalised, rotated, cropped batch, and (B, 4, 4) cloud_from_base made of its recorded steps alone."""
+    """A normalized, rotated, cropped batch, and (B, 4, 4) cloud_from_base made of its recorded steps alone."""
     cloud = CHANGES(cloud_in_base((120, 90, 150)), generator=seeded(5))
     matrices = []
     for steps in cloud.history:
@@ -47,7 +47,7 @@ def changed() -> tuple[PointCloud, torch.Tensor]:
     return cloud, torch.stack(matrices)
 
 
-def test_poses_on_a_normalised_rotated_cropped_cloud_come_back_to_the_base():
+def test_poses_on_a_normalized_rotated_cropped_cloud_come_back_to_the_base():
     cloud, cloud_from_base = changed()
     in_base = random_poses(3, 7)
     scale = torch.linalg.det(cloud_from_base[:, :3, :3]) ** (1 / 3)
@@ -90,7 +90,7 @@ def test_grasps_in_the_camera_frame_go_to_the_base_in_one_call():
     in_camera = random_poses(2, 5)
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     seen = half_turn @ in_camera
-    # The network sees its own points centred: their mean is what was subtracted.
+    # The network sees its own points centered: their mean is what was subtracted.
     mean = torch.linalg.inv(batch.source_from_cloud)[:, :3, 3]
     seen[..., :3, 3] += mean[:, None]
     wanted = base_from_camera @ in_camera

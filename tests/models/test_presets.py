@@ -132,7 +132,7 @@ def test_optional_channels_can_be_left_out_but_others_cannot():
         preset("dp3_sim", frame="base", crop=None, channels=["xyz", "heat"])
 
 
-def test_colours_are_scaled_as_each_model_takes_them():
+def test_colors_are_scaled_as_each_model_takes_them():
     def middle(name: str, key: str) -> tuple[float, float]:
         values = correct_batch(name)[key][..., 3:6]
         return float(values.min()), float(values.max())
@@ -154,7 +154,7 @@ def test_contact_graspnet_sees_x_and_y_negated_and_the_mean_of_its_own_points_re
     assert cloud.source_frame == "camera"
 
 
-def test_m2t2_centres_by_the_full_cloud_and_keeps_points_where_they_are():
+def test_m2t2_centers_by_the_full_cloud_and_keeps_points_where_they_are():
     batch = correct_batch("m2t2")
     shift = batch["points"] - batch["inputs"][..., :3]
     assert torch.allclose(shift, shift[:, :1].expand_as(shift), atol=1e-5)
@@ -162,10 +162,10 @@ def test_m2t2_centres_by_the_full_cloud_and_keeps_points_where_they_are():
     assert float((shift[:, 0] - own_mean).abs().max()) > 1e-6  # the mean is not that of the sample
 
 
-def test_rise_cuts_cells_towards_zero():
+def test_rise_cuts_cells_toward_zero():
     batch = correct_batch("rise")
     xyz = batch["input_feats_list"][:, :3].numpy()
-    # realworld.py joins float32 points and float64 colours, so it divides in float64.
+    # realworld.py joins float32 points and float64 colors, so it divides in float64.
     assert np.array_equal(batch["input_coords_list"][:, 1:].numpy(), (xyz.astype(np.float64) / 0.005).astype(np.int32))
     assert batch["input_coords_list"][:, 0].tolist() == [b for b, n in enumerate(batch.counts) for _ in range(n)]
 
@@ -193,7 +193,7 @@ def test_peract_cells_hold_the_mean_of_the_points_inside():
     assert int(grid[9].sum()) == len(torch.unique(cell, dim=0))
 
 
-def test_organised_maps_put_every_point_back_at_its_pixel():
+def test_organized_maps_put_every_point_back_at_its_pixel():
     cloud = sample_of("3d_diffuser_actor")
     images = made_preset("3d_diffuser_actor").collate([cloud])["pcd_obs"]
     pixel = int(cloud.source_index[1234])

@@ -114,7 +114,7 @@ def test_real_captures_through_a_preset_are_what_its_own_check_takes(name, captu
     source = open_source(Path(os.environ["PCDATA_TEST_DATA"]) / capture_name)
     real = source.load(source.ids[0])
     if isinstance(real, PointCloud) and (
-        CONTRACTS[name].takes == "depth image" or CONTRACTS[name].main.content == "organised"
+        CONTRACTS[name].takes == "depth image" or CONTRACTS[name].main.content == "organized"
     ):
         pytest.skip("the model takes depth images, and this is a cloud")
     box = {"frame": "camera", "crop": ((-2.0, -2.0, 0.1), (2.0, 2.0, 3.0)), "category": 3}
@@ -123,7 +123,7 @@ def test_real_captures_through_a_preset_are_what_its_own_check_takes(name, captu
     assert check(made.collate([sample]), name).samples[Verdict.FAIL] == 0
 
 
-def test_clouds_without_pixels_are_refused_for_organised_models():
+def test_clouds_without_pixels_are_refused_for_organized_models():
     made = made_preset("3d_diffuser_actor")
     cloud = PointCloud(points=torch.rand(500, 3), frame_id="base", colors=torch.rand(500, 3))
     with pytest.raises(ShapeError, match="give depth images, not cloud files"):

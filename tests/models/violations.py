@@ -99,19 +99,19 @@ def wrong_dtype(batch: ModelBatch, contract: ModelContract) -> ModelBatch:
     return with_tensor(batch, contract.main.key, batch[contract.main.key].double())
 
 
-def wrong_normalisation(batch: ModelBatch, contract: ModelContract) -> ModelBatch:
-    """What is centred is moved away; what is not is centred."""
+def wrong_normalization(batch: ModelBatch, contract: ModelContract) -> ModelBatch:
+    """What is centered is moved away; what is not is centered."""
     spec, channel = contract.main, contract.main.channels[0]
     if contract.takes == "depth image":
         relative = channel.name == "depth_relative"
         return _edited(
             batch, spec, channel, lambda depth: (depth + 2.0).clamp(-1, 1) if relative else depth - depth.mean()
         )
-    if contract.centring == "none":
+    if contract.centering == "none":
         rows = batch[spec.key].movedim(spec.axes.index("C"), -1)
         if spec.axes[0] != "S":
             rows = rows.flatten(1, -2)
-            return _centred_each(batch, contract)
+            return _centered_each(batch, contract)
         assert batch.counts is not None
         parts = [
             torch.cat([p[:, :3] - p[:, :3].double().mean(0).float(), p[:, 3:]], 1) for p in rows.split(batch.counts)
@@ -120,7 +120,7 @@ def wrong_normalisation(batch: ModelBatch, contract: ModelContract) -> ModelBatc
     return _edited(batch, spec, channel, lambda values: values - torch.tensor([0.3, 0.8, 0.7]))
 
 
-def _centred_each(batch: ModelBatch, contract: ModelContract) -> ModelBatch:
+def _centered_each(batch: ModelBatch, contract: ModelContract) -> ModelBatch:
     spec = contract.main
     singles = []
     for one in batch[spec.key]:
@@ -147,7 +147,7 @@ VIOLATIONS: dict[str, tuple[Callable[[ModelBatch, ModelContract], ModelBatch | N
     "layout": (wrong_layout, {"layout"}),
     "missing tensor": (missing_tensor, {"layout"}),
     "dtype": (wrong_dtype, {"dtype"}),
-    "normalisation": (wrong_normalisation, {"normalisation"}),
+    "normalization": (wrong_normalization, {"normalization"}),
     "NaN": (not_finite, {"finite"}),
 }
 CHEAP = {"frame", "unit", "count", "order", "layout", "missing tensor", "dtype"}  # seen without reading values

@@ -68,7 +68,7 @@ class _Source(Source):
         self.capture = capture
 
     @classmethod
-    def recognises(cls, path):
+    def recognizes(cls, path):
         return False
 
     def files(self, sample_id):

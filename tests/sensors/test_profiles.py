@@ -1,4 +1,4 @@
-"""The sensor catalogue: complete, sourced, and its derived thresholds hold on surfaces with known noise."""
+"""The sensor catalog: complete, sourced, and its derived thresholds hold on surfaces with known noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pcdata.sensors import PolynomialNoise, SensorProfile, StereoNoise, sensor_p
 from pcdata.sensors.profile import FIGURES
 
 PROFILES = list(sensor_profiles().values())
-CAMERAS = [profile for profile in PROFILES if profile.is_organised]
+CAMERAS = [profile for profile in PROFILES if profile.is_organized]
 each = pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
 each_camera = pytest.mark.parametrize("profile", CAMERAS, ids=lambda profile: profile.name)
 
@@ -25,7 +25,7 @@ def test_the_sensors_asked_for_are_there():
         "realsense_d415", "realsense_d435", "realsense_d435i", "realsense_d455", "realsense_l515", "azure_kinect_nfov",
         "azure_kinect_wfov", "kinect_v1", "photoneo_phoxi_m", "ouster_os1", "velodyne_vlp16",
     }  # fmt: skip
-    assert {profile.name for profile in PROFILES if not profile.is_organised} == {"ouster_os1", "velodyne_vlp16"}
+    assert {profile.name for profile in PROFILES if not profile.is_organized} == {"ouster_os1", "velodyne_vlp16"}
 
 
 @each
@@ -118,7 +118,7 @@ def test_the_edge_threshold_is_not_met_on_a_surface(profile: SensorProfile):
     assert float((step > profile.edge_threshold(1.2 * depth)).double().mean()) < 0.01
 
 
-def test_a_misspelt_sensor_is_told_with_what_was_probably_meant():
+def test_a_misspelled_sensor_is_told_with_what_was_probably_meant():
     with pytest.raises(ConfigError, match=r"unknown sensor 'realsense_d345'; did you mean .*'realsense_d435'"):
         sensor_profile("realsense_d345")
     with pytest.raises(ConfigError, match=r"unknown sensor 'xyz'; known: realsense_d415, "):

@@ -1,4 +1,4 @@
-"""A frame registered to a colour camera, against the same scene rendered from there."""
+"""A frame registered to a color camera, against the same scene rendered from there."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def color(scene) -> DepthFrame:
-    """What the colour camera sees, rendered."""
+    """What the color camera sees, rendered."""
     there = scene.truth.world_from_camera @ DEPTH_FROM_COLOR
     return tabletop(5, num_objects=6, camera=COLOR_CAMERA, world_from_camera=there, floor=False).frame
 
@@ -53,7 +53,7 @@ def test_every_point_has_the_color_and_label_of_its_own_surface(color, registere
     got = registered.depth > 0
     assert float((registered.labels == color.labels)[got].float().mean()) > 0.985  # half a pixel beside outlines
     assert torch.equal(registered.colors, color.colors)
-    # Ghosts: points of the table that took the colour of the object before them, other than along its outline.
+    # Ghosts: points of the table that took the color of the object before them, other than along its outline.
     outline = torch.nn.functional.max_pool2d(color.labels.float(), 5, 1, 2) != -torch.nn.functional.max_pool2d(
         -color.labels.float(), 5, 1, 2
     )
@@ -92,7 +92,7 @@ def test_depth_alone_is_registered_too(scene, color, registered):
 
 
 def test_images_and_cameras_that_do_not_match_are_refused(scene, color):
-    with pytest.raises(ShapeError, match="the colour camera describes"):
+    with pytest.raises(ShapeError, match="the color camera describes"):
         register_to_color(scene.frame, color.colors[:, 1:], COLOR_CAMERA, COLOR_FROM_DEPTH)
     with pytest.raises(ShapeError, match="V=1 but depth has V=2"):
         register_to_color(scene.frame, color.colors[:1], COLOR_CAMERA, COLOR_FROM_DEPTH)

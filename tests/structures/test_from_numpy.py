@@ -121,7 +121,7 @@ LARGE = Camera.pinhole(fx=60.0, fy=62.0, cx=31.5, cy=23.5, size=(48, 64))
         ({"intrinsics": [30.0, 31.0, 15.5, 11.5]}, ShapeError, "Camera.pinhole"),
         ({"color": np.moveaxis(COLOR, -1, 0)}, ShapeError, "channels come last"),
         ({"color": np.dstack([COLOR, COLOR[..., :1]])}, ShapeError, "alpha"),
-        ({"color": COLOR[..., 0]}, ShapeError, "grey"),
+        ({"color": COLOR[..., 0]}, ShapeError, "gray"),
         ({"color": COLOR[::2, ::2]}, ShapeError, "at the depth's pixels"),
         ({"color": COLOR / 255.0}, DTypeError, "8-bit RGB"),
         ({"labels": DEPTH / 1.0}, DTypeError, "whole numbers"),

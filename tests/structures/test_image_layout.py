@@ -33,7 +33,7 @@ def on_image() -> PointCloud:
 
 
 def assert_grid_is_true(cloud: PointCloud) -> None:
-    """Back in its camera, every point projects to the centre of its pixel."""
+    """Back in its camera, every point projects to the center of its pixel."""
     grid = cloud.image_grid()
     assert grid is not None
     assert grid.camera_from_points is not None

@@ -34,7 +34,7 @@ def test_frames_without_a_common_world_are_refused():
         volume.integrate(dataclasses.replace(frame, frame_id="world"))
     with pytest.raises(FrameError, match="no world_from_camera"):
         volume.integrate(dataclasses.replace(frame, frame_id=None, world_from_camera=None))
-    with pytest.raises(CaptureError, match=r"the images of the first.*colours: True, labels: True.*colours: False"):
+    with pytest.raises(CaptureError, match=r"the images of the first.*colors: True, labels: True.*colors: False"):
         volume.integrate(dataclasses.replace(frame, colors=None))
     with pytest.raises(ConfigError, match="nothing was integrated yet"):
         TSDFVolume().extract_points()

@@ -13,7 +13,7 @@ SMALL = (60, 80)
 
 
 def _pose_error(truth: Tensor, reported: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation angle in degrees and distance in metres between poses, from the trace and the camera centres."""
+    """Rotation angle in degrees and distance in metres between poses, from the trace and the camera centers."""
     turn = truth[:, :3, :3].mT @ reported[:, :3, :3]
     cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1))), (truth[:, :3, 3] - reported[:, :3, 3]).norm(dim=-1)
@@ -29,7 +29,7 @@ def test_look_at_puts_the_target_in_the_middle_and_up_upwards() -> None:
     assert float(pose[2, 1]) < 0  # image y points down
 
 
-def test_cameras_stand_around_and_above_and_look_at_the_table_centre() -> None:
+def test_cameras_stand_around_and_above_and_look_at_the_table_center() -> None:
     poses = tabletop(3, num_objects=0, num_views=8, size=(4, 4)).truth.world_from_camera
     rigid.check_rigid("test", poses)
     assert float(poses[:, 2, 3].min()) > 0.4

@@ -29,7 +29,7 @@ each_solid = pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: type(sol
 
 
 def _rays(count: int = 4000) -> tuple[Tensor, Tensor]:
-    """Rays from a sphere of radius 1 around the solid, towards points near it, of random lengths."""
+    """Rays from a sphere of radius 1 around the solid, toward points near it, of random lengths."""
     g = seeded(3)
     center = _pose()[:3, 3]
     origins = center + torch.nn.functional.normalize(torch.randn(count, 3, generator=g, dtype=torch.float64), dim=-1)

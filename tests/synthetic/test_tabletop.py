@@ -79,8 +79,8 @@ def test_normals_are_unit_and_face_the_camera(scene: Tabletop) -> None:
     points, valid = _deprojected(scene.frame, scene.truth.world_from_camera)
     normals = scene.truth.normals[valid]
     torch.testing.assert_close(normals.norm(dim=-1), torch.ones(len(normals)).double())
-    towards = (scene.truth.world_from_camera[:, None, None, :3, 3] - points)[valid]
-    assert float((normals * towards).sum(-1).min()) >= -1e-6
+    toward = (scene.truth.world_from_camera[:, None, None, :3, 3] - points)[valid]
+    assert float((normals * toward).sum(-1).min()) >= -1e-6
 
 
 def test_normals_match_finite_differences_away_from_edges() -> None:
@@ -104,8 +104,8 @@ def test_normals_match_finite_differences_away_from_edges() -> None:
 def test_objects_rest_on_the_table(scene: Tabletop) -> None:
     grid = _object_grid(scene)
     for shape in scene.truth.objects:
-        below_centre = shape.center * torch.tensor([1.0, 1.0, 0.0])
-        assert abs(float(shape.signed_distance(below_centre[None]))) < 1e-12
+        below_center = shape.center * torch.tensor([1.0, 1.0, 0.0])
+        assert abs(float(shape.signed_distance(below_center[None]))) < 1e-12
         assert float(grid[shape.signed_distance(grid) <= 0][:, 2].min()) > -1e-9
         inside = grid[shape.signed_distance(grid) < 0]
         assert float(inside[:, 0].abs().max()) < 0.6
@@ -122,7 +122,7 @@ def test_objects_stay_clear_of_each_other() -> None:
         assert float(nearest.min()) >= 0.0119
 
 
-def test_the_kinds_of_objects_are_mixed_and_colours_differ() -> None:
+def test_the_kinds_of_objects_are_mixed_and_colors_differ() -> None:
     scene = tabletop(5, num_objects=6, size=(4, 4))
     kinds = [type(shape).__name__ for shape in scene.truth.objects]
     assert sorted(kinds) == ["Box", "Box", "Cylinder", "Cylinder", "Sphere", "Sphere"]
@@ -245,7 +245,7 @@ def test_the_frame_is_complete_and_pickles() -> None:
     assert torch.equal(copy.render(3).depth, scene.render(3).depth)
 
 
-def test_colours_tell_the_objects_from_the_table() -> None:
+def test_colors_tell_the_objects_from_the_table() -> None:
     scene = tabletop(0, num_objects=6, size=SMALL)
     assert scene.frame.colors is not None
     image, labels = scene.frame.colors[0].double(), scene.truth.labels[0]

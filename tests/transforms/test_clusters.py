@@ -127,9 +127,9 @@ def test_split_counts_no_points_before_even_when_the_numbers_agree():
 
 
 def test_a_cloud_with_nothing_to_split_is_an_error_alone_and_in_a_batch():
-    unlabelled = blobs(30).with_fields(labels=torch.full((30,), -1))
-    for cloud in (unlabelled, PointCloud.cat([blobs(10), unlabelled])):
-        with pytest.raises(TooFewPointsError, match=r"cloud \d has no labelled point among its 30"):
+    unlabeled = blobs(30).with_fields(labels=torch.full((30,), -1))
+    for cloud in (unlabeled, PointCloud.cat([blobs(10), unlabeled])):
+        with pytest.raises(TooFewPointsError, match=r"cloud \d has no labeled point among its 30"):
             SplitObjects()(cloud)
     with pytest.raises(DTypeError, match="has no labels; put ClusterObjects before it"):
         SplitObjects()(blobs(10).with_fields(labels=None))

@@ -152,16 +152,16 @@ def test_the_module_gets_what_the_contract_says():
     assert bool((result.depth[frame.depth == 0] == 2.0).all())
 
 
-def test_colours_arrive_between_zero_and_one():
+def test_colors_arrive_between_zero_and_one():
     colors = torch.randint(256, (1, 40, 50, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     module = Recorder()
     CompleteDepth(completion=module)(dataclasses.replace(with_hole(plane()), colors=colors))
     assert torch.allclose(module.seen[0][0, :, 7, 9] * 255, colors[0, 7, 9].float())
 
 
-def test_a_module_that_needs_colours_says_so():
+def test_a_module_that_needs_colors_says_so():
     bare = dataclasses.replace(with_hole(plane()), colors=None)
-    with pytest.raises(CaptureError, match="Recorder needs colours, but the capture"):
+    with pytest.raises(CaptureError, match="Recorder needs colors, but the capture"):
         CompleteDepth(completion=Recorder())(bare)
     assert bool((CompleteDepth(completion="smooth")(bare).depth > 0).all())
 

@@ -34,14 +34,14 @@ def chain() -> T.Compose:
 # -- building ------------------------------------------------------------------------------------------------------
 
 
-def test_neighbours_that_do_not_fit_are_refused_when_the_chain_is_built():
+def test_neighbors_that_do_not_fit_are_refused_when_the_chain_is_built():
     with pytest.raises(ConfigError, match="step 2, Center, takes a PointCloud but step 1, MaskDepth, gives a DepthFr"):
         T.Compose([T.MaskDepth(), T.Center()])
     with pytest.raises(ConfigError, match="takes a DepthFrame but step 1, Center, gives a PointCloud"):
         T.Compose([T.Center(), T.Deproject()])
     with pytest.raises(ConfigError, match="step 2, CropWorkspace, works in frame 'base' but the cloud is in 'camera'"):
         T.Compose([T.Deproject(), T.CropWorkspace(**BOX)])
-    with pytest.raises(ConfigError, match="step 2, RemovePlane, works in metres but the cloud is normalised there"):
+    with pytest.raises(ConfigError, match="step 2, RemovePlane, works in metres but the cloud is normalized there"):
         T.Compose([T.NormalizeUnitSphere(), T.RemovePlane()])
     nested = T.Compose([T.ToFrame(frame="base"), T.Compose([T.ToFrame(frame="table")])])
     with pytest.raises(ConfigError, match="works in frame 'base' but the cloud is in 'table' there"):

@@ -191,7 +191,7 @@ def test_rows_stay_together(example):
 
 
 def scale_of(cloud: PointCloud) -> torch.Tensor:
-    """(N,) how many of the cloud's units a metre of its source is, for lengths of normalised clouds."""
+    """(N,) how many of the cloud's units a metre of its source is, for lengths of normalized clouds."""
     scale = torch.linalg.det(cloud.source_from_cloud[:, :3, :3]).abs() ** (-1 / 3)
     return torch.repeat_interleave(scale, cloud.counts)
 
@@ -399,11 +399,11 @@ def test_the_wrong_kind_of_data_is_refused(example):
 
 
 @each_in_metres
-def test_steps_in_metres_refuse_a_normalised_cloud(example):
+def test_steps_in_metres_refuse_a_normalized_cloud(example):
     data = dataclasses.replace(example.make(COUNTS), unit=NORMALIZED)
     with pytest.raises(UnitError, match="lengths in metres but the cloud is normalized"):
         run(example, data)
-    with pytest.raises(ConfigError, match="works in metres but the cloud is normalised there"):
+    with pytest.raises(ConfigError, match="works in metres but the cloud is normalized there"):
         T.Compose([T.NormalizeUnitSphere(), example.transform])
 
 
@@ -481,7 +481,7 @@ def test_cuda_agrees_with_the_cpu(example):
     assert_same(on_cpu, on_gpu.to("cpu"), tolerance=2e-6)
 
 
-def test_every_length_in_metres_makes_its_step_refuse_normalised_clouds():
+def test_every_length_in_metres_makes_its_step_refuse_normalized_clouds():
     with_lengths = {name for name, cls in T.REGISTRY.items() if length_fields(cls) and cls.takes is PointCloud}
     assert {"ClusterObjects", "EstimateNormals", "RandomColumn", "RemovePlane", "VoxelDownsample"} <= with_lengths
     for name in with_lengths:
@@ -494,11 +494,11 @@ def test_a_voxel_size_works_in_the_unit_that_it_is_given_in(step):
     sphere = T.NormalizeUnitSphere()
     with pytest.raises(UnitError, match=r"lengths in metres but the cloud is normalized; .* or say unit: normalized"):
         step(voxel_size=0.1)(sphere(cloud), generator=seeded(0))
-    with pytest.raises(ConfigError, match=r"works in metres but the cloud is normalised there; .*unit: normalized"):
+    with pytest.raises(ConfigError, match=r"works in metres but the cloud is normalized there; .*unit: normalized"):
         T.Compose([sphere, step(voxel_size=0.1)])
-    with pytest.raises(UnitError, match=r"the unit of normalised clouds but the cloud is in metres; put it after"):
+    with pytest.raises(UnitError, match=r"the unit of normalized clouds but the cloud is in metres; put it after"):
         step(voxel_size=0.1, unit="normalized")(cloud, generator=seeded(0))
-    with pytest.raises(ConfigError, match=r"works on normalised clouds but the cloud is in metres there"):
+    with pytest.raises(ConfigError, match=r"works on normalized clouds but the cloud is in metres there"):
         T.Compose([T.RemovePlane(), step(voxel_size=0.1, unit="normalized")])
     followed = T.Compose([sphere, step(voxel_size=0.1, unit="normalized"), T.RandomJitter()])
     assert 0 < followed(cloud, generator=seeded(0)).num_points < cloud.num_points

@@ -76,7 +76,7 @@ def test_a_box_that_is_none_is_refused():
         CropWorkspace(**BOX, frame_from_box=[[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1.0]])
 
 
-def test_cropped_normalised_and_rotated_clouds_return_to_their_source():
+def test_cropped_normalized_and_rotated_clouds_return_to_their_source():
     source = cloud_in_camera((200, 30, 120))
     cloud = source.transformed(source.frames["base"], frame_id="base")
     chain = Compose([CropWorkspace(**BOX), NormalizeUnitSphere(), RandomRotation(axis=None)])

@@ -71,7 +71,7 @@ def test_decimation_by_2_and_3_takes_the_median_of_the_readings(frames, factor):
     assert (depth[even] <= np.float32(upper[even])).all()
     k, reduced = frames[0].camera.intrinsics[0], found.camera.intrinsics[0]
     assert torch.allclose(reduced[:2, :2], k[:2, :2] / factor)
-    assert torch.allclose(reduced[:2, 2] + 0.5, (k[:2, 2] + 0.5) / factor)  # centres of pixels are whole numbers
+    assert torch.allclose(reduced[:2, 2] + 0.5, (k[:2, 2] + 0.5) / factor)  # centers of pixels are whole numbers
 
 
 def test_decimation_by_4_and_more_takes_their_mean(frames):
@@ -84,7 +84,7 @@ def test_decimation_by_4_and_more_takes_their_mean(frames):
 
 
 def smoothed(image: np.ndarray, alpha: float, delta: float) -> np.ndarray:
-    """Along the first axis and back: a pixel leans on its neighbour where both have readings less than delta apart."""
+    """Along the first axis and back: a pixel leans on its neighbor where both have readings less than delta apart."""
     for step in (1, -1):
         raw = image[::step]
         out = raw.copy()

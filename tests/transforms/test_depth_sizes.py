@@ -48,7 +48,7 @@ def test_points_of_the_smaller_image_lie_on_the_true_surfaces(scene, step):
 
 @pytest.mark.parametrize("step", [DecimateDepth(factor=2), ResizeDepth(size=(60, 80)), ResizeDepth(size=(240, 320))])
 def test_the_table_stays_at_height_zero_without_an_offset(scene, step):
-    # An intrinsic matrix scaled about the pixel's corner instead of its centre would tilt and shift the table.
+    # An intrinsic matrix scaled about the pixel's corner instead of its center would tilt and shift the table.
     frame = step(scene.frame)
     points = in_base(frame)
     labels = Deproject()(frame).labels
@@ -100,7 +100,7 @@ def test_rows_and_columns_left_over_are_cut_off_with_the_camera():
     assert small.size == (2, 3)
     k, old = small.camera.intrinsics[0], frame.camera.intrinsics[0]
     assert k[0, 0] == pytest.approx(float(old[0, 0]) / 5)
-    # The centre of the first block is pixel 2 of the image.
+    # The center of the first block is pixel 2 of the image.
     assert pytest.approx(float(old[0, 2] - k[0, 2] * 5), abs=1e-9) == 0 * 5 + 2
 
 

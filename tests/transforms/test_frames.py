@@ -164,8 +164,8 @@ def test_what_was_found_view_by_view_is_refused(num_views, step):
 def test_merged_normals_face_the_camera_that_saw_each_point():
     scene = tabletop(1, num_objects=2, num_views=3, size=(60, 80), floor=False)
     cloud = Compose([Deproject(), ToFrame(frame="base"), MergeViews(), EstimateNormals(radius=0.03)])(scene.frame)
-    towards = cloud.viewpoint_per_point() - cloud.points
-    assert bool(((towards * cloud.normals).sum(1) > 0).all())
+    toward = cloud.viewpoint_per_point() - cloud.points
+    assert bool(((toward * cloud.normals).sum(1) > 0).all())
     truth = scene.truth.normals.reshape(-1, 3)[cloud.source_index]
     flat = (truth[:, 2] > 0.999) & (cloud.points[:, 2].abs() < 1e-4)  # the table top
     angle = rigid.angle_between(cloud.normals[flat], truth[flat])
@@ -185,9 +185,9 @@ def test_the_history_of_a_merged_cloud_counts_all_its_views():
 def test_normals_are_turned_to_the_camera_that_saw_them():
     views = EstimateNormals(radius=0.05, orient="none")(views_in_base("a", num_views=2))
     merged, as_given = MergeViews()(views), MergeViews(face_cameras=False)(views)
-    towards = merged.extra["viewpoint"] - merged.points
-    assert bool(((towards * merged.normals).sum(1) >= 0).all())
-    assert not bool(((towards * as_given.normals).sum(1) >= 0).all())
+    toward = merged.extra["viewpoint"] - merged.points
+    assert bool(((toward * merged.normals).sum(1) >= 0).all())
+    assert not bool(((toward * as_given.normals).sum(1) >= 0).all())
     assert bool((merged.normals * as_given.normals).sum(1).abs().gt(0.999).all())
 
 

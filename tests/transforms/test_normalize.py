@@ -53,7 +53,7 @@ def test_a_box_in_another_frame_and_a_flat_box_are_refused():
         NormalizeWorkspace(**{**BOX, "upper": (0.2, -0.4, 0.1)})
 
 
-def test_centred_clouds_have_their_mean_at_the_origin_and_a_frame_of_their_own():
+def test_centered_clouds_have_their_mean_at_the_origin_and_a_frame_of_their_own():
     cloud = Center()(cloud_in_base((120, 90)))
     for single in cloud.unbatch():
         assert float(single.points.double().mean(0).abs().max()) < 1e-7
@@ -62,7 +62,7 @@ def test_centred_clouds_have_their_mean_at_the_origin_and_a_frame_of_their_own()
         CropWorkspace(**BOX)(cloud)
 
 
-def test_a_pipeline_knows_the_frame_that_centring_makes():
+def test_a_pipeline_knows_the_frame_that_centering_makes():
     around = {"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.1, 0.1)}
     chain = Compose([CropWorkspace(**BOX), Center(), CropWorkspace(frame="base/centered", **around)])
     assert chain(cloud_in_base()).frame_id == "base/centered"

@@ -12,12 +12,12 @@ from pcdata.transforms import EstimateNormals
 
 
 def sphere(count: int = 600, radius: float = 0.1) -> PointCloud:
-    """A ball around the origin with the camera at its centre: normals must point inwards."""
+    """A ball around the origin with the camera at its center: normals must point inwards."""
     outward = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     return PointCloud(points=outward * radius, frame_id="base", viewpoint=torch.zeros(1, 3))
 
 
-def test_normals_of_a_sphere_point_to_the_camera_at_its_centre():
+def test_normals_of_a_sphere_point_to_the_camera_at_its_center():
     cloud = EstimateNormals(radius=0.03)(sphere())
     angle = rigid.angle_between(cloud.normals, -cloud.points)
     assert float(angle.median()) < 0.05

@@ -25,7 +25,7 @@ def test_points_far_from_a_regular_patch_are_dropped_and_the_patch_stays(step):
 @pytest.mark.parametrize(
     "step", [RemoveStatisticalOutliers(num_neighbors=6), RemoveRadiusOutliers(min_neighbors=3, radius=0.015)]
 )
-def test_the_neighbours_of_another_cloud_do_not_count(step):
+def test_the_neighbors_of_another_cloud_do_not_count(step):
     alone = PointCloud(points=torch.cat([GRID, STRAYS[:1]]), frame_id="base")
     around_the_stray = PointCloud(points=torch.cat([GRID + STRAYS[0], GRID[:1] - 1.0]), frame_id="base")
     both = step(PointCloud.cat([alone, around_the_stray]))

@@ -102,7 +102,7 @@ def test_dropout_hits_every_row_alike():
     assert 65 < int(counts.min()) <= int(counts.max()) < 135  # 100 expected, standard deviation 7
 
 
-def test_colours_are_changed_as_kornia_changes_an_image():
+def test_colors_are_changed_as_kornia_changes_an_image():
     cloud = cloud_in_base((50, 80))
     step = RandomColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
     factors = step.make_params(cloud, Streams.of(seeded(2), 2))["factors"]
@@ -118,7 +118,7 @@ def test_colours_are_changed_as_kornia_changes_an_image():
         assert abs(float(hue)) <= 0.1
 
 
-def test_colours_stay_colours_at_the_extremes():
+def test_colors_stay_colors_at_the_extremes():
     step = RandomColorJitter(brightness=1.0, contrast=1.0, saturation=1.0, hue=0.5)
     cloud = cloud_in_base((200,))
     for seed in range(20):
@@ -134,8 +134,8 @@ def test_no_change_is_no_change():
     torch.testing.assert_close(still.colors, cloud.colors, atol=1e-5, rtol=0)
 
 
-def test_a_cloud_without_colours_and_a_hue_beyond_half_a_turn_are_refused():
-    with pytest.raises(DTypeError, match="has no colours"):
+def test_a_cloud_without_colors_and_a_hue_beyond_half_a_turn_are_refused():
+    with pytest.raises(DTypeError, match="has no colors"):
         RandomColorJitter()(cloud_in_base().with_fields(colors=None), generator=seeded(0))
     with pytest.raises(ConfigError, match=r"hue is in turns, at most 0\.5, got 0\.6"):
         RandomColorJitter(hue=0.6)

@@ -15,7 +15,7 @@ from pcdata.structures import Camera, DepthFrame
 from pcdata.transforms import RandomSensorNoise
 
 QUIET = {"flying_pixels": 0.0, "edge_dropout": 0.0, "dropout": 0.0, "grazing_degrees": 90.0}
-CAMERAS = [profile.name for profile in sensor_profiles().values() if profile.is_organised]
+CAMERAS = [profile.name for profile in sensor_profiles().values() if profile.is_organized]
 
 
 def frame_of(depth: torch.Tensor, focal: float = 600.0) -> DepthFrame:
@@ -134,7 +134,7 @@ def test_samples_epochs_and_views_have_noise_of_their_own():
 
 
 def test_a_lidar_gives_no_depth_images():
-    with pytest.raises(ConfigError, match="velodyne_vlp16 gives unorganised points"):
+    with pytest.raises(ConfigError, match="velodyne_vlp16 gives unorganized points"):
         RandomSensorNoise(sensor="velodyne_vlp16")
     with pytest.raises(ConfigError, match="unknown sensor 'd435'"):
         RandomSensorNoise(sensor="d435")

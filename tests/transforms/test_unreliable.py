@@ -94,7 +94,7 @@ def test_what_was_known_before_stays_known():
 
 
 def test_a_lidar_gives_no_depth_images():
-    with pytest.raises(ConfigError, match="MarkUnreliableDepth: ouster_os1 gives unorganised points"):
+    with pytest.raises(ConfigError, match="MarkUnreliableDepth: ouster_os1 gives unorganized points"):
         MarkUnreliableDepth(sensor="ouster_os1")
 
 

@@ -49,7 +49,7 @@ def test_zero_rows_fill_up_what_is_short_also_with_replacement():
     assert len(torch.unique(filled.points, dim=0)) == 51
 
 
-def test_a_column_holds_all_heights_about_its_centre():
+def test_a_column_holds_all_heights_about_its_center():
     cloud = cloud_in_base((300,))
     column = RandomColumn(size=0.1, min_points=3)(cloud, generator=seeded(2))
     center = torch.tensor(column.meta[0]["column_center"])

@@ -122,7 +122,7 @@ def test_coverage_scales_with_resolution(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(("x", "y"), [(3, 0), (-3, 0), (0, 3), (0, -3), (4, 4), (-6, 2)])
-def test_shifted_colour_fails_and_the_shift_is_told(x: int, y: int) -> None:
+def test_shifted_color_fails_and_the_shift_is_told(x: int, y: int) -> None:
     frame = scene(num_views=1).frame
     assert frame.colors is not None
     checks = validate_frame(replace(frame, colors=frame.colors.roll((y, x), (1, 2))))
@@ -140,7 +140,7 @@ def test_registration_that_cannot_be_measured_is_unknown_with_the_reason() -> No
     assert check.found.startswith("not measurable: only 0 points")
 
 
-def test_without_colour_or_poses_their_checks_are_left_out() -> None:
+def test_without_color_or_poses_their_checks_are_left_out() -> None:
     bare = replace(scene().frame, colors=None, world_from_camera=None, frame_id=None)
     assert not {"color_registration", "pose", "pose_direction"} & {check.name for check in validate_frame(bare)}
 

@@ -123,7 +123,7 @@ def test_clouds_on_their_images_give_what_the_frame_gives():
         assert one.shift == pytest.approx(other.shift, abs=2e-4)
 
 
-def test_bare_clouds_are_compared_by_nearest_neighbours():
+def test_bare_clouds_are_compared_by_nearest_neighbors():
     frame = rig(2, 4, millimetres=9.0, wrong=3)
     cloud = replace(Compose([Deproject(), ToFrame(frame="base")])(frame), layout=None)
     found = verify_overlap(cloud)

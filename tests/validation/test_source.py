@@ -28,7 +28,7 @@ from tests.validation.captures import SIZE, Frames, scene, store, verdicts
 
 
 def shots(count: int = 3) -> list[DepthFrame]:
-    """Captures of a still scene; colours differ by a grey level, as a sensor's would."""
+    """Captures of a still scene; colors differ by a gray level, as a sensor's would."""
     frames = list(scene(num_views=1).noisy_frames(count))
     return [replace(frame, colors=frame.colors ^ number) for number, frame in enumerate(frames)]  # type: ignore[operator]
 
@@ -255,7 +255,7 @@ def test_times_that_cannot_be_are_refused(folder: Path, text: str, message: str)
 # -- clouds ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_organised_cloud_is_judged_on_coverage_and_range(test_data: Path) -> None:
+def test_an_organized_cloud_is_judged_on_coverage_and_range(test_data: Path) -> None:
     reports = list(validate_source(open_source(test_data / "pcd")))
     by_id = {report.sample_id: report for report in reports}
     mug = by_id["table_scene_mug_stereo_textured"]
@@ -266,7 +266,7 @@ def test_an_organised_cloud_is_judged_on_coverage_and_range(test_data: Path) -> 
     assert failed(milk) == {"behind_camera"}, "this file has z pointing backwards"
 
 
-def test_an_unorganised_cloud_is_judged_on_range_alone(tmp_path: Path) -> None:
+def test_an_unorganized_cloud_is_judged_on_range_alone(tmp_path: Path) -> None:
     points = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 0.5])
     write_pcd(tmp_path / "good.pcd", PointCloud(points=points, frame_id="camera"))
     write_pcd(tmp_path / "tenfold.pcd", PointCloud(points=10 * points, frame_id="camera"))
@@ -282,7 +282,7 @@ def test_an_unorganised_cloud_is_judged_on_range_alone(tmp_path: Path) -> None:
 
 
 def test_a_real_hand_held_recording_has_right_poses_and_no_false_alarm_but_registration(test_data: Path) -> None:
-    """Its depth is not registered to its colour exactly, as its makers say; everything else is in order."""
+    """Its depth is not registered to its color exactly, as its makers say; everything else is in order."""
     source = open_source(test_data / "seven_scenes", limit=6)
     for report in validate_source(source, limits=CaptureLimits(workspace=(0.3, 5.0))):
         assert failed(report) <= {"color_registration"}

@@ -1,7 +1,7 @@
 """Between depth images and points: the pinhole camera with OpenCV's lens distortion.
 
-OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel centres, so pixel (u, v) is seen along
-``K^-1 (u, v, 1)``. Depth is the z coordinate, not the ray length. A skewed K (K[0,1] not 0) is honoured throughout.
+OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel centers, so pixel (u, v) is seen along
+``K^-1 (u, v, 1)``. Depth is the z coordinate, not the ray length. A skewed K (K[0,1] not 0) is honored throughout.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def pixel_rays(
     size: tuple[int, int],  # (height, width)
     distortion: Tensor | None = None,  # (V, D)
 ) -> Tensor:  # (V, H, W, 2) float64
-    """Return (x/z, y/z) of the ray seen by every pixel centre; NaN where the lens model has no inverse.
+    """Return (x/z, y/z) of the ray seen by every pixel center; NaN where the lens model has no inverse.
 
     Such pixels lie outside the lens circle (the corners of some wide-angle images) and should hold no reading.
 

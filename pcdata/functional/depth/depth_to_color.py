@@ -1,4 +1,4 @@
-"""Depth registered to colour: what the colour camera would measure, from what the depth camera did."""
+"""Depth registered to color: what the color camera would measure, from what the depth camera did."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _BAND = 1 << 16  # pixels handled at once on a CPU: the dozens of intermediate i
 
 
 class RegisteredDepth(NamedTuple):
-    """Depth in the colour image, and who hides whom."""
+    """Depth in the color image, and who hides whom."""
 
-    depth: Tensor  # (V, Hc, Wc) float32 metres along the colour camera's z, 0 = no reading
+    depth: Tensor  # (V, Hc, Wc) float32 metres along the color camera's z, 0 = no reading
     pixel_index: Tensor  # (V, Hc, Wc) int64: the pixel v * W + u of the depth image it comes from, -1 = none
     occluding: Tensor  # (V, Hc, Wc) bool: a farther reading was hidden here by this nearer surface
-    hidden: Tensor  # (V, H, W) bool: a reading that the colour camera does not see; it must not take its colour there
+    hidden: Tensor  # (V, H, W) bool: a reading that the color camera does not see; it must not take its color there
 
 
 class _View(NamedTuple):
@@ -40,11 +40,11 @@ class _View(NamedTuple):
 
 
 class _Projection(NamedTuple):
-    """Where the colour camera sees some rows of depth pixels; each (h, W)."""
+    """Where the color camera sees some rows of depth pixels; each (h, W)."""
 
     u: Tensor
     v: Tensor
-    depth: Tensor  # float32, metres along the colour camera's z
+    depth: Tensor  # float32, metres along the color camera's z
     visible: Tensor  # bool: has a reading, lies before the camera and within the lens model
 
 
@@ -61,21 +61,21 @@ class _Projection(NamedTuple):
 def register_depth(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
     intrinsics: Tensor,  # (V, 3, 3) of the depth camera
-    color_intrinsics: Tensor,  # (V, 3, 3) of the colour camera, at color_size
+    color_intrinsics: Tensor,  # (V, 3, 3) of the color camera, at color_size
     color_from_depth: Tensor,  # (V, 4, 4) float64 rigid
     *,
     color_size: tuple[int, int],  # (height, width)
     distortion: Tensor | None = None,  # (V, D) of the depth camera
-    color_distortion: Tensor | None = None,  # (V, E) of the colour camera
+    color_distortion: Tensor | None = None,  # (V, E) of the color camera
     max_jump: float = 0.02,
     backend: str = "auto",
 ) -> RegisteredDepth:
-    """Render the depth readings as the colour camera sees them, nearest first, without cracks.
+    """Render the depth readings as the color camera sees them, nearest first, without cracks.
 
-    Every reading covers a cell of the colour image: the box around its four corners. Where the four pixels around a
+    Every reading covers a cell of the color image: the box around its four corners. Where the four pixels around a
     corner lie on one surface (depths within ``max_jump`` of the nearest), the corner is the mean of their projections,
     shared by all four: their cells leave no crack, whatever the sizes of the images. At an edge or a hole a pixel ends
-    half a pixel from its centre. A colour pixel takes the nearest of the readings whose cells hold its centre (of
+    half a pixel from its center. A color pixel takes the nearest of the readings whose cells hold its center (of
     equally near ones the first); nothing is interpolated.
 
     A reading is ``hidden`` if it projects outside the image, or onto a surface nearer by more than ``max_jump``.
@@ -122,10 +122,10 @@ def check_cameras(
 
 
 def half_pixels(intrinsics: Tensor, color_intrinsics: Tensor, color_from_depth: Tensor) -> Tensor:
-    """Return (V, 2) float64: half the width and height, in colour pixels, of the box around a depth pixel.
+    """Return (V, 2) float64: half the width and height, in color pixels, of the box around a depth pixel.
 
     It is that of a pixel that faces its camera and is as far from both; it grows with the depth in the depth camera
-    over the depth in the colour camera.
+    over the depth in the color camera.
     """
     focal, color_focal = (k.double().diagonal(dim1=1, dim2=2)[:, :2] for k in (intrinsics, color_intrinsics))
     return 0.5 * ((color_from_depth[:, :2, :2].abs() / focal[:, None]).sum(2) * color_focal)
@@ -136,7 +136,7 @@ def _register_view(view: _View, size: tuple[int, int], max_jump: float) -> tuple
     height, width = view.depth.shape
     projections = []
     for start, stop in _bands(view.depth):
-        # One more row on each side: the corners of a pixel depend on its neighbours.
+        # One more row on each side: the corners of a pixel depend on its neighbors.
         first, last = max(0, start - 1), min(height, stop + 1)
         rows = slice(start - first, stop - first)
         seen = _project(view, first, last)
@@ -167,7 +167,7 @@ def _bands(image: Tensor) -> Iterator[tuple[int, int]]:
 
 
 def _project(view: _View, first: int, last: int) -> _Projection:
-    """Move the readings of some rows into the colour camera and project them, in float32 (a thousandth of a pixel)."""
+    """Move the readings of some rows into the color camera and project them, in float32 (a thousandth of a pixel)."""
     depth = view.depth[first:last]
     x, y = (part[first:last] for part in view.rays)
     moved = [((a * x + b * y + c) * depth).add_(d) for a, b, c, d in view.color_from_depth[:3].tolist()]
@@ -184,7 +184,7 @@ def _project(view: _View, first: int, last: int) -> _Projection:
 
 
 def _behind(seen: _Projection, registered: Tensor, max_jump: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Say which pixels lie outside the colour image and which behind its surface, and the colour pixel of each."""
+    """Say which pixels lie outside the color image and which behind its surface, and the color pixel of each."""
     height, width = registered.shape
     u, v = (seen.u + 0.5).floor_(), (seen.v + 0.5).floor_()
     outside = ~(seen.visible & (u >= 0) & (u < width) & (v >= 0) & (v < height))

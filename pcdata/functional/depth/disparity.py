@@ -49,8 +49,8 @@ def spatial_filter(
 ) -> Tensor:  # (V, H, W) float32
     """Smooth surfaces and keep edges: exponential averages along rows, then columns, forth and back.
 
-    A pixel takes ``alpha`` of its own value and the rest of the average that arrives from its neighbour, but starts
-    anew if the neighbour has no reading or differs by ``delta`` or more. It runs step by step along one axis and on
+    A pixel takes ``alpha`` of its own value and the rest of the average that arrives from its neighbor, but starts
+    anew if the neighbor has no reading or differs by ``delta`` or more. It runs step by step along one axis and on
     whole rows at a time across it; time grows with ``iterations`` alone. No gradient flows through it.
 
     Args:

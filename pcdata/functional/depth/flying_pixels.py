@@ -8,7 +8,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import Count, Positive
 
-_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbours is compared once
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbors is compared once
 
 
 @op(depth="V H W : depth", tolerance=Positive(finite=False), min_neighbors=Count(1, 8))
@@ -19,17 +19,17 @@ def flying_pixel_mask(
     min_neighbors: int = 3,
     backend: str = "auto",
 ) -> Tensor:  # (V, H, W) bool, True = flying pixel
-    """Mark readings beside a depth edge that share a surface with too few of their eight neighbours.
+    """Mark readings beside a depth edge that share a surface with too few of their eight neighbors.
 
-    Two neighbours share a surface if their depths differ by at most ``tolerance`` times the nearer one; two readings
+    Two neighbors share a surface if their depths differ by at most ``tolerance`` times the nearer one; two readings
     that do not lie across an edge from each other. Relative to depth, the slope of a surface gives the same difference
     at any distance: 0.02 bears one tilted by 85 degrees at 600 pixels focal length. Lines that are one pixel wide go as
-    well (their pixels have two neighbours); a reading with nothing but holes around it stays.
+    well (their pixels have two neighbors); a reading with nothing but holes around it stays.
 
     Args:
         depth: the images.
         tolerance: as a part of the depth; sensor noise of three standard deviations should fit in.
-        min_neighbors: 1..8 neighbours that a good reading has on its surface.
+        min_neighbors: 1..8 neighbors that a good reading has on its surface.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:

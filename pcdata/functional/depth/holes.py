@@ -1,4 +1,4 @@
-"""Fill the holes of a depth image from its neighbours."""
+"""Fill the holes of a depth image from its neighbors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def fill_holes(
     """Give pixels without a reading the depth of a reading beside them; readings stay as they are.
 
     ``left`` copies the next reading to the left in the row. The others go inwards from the rim of a hole, a layer of
-    pixels at a time: each pixel takes, of those of its four neighbours that have a depth by then, the farthest
+    pixels at a time: each pixel takes, of those of its four neighbors that have a depth by then, the farthest
     (background, the safe guess in a stereo shadow) or the nearest. Nothing is blended. ``distance`` counts the columns
     or the layers from the reading; 0 = not filled. A pixel that no reading leads to stays empty.
 
@@ -103,7 +103,7 @@ def _fill_inwards(depth: Tensor, wanted: Tensor, *, farthest: bool) -> tuple[Ten
         distance[layer] = step
         waiting[layer] = False
         candidates = near[waiting[near]]
-        # Several neighbours lead to one pixel: the last to sign for it keeps it.
+        # Several neighbors lead to one pixel: the last to sign for it keeps it.
         distance[candidates] = ticket = torch.arange(len(candidates), dtype=torch.int64, device=depth.device)
         layer = candidates[distance[candidates] == ticket]
     return tuple(  # type: ignore[return-value]

@@ -93,9 +93,9 @@ def resize_depth(
     max_jump: float | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # depth (V, h, w) float32 metres; pixel_index (V, h, w) int64
-    """Sample the depth at the pixel centres of an image of another size.
+    """Sample the depth at the pixel centers of an image of another size.
 
-    Pixel centres are at integers and both images span the same field: new pixel i lies at ``(i + 0.5) H / h - 0.5``,
+    Pixel centers are at integers and both images span the same field: new pixel i lies at ``(i + 0.5) H / h - 0.5``,
     as :meth:`pcdata.structures.Camera.resized` has it. Each takes the nearest pixel (``pixel_index``, ``v * W + u``;
     of two equally near ones the lower right), as OpenCV's INTER_NEAREST_EXACT does.
 
@@ -110,8 +110,8 @@ def resize_depth(
     """
     if 0 in depth.shape[1:]:
         raise ShapeError(f"resize_depth: an image of {tuple(depth.shape[1:])} has no pixels")
-    row = _centres(depth.shape[1], size[0], depth.device)
-    column = _centres(depth.shape[2], size[1], depth.device)
+    row = _centers(depth.shape[1], size[0], depth.device)
+    column = _centers(depth.shape[2], size[1], depth.device)
     index = _nearest(row, depth.shape[1])[:, None] * depth.shape[2] + _nearest(column, depth.shape[2])
     nearest = depth.flatten(1)[:, index.flatten()].reshape(len(depth), *size)
     pixel_index = index.expand(len(depth), -1, -1).contiguous()
@@ -129,8 +129,8 @@ def resize_depth(
     return torch.where(one_surface, 1 / torch.lerp(top, bottom, down[:, None]), nearest), pixel_index
 
 
-def _centres(old: int, new: int, device: torch.device) -> Tensor:
-    """Return where the (new,) pixel centres lie among the old ones, float64."""
+def _centers(old: int, new: int, device: torch.device) -> Tensor:
+    """Return where the (new,) pixel centers lie among the old ones, float64."""
     return (torch.arange(new, dtype=torch.float64, device=device) + 0.5) * (old / new) - 0.5
 
 

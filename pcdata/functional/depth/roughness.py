@@ -15,13 +15,13 @@ _MEDIAN_OF_NORMAL = 0.6744897501960817  # the median of |x| for a standard norma
 def depth_roughness(
     depth: Tensor,  # (V, H, W) float64 metres, 0 = no reading
     noise: Tensor,  # (V, H, W) metres: standard deviation of a reading
-    edge: Tensor,  # (V, H, W) metres: neighbours that differ by more lie on another surface
+    edge: Tensor,  # (V, H, W) metres: neighbors that differ by more lie on another surface
 ) -> Tensor:  # (V, H, W): 1 = as rough as the noise, 0 without a reading, inf = fits no reading around it
     """Return the local noise as a multiple of the expected one.
 
     Along rows and columns the second difference of 1 / depth is zero on every plane, however tilted, and has sqrt(6)
     times the standard deviation of one value. The estimate is the median of its magnitude over 5 x 5 pixels, which a
-    depth edge through the window does not move. A reading that differs by an edge from all its 4-neighbours that read
+    depth edge through the window does not move. A reading that differs by an edge from all its 4-neighbors that read
     gets infinity; with less than half of the window's differences (at corners, among holes) the estimate is 0.
 
     Source: Immerkaer, Fast noise variance estimation, 1996, for second differences as a measure of noise.

@@ -79,7 +79,7 @@ def quantized(values: Tensor, step: float) -> Tensor:
 
 
 def facing_depth(depth: Tensor) -> Tensor:
-    """Return, for every pixel of (V, H, W), the depth of that 4-neighbour which differs most; 0 = nothing there."""
+    """Return, for every pixel of (V, H, W), the depth of that 4-neighbor which differs most; 0 = nothing there."""
     padded = torch.nn.functional.pad(depth[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
     sides = [padded[:, :-2, 1:-1], padded[:, 2:, 1:-1], padded[:, 1:-1, :-2], padded[:, 1:-1, 2:]]
     neighbors = torch.stack(sides)
@@ -97,7 +97,7 @@ def surface_slope(
     """Return how steeply the surface at each pixel leads away from the sensor; 0 without readings around.
 
     Of the two sides of a pixel the flatter one counts, so that a jump to another surface is no slope; that the ray is
-    oblique off the image's centre is left out.
+    oblique off the image's center is left out.
     """
     across = [_flatter_side(depth, dim, reach, tolerance) * focal / (reach * depth.clamp(min=1e-9)) for dim in (1, 2)]
     sloped = (depth > 0) & ((across[0] > 0) | (across[1] > 0))

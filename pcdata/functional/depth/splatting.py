@@ -29,9 +29,9 @@ class ZBuffer:
         *,
         first_index: int,  # of the first of these pixels
     ) -> None:
-        """Paint every pixel over the centres of this image that its cell holds: left <= u < right, top <= v < bottom.
+        """Paint every pixel over the centers of this image that its cell holds: left <= u < right, top <= v < bottom.
 
-        Half-open, so that a centre on a side that two cells share belongs to one of them.
+        Half-open, so that a center on a side that two cells share belongs to one of them.
         """
         if depth.numel() == 0:
             return
@@ -72,8 +72,8 @@ def on_one_surface(depth: Tensor, max_jump: float) -> Tensor:
 def cell_of_pixels(center: Tensor, half: Tensor, linked: Tensor) -> tuple[Tensor, Tensor]:
     """Return one coordinate's lower and upper end of every pixel's cell, the box around its four corners.
 
-    A corner at which four pixels are linked is the mean of their centres, so their cells meet there; at any other the
-    pixel ends ``half`` from its centre.
+    A corner at which four pixels are linked is the mean of their centers, so their cells meet there; at any other the
+    pixel ends ``half`` from its center.
 
     Args:
         center: (h, W) the coordinate of the pixels.

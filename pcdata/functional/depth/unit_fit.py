@@ -76,8 +76,8 @@ _NEAREST = 0.01  # metres: no median lies nearer
 _BLOCK = 24  # pixels: side of the squares in which roughness is measured
 _BANDS = 10  # of squares, across and down: some two hundred squares tell as much as all
 _SPACING = 4  # pixels between the three readings of a second difference: beyond the matching window's correlation
-_SMOOTH = 0.05  # of the depth: neighbours on one surface differ by less
-_LEAST_SMOOTH = 0.7  # of neighbours in any depth image; half as many where bits are out of order
+_SMOOTH = 0.05  # of the depth: neighbors on one surface differ by less
+_LEAST_SMOOTH = 0.7  # of neighbors in any depth image; half as many where bits are out of order
 _SMOOTH_ROWS = 48  # looked at
 _QUANTILE = 40.0  # per cent of the blocks: the flatter half, where roughness is noise and not shape
 _DIVIDED = 1 << 11  # readings
@@ -85,7 +85,7 @@ _PIXELS = 1 << 17  # looked at: shares are known to 0.4 %
 
 # Disparity noise over baseline, sigma focal / z^2 in pixels per metre: measured on seven sensors 0.27 to 2.9, most
 # within 0.65 and 1.5. Time of flight: a sigma of 1 to 3 mm, whatever the distance.
-_STEREO_NOISE = (0.8, 0.55)  # centre, spread of the logarithm
+_STEREO_NOISE = (0.8, 0.55)  # center, spread of the logarithm
 _FLIGHT_NOISE = (0.0015, 0.5)
 _FLIGHT_RARER = -0.7
 # Disparity step over baseline, in pixels per metre: 1/32 of a pixel over 0.1 m, to 1/8 over 0.075 m and a margin.
@@ -175,7 +175,7 @@ class _Traces(NamedTuple):
     """What a scale leaves behind in an image, in units as stored."""
 
     median: float
-    smooth: float  # share of neighbours that lie on one surface
+    smooth: float  # share of neighbors that lie on one surface
     roughness: float | None  # sigma / z^2, in 1 / unit; None = nothing flat enough to tell
     is_rounding: bool  # the roughness is no more than that of rounding to whole units
     step: float | None  # distance of the values that occur / z^2, in 1 / unit, where it is more than rounding's
@@ -248,7 +248,7 @@ def _divisor(readings: NDArray[np.float64]) -> int:
 
 
 def _step(readings: NDArray[np.float64], divisor: int) -> float | None:
-    """Return the usual distance of neighbouring values that occur, over the depth squared, if it is no rounding's."""
+    """Return the usual distance of neighboring values that occur, over the depth squared, if it is no rounding's."""
     values, counts = np.unique(readings, return_counts=True)
     values = values[counts >= max(2, len(readings) // 20_000)]
     if len(values) < 20:
@@ -262,7 +262,7 @@ def _step(readings: NDArray[np.float64], divisor: int) -> float | None:
 
 
 def _smooth_share(depth: NDArray[np.float64]) -> float:
-    """Return the share of neighbours that lie on one surface."""
+    """Return the share of neighbors that lie on one surface."""
     a, b = depth[:, :-1], depth[:, 1:]
     both = (a > 0) & (b > 0)
     if not both.any():

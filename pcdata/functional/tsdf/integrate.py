@@ -153,7 +153,7 @@ def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tens
 
 
 def bend(x: Tensor, y: Tensor, r2: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Bend normalised coordinates as the lens does, in float32 and in the order of operations that kernels repeat."""
+    """Bend normalized coordinates as the lens does, in float32 and in the order of operations that kernels repeat."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = c.unbind()
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     xy = (2 * x) * y

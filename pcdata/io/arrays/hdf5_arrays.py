@@ -90,7 +90,7 @@ def read_group(group: Any, file_bytes: int) -> dict[str, NDArray[Any]]:
     return {name: dataset[...] for name, dataset in datasets.items()}
 
 
-def checked_dataset(group: Any, name: str, file_bytes: int) -> Hdf5Array | Hdf5Deflated:
+def checked_dataset(group: Any, name: str, file_bytes: int) -> _Hdf5Array | _Hdf5Deflated:
     """Return a dataset, unread, that lies in this very file and is no larger than its bytes allow.
 
     Raises:
@@ -129,8 +129,8 @@ def checked_dataset(group: Any, name: str, file_bytes: int) -> Hdf5Array | Hdf5D
             )
     check_packing(where, claimed, stored)
     if _DEFLATE in filters:
-        return Hdf5Deflated(where, found, shape, chunks, dtype, filters, stored)
-    return Hdf5Array(found, shape, dtype, stored)
+        return _Hdf5Deflated(where, found, shape, chunks, dtype, filters, stored)
+    return _Hdf5Array(found, shape, dtype, stored)
 
 
 def _is_hard(group: Any, name: str) -> bool:
@@ -142,7 +142,7 @@ def _is_hard(group: Any, name: str) -> bool:
         return False
 
 
-class Hdf5Array:
+class _Hdf5Array:
     """A dataset that HDF5 reads: not packed, or by LZF."""
 
     def __init__(self, dataset: Any, shape: tuple[int, ...], dtype: np.dtype, stored_bytes: int) -> None:
@@ -161,7 +161,7 @@ class Hdf5Array:
         return result
 
 
-class Hdf5Deflated(ChunkGrid):
+class _Hdf5Deflated(ChunkGrid):
     """A dataset of deflated chunks, each unpacked to exactly its size."""
 
     def __init__(

@@ -44,7 +44,7 @@ def new_hdf5(path: Path) -> Iterator[tuple[Any, FaultKeepingFile]]:
 
 
 class FaultKeepingFile:
-    """A file object for ``h5py.File`` whose writes never fail towards HDF5."""
+    """A file object for ``h5py.File`` whose writes never fail toward HDF5."""
 
     def __init__(self, path: Path) -> None:
         """Open a file for reading and writing; it is made where there is none.

@@ -25,14 +25,14 @@ _MAX_FOLDERS = 100_000  # that are searched for arrays
 _MAX_DEPTH = 16
 
 
-def zarr_array(folder: Path, name: str) -> ZarrArray | None:
+def zarr_array(folder: Path, name: str) -> _ZarrArray | None:
     """Return the array at a path inside a zarr v2 directory; None if there is none.
 
     Raises:
         CacheError: zarr v3, or a header that cannot be read or be true.
     """
     place = folder.joinpath(*(part for part in name.split("/") if part not in ("", ".", "..")))
-    return ZarrArray(place, folder) if os.path.lexists(place / ".zarray") else None
+    return _ZarrArray(place, folder) if os.path.lexists(place / ".zarray") else None
 
 
 def zarr_names(folder: Path, most: int) -> list[str]:
@@ -62,7 +62,7 @@ def _names_below(folder: Path) -> Iterator[str]:
             return
 
 
-class ZarrArray(ChunkGrid):
+class _ZarrArray(ChunkGrid):
     """One array: ``array[3]`` reads the chunks of one row, ``array[...]`` all.
 
     Every chunk must be there: zarr reads a missing one as the fill value, so that a wrong byte in the header, or a copy
@@ -98,7 +98,7 @@ class ZarrArray(ChunkGrid):
         if self._scalar:
             self.shape = ()
 
-    def checked(self) -> ZarrArray:
+    def checked(self) -> _ZarrArray:
         """Return this array once its codecs are known and its chunks are there, no more and no fewer.
 
         Raises:

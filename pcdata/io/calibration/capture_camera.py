@@ -78,7 +78,7 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     ``camera``, its name there, and ``folders``, names of folders by role; ``notes``, ``sensor``, ``serial``,
     ``registered_to`` and ``date`` are free remarks.
 
-    Any other key is an error, because a misspelt ``distortion`` that is ignored bends every cloud.
+    Any other key is an error, because a misspelled ``distortion`` that is ignored bends every cloud.
 
     Raises:
         CaptureError: the file is missing, no JSON object, lacks or repeats a key, or a value is impossible.

@@ -85,7 +85,7 @@ def to_cloud(
 
 
 def from_cloud(where: str, cloud: PointCloud) -> CloudArrays:
-    """Return the arrays of a single cloud, colours as uint8; ``source_index`` is left behind.
+    """Return the arrays of a single cloud, colors as uint8; ``source_index`` is left behind.
 
     Raises:
         ShapeError: the cloud is a batch.

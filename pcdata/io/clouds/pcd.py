@@ -41,7 +41,7 @@ def read_pcd(
     its like (see :func:`read_ply`) ``labels``, ``vp_x vp_y vp_z`` the viewpoint of each point, every other field an
     extra. Points whose x, y or z is NaN or infinite carry no reading and are dropped; ``source_index`` keeps the row in
     the file. ``viewpoint`` is the translation of VIEWPOINT; ``meta[0]["viewpoint"]`` has all seven numbers
-    (tx ty tz qw qx qy qz), ``meta[0]["organised_size"]`` is [H, W] when the rows are the pixels of an image. A file
+    (tx ty tz qw qx qy qz), ``meta[0]["organized_size"]`` is [H, W] when the rows are the pixels of an image. A file
     that pcdata wrote comes back in its frame and unit, with the way to its source.
 
     Args:
@@ -67,7 +67,7 @@ def read_pcd(
     }
     meta: dict[str, Any] = {"viewpoint": list(header.viewpoint)}
     if header.height > 1:
-        meta["organised_size"] = [header.height, header.width]
+        meta["organized_size"] = [header.height, header.width]
     is_own = statement.frame_id is not None
     return to_cloud(
         where,
@@ -82,9 +82,9 @@ def read_pcd(
 
 @locates_path
 def write_pcd(path: str | os.PathLike[str], cloud: PointCloud, *, encoding: str = "binary") -> None:
-    """Write one cloud as PCD 0.7; colours are rounded to 8 bits, as the format has them.
+    """Write one cloud as PCD 0.7; colors are rounded to 8 bits, as the format has them.
 
-    Written: points, normals, colours (``rgb``), labels, extra fields, viewpoint; as comments, which :func:`read_pcd`
+    Written: points, normals, colors (``rgb``), labels, extra fields, viewpoint; as comments, which :func:`read_pcd`
     understands and others skip: frame, unit, the way back to the source frame, known frames, and what each extra field
     is. Not written: ``meta``, ``history``, ``layout``, ``source_index``.
 

@@ -74,9 +74,9 @@ def read_ply(
 
 @locates_path
 def write_ply(path: str | os.PathLike[str], cloud: PointCloud | SurfaceMesh, *, encoding: str = "binary") -> None:
-    """Write one cloud, or a mesh, as PLY; colours are rounded to 8 bits.
+    """Write one cloud, or a mesh, as PLY; colors are rounded to 8 bits.
 
-    Written: points, normals, colours, labels, extra fields (many columns become ``name_0``, ``name_1``, ...); as
+    Written: points, normals, colors, labels, extra fields (many columns become ``name_0``, ``name_1``, ...); as
     comments, which :func:`read_ply` understands and others skip: frame, unit, viewpoint, the way back to the source
     frame, known frames, and what each extra field is. Not written: ``meta``, ``history``, ``layout``, ``source_index``.
 

@@ -23,7 +23,7 @@ BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": "
 
 
 @dataclass(frozen=True)
-class Property:
+class _Property:
     """One property of an element; a list has the type of its length too."""
 
     name: str
@@ -37,7 +37,7 @@ class Element:
 
     name: str
     count: int
-    properties: tuple[Property, ...]
+    properties: tuple[_Property, ...]
 
     @property
     def row_dtype(self) -> np.dtype | None:
@@ -48,7 +48,7 @@ class Element:
 
 
 @dataclass(frozen=True)
-class PlyHeader:
+class _PlyHeader:
     """What a header says, and where the data begins."""
 
     encoding: str
@@ -57,7 +57,7 @@ class PlyHeader:
     size: int  # bytes
 
 
-def parse_header(where: str, data: bytes) -> PlyHeader:
+def parse_header(where: str, data: bytes) -> _PlyHeader:
     """Read the header.
 
     Raises:
@@ -69,7 +69,7 @@ def parse_header(where: str, data: bytes) -> PlyHeader:
         raise CaptureError(f"{where}: not a PLY file: 'ply' and, within {_MAX_HEADER} bytes, 'end_header' are needed")
     encoding = ""
     names: list[tuple[str, int]] = []
-    properties: list[list[Property]] = []
+    properties: list[list[_Property]] = []
     comments = []
     for line in head[: end.start()].decode("ascii", "replace").split("\n")[1:]:
         match line.split():
@@ -85,9 +85,9 @@ def parse_header(where: str, data: bytes) -> PlyHeader:
             case ["property", "list", size, kind, name] if (
                 names and _TYPES.get(size, "f")[0] in "iu" and kind in _TYPES
             ):
-                properties[-1].append(Property(name, _dtype(encoding, kind), _dtype(encoding, size)))
+                properties[-1].append(_Property(name, _dtype(encoding, kind), _dtype(encoding, size)))
             case ["property", kind, name] if names and kind in _TYPES:
-                properties[-1].append(Property(name, _dtype(encoding, kind)))
+                properties[-1].append(_Property(name, _dtype(encoding, kind)))
             case _:
                 raise CaptureError(f"{where}: header line {line!r:.100} is not known, or not allowed at that place")
     elements = [Element(name, count, tuple(entries)) for (name, count), entries in zip(names, properties)]
@@ -98,7 +98,7 @@ def parse_header(where: str, data: bytes) -> PlyHeader:
     if [element.name for element in elements].count("vertex") != 1:
         found = ", ".join(repr(name)[:60] for name, _ in names[:8]) or "none"
         raise CaptureError(f"{where}: exactly one element 'vertex' is needed, but the file has {found}")
-    return PlyHeader(encoding, elements, comments, min(end.end(), len(data)))
+    return _PlyHeader(encoding, elements, comments, min(end.end(), len(data)))
 
 
 def check_header_size(where: str, header: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What the named columns of a cloud file mean: coordinates, normals, colours, labels, extra fields.
+"""What the named columns of a cloud file mean: coordinates, normals, colors, labels, extra fields.
 
 Names are those that CloudCompare, MeshLab, Open3D, PCL, Blender and the common data sets write, in any case, with or
 without the prefixes ``scalar_`` and ``vertex_``. What a name could mean twice is asked about, never guessed.
@@ -70,7 +70,7 @@ def arrays_of_columns(
         raise CaptureError(f"{where}: fields x, y and z are needed, one value each, but the file has {found}")
     stated = {name: _stated(where, name, columns, statement) for name in statement.fields}
     normals = _one_triple(where, columns, _NORMALS, "normals")
-    rgb = _one_triple(where, columns, _COLORS, "colours")
+    rgb = _one_triple(where, columns, _COLORS, "colors")
     packed = [name for name in columns if name.lower() in _PACKED and columns[name].dtype.itemsize == 4]
     if rgb is None and packed:
         rgb = _unpacked(where, packed[0], columns.pop(packed[0]))
@@ -111,7 +111,7 @@ def _triple(columns: Columns, wanted: Iterable[str]) -> NDArray[Any] | None:
 
 
 def _one_triple(where: str, columns: Columns, choices: Iterable[tuple[str, ...]], what: str) -> NDArray[Any] | None:
-    """Take the columns of a vector or a colour; a part of one, or two of them, cannot be told what they are."""
+    """Take the columns of a vector or a color; a part of one, or two of them, cannot be told what they are."""
     present = {names: [name for name in names if _column(columns, name)] for names in choices}
     whole = [names for names, own in present.items() if len(own) == 3]
     if len(whole) > 1:

@@ -38,7 +38,7 @@ _NAMED_UNIT = re.compile(
 
 
 @dataclass(frozen=True)
-class FieldFacts:
+class _FieldFacts:
     """How an extra field was held: its kind, dtype, and number of columns (0 = one value per point)."""
 
     kind: Kind
@@ -57,7 +57,7 @@ class CloudStatement:
     source_frame: str | None = None
     source_from_cloud: Tensor | None = None
     frames: dict[str, Tensor] = field(default_factory=dict)
-    fields: dict[str, FieldFacts] = field(default_factory=dict)
+    fields: dict[str, _FieldFacts] = field(default_factory=dict)
     named_unit: tuple[str, str] | None = None  # the unit that somebody else's comment names, and the comment
 
     def frame(self, where: str, given: str | None) -> str:
@@ -185,7 +185,7 @@ def _take(found: CloudStatement, key: str, value: Any) -> None:
         name, kind, dtype, columns = value
         if dtype not in _DTYPES or type(columns) is not int or not 0 <= columns <= 1 << 16:
             raise ValueError(f"{columns!r:.40} columns of {dtype!r:.40}")
-        found.fields[_new(_text(name), found.fields)] = FieldFacts(Kind(kind), dtype, columns)
+        found.fields[_new(_text(name), found.fields)] = _FieldFacts(Kind(kind), dtype, columns)
     else:
         raise ValueError(f"no such fact {key!r:.40}")
 

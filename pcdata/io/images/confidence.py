@@ -17,7 +17,7 @@ from pcdata.structures import Confidence
 
 @locates_path
 def read_confidence(path: str | os.PathLike[str]) -> Tensor:  # (H, W) uint8
-    """Read an 8-bit grey PNG of the values of :class:`Confidence`.
+    """Read an 8-bit gray PNG of the values of :class:`Confidence`.
 
     Raises:
         CaptureError: the file is missing, damaged, of another type, or holds other values.
@@ -33,7 +33,7 @@ def read_confidence(path: str | os.PathLike[str]) -> Tensor:  # (H, W) uint8
 
 
 def write_confidence(path: str | os.PathLike[str], confidence: Tensor) -> None:
-    """Write (H, W) uint8 values of :class:`Confidence` as an 8-bit grey PNG.
+    """Write (H, W) uint8 values of :class:`Confidence` as an 8-bit gray PNG.
 
     Raises:
         CaptureError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Depth, colour, label and mask images <-> tensors.
+"""Depth, color, label and mask images <-> tensors.
 
 Nothing is guessed: the unit of depth is an argument, and an image whose type could mean two things is refused.
 """
@@ -44,7 +44,7 @@ def read_depth(
 ) -> Tensor:  # (H, W) float32 metres, 0 = no reading
     """Read a depth image as metres along z, 0 where the sensor had no reading.
 
-    Accepted: 16-bit grey PNG or TIFF, uint16 ``.npy``; float TIFF and float ``.npy``, whose NaN and infinite pixels
+    Accepted: 16-bit gray PNG or TIFF, uint16 ``.npy``; float TIFF and float ``.npy``, whose NaN and infinite pixels
     mean "no reading" and become 0.
 
     Args:
@@ -93,11 +93,11 @@ def read_raw_depth(where: str, path: Path) -> NDArray[Any]:
         return pixels.astype(np.uint16)
     if mode == "F":
         return pixels
-    if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit grey PNG as 32-bit integers
+    if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit gray PNG as 32-bit integers
         return pixels.astype(np.uint16)
-    words = {"L": "8-bit grey", "P": "palette", "1": "1-bit", "RGB": "colour", "RGBA": "colour with alpha"}
+    words = {"L": "8-bit gray", "P": "palette", "1": "1-bit", "RGB": "color", "RGBA": "color with alpha"}
     raise CaptureError(
-        f"{where}: a depth image must be 16-bit grey, but this is a {words.get(mode, mode)} image; is it a picture of "
+        f"{where}: a depth image must be 16-bit gray, but this is a {words.get(mode, mode)} image; is it a picture of "
         "the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
     )
 
@@ -114,10 +114,10 @@ def _read_npy(where: str, path: Path) -> NDArray[Any]:
 
 @locates_path
 def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
-    """Read an 8-bit colour PNG or JPEG as RGB; an alpha channel is dropped, orientation tags are not applied.
+    """Read an 8-bit color PNG or JPEG as RGB; an alpha channel is dropped, orientation tags are not applied.
 
     Raises:
-        CaptureError: the file is missing, damaged, grey, palette, CMYK or deeper than 8 bits per channel.
+        CaptureError: the file is missing, damaged, gray, palette, CMYK or deeper than 8 bits per channel.
     """
     where = f"read_color: {path}"
     check_suffix(where, path, COLOR_SUFFIXES)
@@ -125,18 +125,18 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
     if mode not in ("RGB", "RGBA") or bits == 16:
         found = f"{bits}-bit {mode}" if bits else mode
         raise CaptureError(
-            f"{where}: colour must be 8-bit RGB, but this image is {found}; convert it on purpose "
-            "(for one grey or infrared channel: repeat it three times, or leave the colours out)"
+            f"{where}: color must be 8-bit RGB, but this image is {found}; convert it on purpose "
+            "(for one gray or infrared channel: repeat it three times, or leave the colors out)"
         )
     return torch.from_numpy(np.array(pixels[..., :3]))
 
 
 @locates_path
 def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
-    """Read an 8-bit grey, 16-bit grey or palette PNG of object ids; of a palette the index is the id.
+    """Read an 8-bit gray, 16-bit gray or palette PNG of object ids; of a palette the index is the id.
 
     Raises:
-        CaptureError: the file is missing, damaged, colour, or grey of fewer than 8 bits (which viewers rescale).
+        CaptureError: the file is missing, damaged, color, or gray of fewer than 8 bits (which viewers rescale).
     """
     where = f"read_labels: {path}"
     check_suffix(where, path, (".png",))
@@ -144,14 +144,14 @@ def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
     if not (mode == "P" or (mode == "L" and bits == 8) or (bits == 16 and mode.startswith("I"))):
         raise CaptureError(
             f"{where}: labels must be an 8-bit, 16-bit or palette PNG of ids, but this image is {bits}-bit {mode}; "
-            "map its colours to ids first"
+            "map its colors to ids first"
         )
     return torch.from_numpy(pixels.astype(np.int64))
 
 
 @locates_path
 def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
-    """Read a 1-bit or 8-bit grey PNG as a mask; every value but 0 is inside.
+    """Read a 1-bit or 8-bit gray PNG as a mask; every value but 0 is inside.
 
     Raises:
         CaptureError: the file is missing, damaged, or of another type.
@@ -160,7 +160,7 @@ def read_mask(path: str | os.PathLike[str]) -> Tensor:  # (H, W) bool
     check_suffix(where, path, (".png",))
     mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
     if mode not in ("1", "L"):
-        raise CaptureError(f"{where}: a mask must be a 1-bit or 8-bit grey PNG, but this image is {bits}-bit {mode}")
+        raise CaptureError(f"{where}: a mask must be a 1-bit or 8-bit gray PNG, but this image is {bits}-bit {mode}")
     return torch.from_numpy(pixels != 0)
 
 
@@ -176,13 +176,13 @@ def _check_pixels(where: str, width: int, height: int) -> None:
 
 
 def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDArray[Any], tuple[int, int]]:
-    """Return Pillow's mode, the pixels, and (bit depth, colour type) as a PNG's own header states them, else 0, 0.
+    """Return Pillow's mode, the pixels, and (bit depth, color type) as a PNG's own header states them, else 0, 0.
 
     Pillow gets a file whose structure was checked first: it shows what it can of a damaged one.
     """
     data = read_bytes(where, path, max_bytes=_MAX_BYTES)
     try:
-        # Pillow opens 16-bit colour as 8-bit without a word, so the depth is read from the header.
+        # Pillow opens 16-bit color as 8-bit without a word, so the depth is read from the header.
         depth = (0, 0)
         if _PNG in formats and (data[:8] == PNG_SIGNATURE or formats == (_PNG,)):
             data, *depth_and_type = checked_png(data, MAX_PIXELS)

@@ -1,4 +1,4 @@
-"""Write depth, colour, label and mask images from which the readers return the same values."""
+"""Write depth, color, label and mask images from which the readers return the same values."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def write_labels(
     *,
     background_label: int,
 ) -> None:
-    """Write object ids as a 16-bit grey PNG, with ``background_label`` for "no object".
+    """Write object ids as a 16-bit gray PNG, with ``background_label`` for "no object".
 
     Raises:
         CaptureError: an id is not in -1 .. 65535 or is the background's own, or the file cannot be written.

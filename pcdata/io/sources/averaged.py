@@ -22,7 +22,7 @@ from pcdata.structures import Confidence, DepthFrame, confidence_of
 class AveragedSource(CombinedSource):
     """Averages every ``num_frames`` consecutive captures of a source into one with less noise and fewer holes.
 
-    A sample bears the id, colours, labels, pose and mask of the first capture of its group. Its provenance tells what
+    A sample bears the id, colors, labels, pose and mask of the first capture of its group. Its provenance tells what
     was averaged and what was dropped: ``averaged: {frames, readings, jitter, jumps, too_few, noise}``, counts of
     readings and of pixels, and the median standard deviation of a single reading in metres.
 

@@ -51,7 +51,7 @@ class CloudFilesSource(Source):
         super().__init__(path, self._files, links_to)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """A cloud file, or a folder that holds one."""
         try:
             return any(_is_cloud(entry.name) for entry in (entries(path) if is_folder(path) else [path]))

@@ -18,7 +18,7 @@ def detect_layout(path: Path) -> type[Source]:
     Raises:
         CaptureError: none is, or more than one.
     """
-    fitting = [layout for layout in LAYOUTS.values() if layout.recognises(path)]
+    fitting = [layout for layout in LAYOUTS.values() if layout.recognizes(path)]
     if len(fitting) > 1 and is_folder(path):  # a recording that lies beside a capture is not the capture
         fitting = [layout for layout in fitting if layout is not RealSenseBagSource]
     if len(fitting) == 1:
@@ -39,7 +39,7 @@ def _captures_inside(path: Path) -> str:
         inside = entries(path) if is_folder(path) else []
     except CaptureError:
         return ""
-    found = [entry.name for entry in inside[:100] if any(layout.recognises(entry) for layout in LAYOUTS.values())]
+    found = [entry.name for entry in inside[:100] if any(layout.recognizes(entry) for layout in LAYOUTS.values())]
     return f" A capture by itself: {name_some(found)}; give its path." if found else ""
 
 

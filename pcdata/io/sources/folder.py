@@ -40,7 +40,7 @@ _TIMESTAMPS = "timestamps.json"
 
 
 class FolderSource(Source):
-    """``intrinsics.json``, ``depth/NAME.png``; for all names or none colour, labels, masks, confidence and poses."""
+    """``intrinsics.json``, ``depth/NAME.png``; for all names or none color, labels, masks, confidence and poses."""
 
     kind = "folder"
     needs = (
@@ -139,7 +139,7 @@ class FolderSource(Source):
             self._used.add(times)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """A calibration file and a folder of depth."""
         return os.path.lexists(path / "depth") and any(os.path.lexists(path / name) for name in _CALIBRATIONS)
 

@@ -64,7 +64,7 @@ class GraspNetSource(Source):
         self._positions = positions(self._ids)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """All three files in the folder, or in a folder of it."""
         return any(map(_is_frame, [path, *(_entries(path))]))
 

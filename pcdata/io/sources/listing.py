@@ -153,7 +153,7 @@ def has_folder(path: Path) -> bool:
     return _there(path, is_folder, "folder")
 
 
-class FilesByStem(Mapping[str, Path]):
+class _FilesByStem(Mapping[str, Path]):
     """Files of one folder by name without suffix; a path is made when it is asked for, which most never are."""
 
     def __init__(self, folder: Path, names: Mapping[str, str]) -> None:
@@ -172,7 +172,7 @@ class FilesByStem(Mapping[str, Path]):
         return len(self._names)
 
 
-def by_stem(folder: Path, suffixes: Sequence[str]) -> FilesByStem:
+def by_stem(folder: Path, suffixes: Sequence[str]) -> _FilesByStem:
     """Return the files of a folder by name without suffix.
 
     Raises:
@@ -186,7 +186,7 @@ def by_stem(folder: Path, suffixes: Sequence[str]) -> FilesByStem:
         if stem in found:
             raise CaptureError(f"{folder}: {found[stem]} and {name} are both {stem!r}; remove one")
         found[stem] = name
-    return FilesByStem(folder, found)
+    return _FilesByStem(folder, found)
 
 
 def unread_entries(path: Path, read: set[Path]) -> list[str]:

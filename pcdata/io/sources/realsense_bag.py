@@ -1,8 +1,8 @@
 """Recordings of a RealSense: ``.bag`` files as its viewer and SDK write them.
 
 Source: librealsense, third-party/realsense-file/rosbag: topics ``/device_D/sensor_S/STREAM_I/...``; depth units are an
-option of the depth sensor. The transform of the colour stream is taken as colour from depth; of the four readings
-(either direction, rotation transposed, none) it is the one that lays depth edges on colour edges.
+option of the depth sensor. The transform of the color stream is taken as color from depth; of the four readings
+(either direction, rotation transposed, none) it is the one that lays depth edges on color edges.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class _Stream:
 
 
 class RealSenseBagSource(Source):
-    """The depth images of one recording, in the order of time; with ``registered`` as the colour camera sees them.
+    """The depth images of one recording, in the order of time; with ``registered`` as the color camera sees them.
 
-    Without it nothing is resampled and the colour images, which lie on another grid, are left out. Times are those of
+    Without it nothing is resampled and the color images, which lie on another grid, are left out. Times are those of
     recording, in seconds.
     """
 
@@ -64,13 +64,13 @@ class RealSenseBagSource(Source):
 
         Args:
             path: the file, or a folder that holds one such file.
-            registered: register each depth image to the colour image nearest in time; those without one within
+            registered: register each depth image to the color image nearest in time; those without one within
                 ``max_time_apart`` are left out.
             max_time_apart: seconds; the default is one frame at 30 Hz.
             links_to: folders outside that a link to the recording, in the folder that is given, may lead to.
 
         Raises:
-            CaptureError: no bag or several, damaged, not of one depth camera, or no depth has a colour image near
+            CaptureError: no bag or several, damaged, not of one depth camera, or no depth has a color image near
                 enough.
             UnitError: the recording states no depth unit.
             IntrinsicsError: a camera's numbers are impossible, or its lens model is not one of OpenCV's.
@@ -80,7 +80,7 @@ class RealSenseBagSource(Source):
         where = f"{self.kind} source {path}"
         check_switch(where, "registered", registered)
         check_seconds(where, "max_time_apart", max_time_apart)
-        if not self.recognises(path):
+        if not self.recognizes(path):
             raise CaptureError(f"{where}: is no ROS 1 bag; this layout needs {self.needs}")
         if is_folder(path):
             folder, path = path, _only_bag(where, path)
@@ -99,7 +99,7 @@ class RealSenseBagSource(Source):
         super().__init__(path, [f"{number:06d}" for number in numbers], links_to)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """A file that begins as ROS 1 bags do, or a folder with one."""
         try:
             return any(map(_is_bag, _bag_files(path) if is_folder(path) else [path]))
@@ -111,7 +111,7 @@ class RealSenseBagSource(Source):
         return {"bag": self.path}
 
     def unread(self) -> list[str]:
-        """Name the streams of the recording that are not read, the colour stream among them unless ``registered``."""
+        """Name the streams of the recording that are not read, the color stream among them unless ``registered``."""
         return list(self._unread)
 
     def _load(self, sample_id: str) -> DepthFrame:
@@ -144,7 +144,7 @@ class RealSenseBagSource(Source):
 
 def _is_bag(path: Path) -> bool:
     try:
-        with open_input("recognises", path, max_bytes=MAX_STREAMED_BYTES) as stream:
+        with open_input("recognizes", path, max_bytes=MAX_STREAMED_BYTES) as stream:
             return stream.read(len(MAGIC)) == MAGIC
     except (CaptureError, OSError):
         return False
@@ -172,7 +172,7 @@ def _unread(bag: Bag, read: set[str]) -> list[str]:
         match = _DATA.fullmatch(topic)
         if match and topic not in read:
             use = "; registered=True (--registered) reads it" if match["kind"] == "Color" else ""
-            name = {"Color": "colour"}.get(match["kind"], match["kind"])
+            name = {"Color": "color"}.get(match["kind"], match["kind"])
             told.append(f"{name} stream {topic} ({len(bag.times(topic))} messages){use}")
     return told
 
@@ -226,14 +226,14 @@ def _device(bag: Bag, device: str) -> dict[str, str]:
 
 
 def _partners(where: str, depth: list[int], color: list[int], limit: float) -> dict[int, int]:
-    """Return the colour image nearest in time, of two equally near the earlier, for each depth image that has one."""
+    """Return the color image nearest in time, of two equally near the earlier, for each depth image that has one."""
     instants = np.array(color)
     nearest = {number: int(np.abs(instants - time).argmin()) for number, time in enumerate(depth)}
     apart = {number: abs(color[partner] - depth[number]) / 1e9 for number, partner in nearest.items()}
     kept = {number: partner for number, partner in nearest.items() if apart[number] <= limit}
     if not kept:
         raise CaptureError(
-            f"{where}: no depth image has a colour image within {limit:g} s; the nearest is "
+            f"{where}: no depth image has a color image within {limit:g} s; the nearest is "
             f"{min(apart.values()):.3g} s off: allow more by max_time_apart, or leave out registered"
         )
     return kept

@@ -31,7 +31,7 @@ from pcdata.structures.calibration import Calibration
 class RigSource(Source):
     """``CAMERA/intrinsics.json`` and ``CAMERA/depth/NAME.png`` for two or more cameras; a sample is one view of each.
 
-    Every camera's folder is of the layout ``folder``, and all that it holds arrives: colour, labels, masks, confidence,
+    Every camera's folder is of the layout ``folder``, and all that it holds arrives: color, labels, masks, confidence,
     timestamps. What one camera has, all must have, the sample names first of all: a name that one camera lacks is an
     error, never left out. Views stand in the order of the numbers that the cameras' names end in, if all do, else of
     the names; ``provenance["cameras"]`` lists them. ``provenance["metres_per_unit"]`` is there where all have one unit.
@@ -104,7 +104,7 @@ class RigSource(Source):
         _check_poses(str(self), self.cameras, known)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """Two or more folders, each of the layout ``folder``; a link to nothing may stand for one."""
         try:
             found = entries(path)
@@ -113,7 +113,7 @@ class RigSource(Source):
         # A link to nothing counts as the camera that it may stand for, so that opening names it.
         folders = [entry for entry in found if is_folder(entry)]
         lost = [entry for entry in found if is_dangling(entry)]
-        return len(folders) > 0 and len(folders + lost) > 1 and all(map(FolderSource.recognises, folders))
+        return len(folders) > 0 and len(folders + lost) > 1 and all(map(FolderSource.recognizes, folders))
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by camera and role, such as ``left/depth``."""
@@ -172,7 +172,7 @@ def _camera_names(path: Path, calibration: Calibration | None) -> list[str]:
             f"{where}: needs one folder for each camera of the calibration and no other; missing: {missing}; "
             f"not in the calibration: {unknown}. Rename or move folders, or give a calibration of these cameras"
         )
-    others = [name for name in names if not FolderSource.recognises(path / name)]
+    others = [name for name in names if not FolderSource.recognizes(path / name)]
     if len(names) < 2 or others:
         told = f"{name_some(others)} is of another layout" if others else f"found {name_some(names) or 'no folder'}"
         raise CaptureError(f"{where}: needs {RigSource.needs}; {told}")

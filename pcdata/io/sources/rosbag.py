@@ -90,9 +90,9 @@ def depth_units(message: Any) -> NDArray[np.uint16]:  # (H, W)
 
 
 def rgb_pixels(message: Any) -> NDArray[np.uint8]:  # (H, W, 3)
-    """Return a colour image as RGB."""
+    """Return a color image as RGB."""
     if message.encoding not in _CHANNELS:
-        raise CaptureError(f"colour must be encoded as {', '.join(_CHANNELS)}, not {message.encoding!r}; convert it")
+        raise CaptureError(f"color must be encoded as {', '.join(_CHANNELS)}, not {message.encoding!r}; convert it")
     order, count = _CHANNELS[message.encoding]
     return np.ascontiguousarray(_rows(message, count).reshape(message.height, message.width, count)[..., order])
 

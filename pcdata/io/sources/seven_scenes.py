@@ -30,7 +30,7 @@ _INTRINSICS = "camera-intrinsics.txt"
 class SevenScenesSource(Source):
     """Hand-held RGB-D frames with camera-to-world poses; 65535 and 0 mean "no reading".
 
-    Colour is that of the data set: only approximately registered to the depth.
+    Color is that of the data set: only approximately registered to the depth.
     """
 
     kind = "seven_scenes"
@@ -92,7 +92,7 @@ class SevenScenesSource(Source):
         self._positions = positions(self._ids)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """A depth image named as the data set names them."""
         try:
             found = [_FILE.fullmatch(entry.name) for entry in entries(path)]

@@ -70,7 +70,7 @@ class Source(Selectable["Source"], metaclass=_Recorded):
 
     @classmethod
     @abstractmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """Say whether the exact signs of this layout are there; must not raise for any path."""
 
     @abstractmethod

@@ -1,7 +1,7 @@
 """A cloud as named arrays and one JSON text: the form that every file format stores.
 
 Arrays follow the field's customs, so that other tools can read them: ``points``, ``colors`` and ``normals`` are (N, 3)
-float32, colours in [0, 1], and ``labels`` is (N, 1) int32. ``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4)
+float32, colors in [0, 1], and ``labels`` is (N, 1) int32. ``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4)
 world_from_camera repeat what the JSON says of the cameras.
 """
 

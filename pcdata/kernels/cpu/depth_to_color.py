@@ -1,4 +1,4 @@
-"""Depth registered to colour in the compiled core."""
+"""Depth registered to color in the compiled core."""
 
 from __future__ import annotations
 

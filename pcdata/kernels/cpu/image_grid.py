@@ -1,4 +1,4 @@
-"""The depth image of an organised cloud as the compiled core takes it."""
+"""The depth image of an organized cloud as the compiled core takes it."""
 
 from __future__ import annotations
 

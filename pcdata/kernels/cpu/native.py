@@ -153,7 +153,7 @@ def call(function: str, *arguments: Any) -> None:
 
 
 def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
-    """Return uninitialised memory for results of these shapes; if large, in huge pages where the system has them."""
+    """Return uninitialized memory for results of these shapes; if large, in huge pages where the system has them."""
     rooms, sizes = [], []
     for shape, dtype in results:
         rooms.append(torch.empty(tuple(shape), dtype=dtype, device="cpu"))
@@ -164,7 +164,7 @@ def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
 
 
 def room(shape: int | Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Return uninitialised memory for a result: contiguous and on the CPU, whatever torch's defaults are."""
+    """Return uninitialized memory for a result: contiguous and on the CPU, whatever torch's defaults are."""
     return torch.empty((shape,) if isinstance(shape, int) else tuple(shape), dtype=dtype, device="cpu")
 
 

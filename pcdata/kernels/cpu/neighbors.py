@@ -1,7 +1,7 @@
-"""Neighbour kernels: kNN, ball query, chamfer distance, statistical outliers, normals.
+"""Neighbor kernels: kNN, ball query, chamfer distance, statistical outliers, normals.
 
 All search one box tree over Morton order, sixteen queries at a time; clouds with an image grid search pixel windows
-first. Results are those of the references: the same neighbours in the same order, the same masks.
+first. Results are those of the references: the same neighbors in the same order, the same masks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pcdata.functional.radius import largest_squared
 from pcdata.kernels.cpu.image_grid import grid_arguments
 from pcdata.kernels.cpu.native import call, room
 
-# The core keeps rows, and numbers of neighbours, in 31 bits.
+# The core keeps rows, and numbers of neighbors, in 31 bits.
 _MAX_ROWS = 2**31 - 1
 
 
@@ -138,7 +138,7 @@ def _rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reachable(count: int, points: Tensor) -> int:
-    """Return a number of neighbours that gives the same answer and fits the 31 bits of the core."""
+    """Return a number of neighbors that gives the same answer and fits the 31 bits of the core."""
     return min(count, max(1, len(points)))
 
 

@@ -48,7 +48,7 @@ class Groups:
 
 
 @dataclass(frozen=True)
-class Level:
+class _Level:
     """The boxes of one level; the children of box i are rows first[i] : first[i]+count[i] of the level below."""
 
     groups: Groups
@@ -63,7 +63,7 @@ class Leaves:
     points: Tensor  # (L, 16, 3) float32
     row: Tensor  # (L, 16) int64, row in the caller's tensor
     real: Tensor  # (L, 16) bool, False for a repeated slot
-    level: Level
+    level: _Level
 
     @classmethod
     def of(cls, points: Tensor, ptr: Tensor, order: Tensor) -> Leaves:
@@ -72,7 +72,7 @@ class Leaves:
         slots, real = groups.table()
         row = order[slots]
         members = points[row]
-        return cls(members, row, real, Level(groups, members.amin(1), members.amax(1)))
+        return cls(members, row, real, _Level(groups, members.amin(1), members.amax(1)))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -83,7 +83,7 @@ class BoxTree:
     """Leaves and the levels of boxes above them, bottom first."""
 
     leaves: Leaves
-    levels: list[Level]
+    levels: list[_Level]
     # (3, L+1, 16) coordinates, infinity in empty slots and in the extra last row: infinite distances need no mask.
     coordinates: Tensor
     row: Tensor  # (L+1, 16) int64, N in empty slots: sorts after every real point
@@ -202,7 +202,7 @@ def _first_copies(ordered: Tensor, ptr: Tensor, max_copies: int) -> Tensor:
     return place - run_start < max_copies
 
 
-def _parents(below: Level) -> Level:
+def _parents(below: _Level) -> _Level:
     groups = Groups.of(below.groups.ptr, FAN_OUT)
     children, _ = groups.table()
-    return Level(groups, below.low[children].amin(1), below.high[children].amax(1))
+    return _Level(groups, below.low[children].amin(1), below.high[children].amax(1))

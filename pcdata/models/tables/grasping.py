@@ -12,7 +12,7 @@ _UPSIDE_DOWN = (
     "it looks at the scene from below the table, and proposes approaches through the table top."
 )
 _METRIC = (
-    "Ball radii are in metres: a cloud in millimetres or in the unit sphere gives neighbourhoods of nothing or all."
+    "Ball radii are in metres: a cloud in millimetres or in the unit sphere gives neighborhoods of nothing or all."
 )
 _TABLE = "The table stays: the network is trained with it, and finds no free space without it."
 
@@ -26,7 +26,7 @@ GRASPNET_BASELINE = ModelContract(
     sampler="random",
     pad="repeat",
     guide='Guides say "20,000+ in the camera frame" and to remove the table. The code: exactly 20,000 (at most '
-    "50,000), xyz only; colour is loaded and never fed; the table is kept.",
+    "50,000), xyz only; color is loaded and never fed; the table is kept.",
     traps=(
         _TABLE,
         _METRIC,
@@ -36,7 +36,7 @@ GRASPNET_BASELINE = ModelContract(
     wrong_frame=_UPSIDE_DOWN,
     checked=(
         "graspnet/graspnet-baseline 086033d dataset/graspnet_dataset.py, f4c705e demo.py, 95b3ae2 utils/data_utils.py: "
-        "metres in the camera frame, without replacement, short clouds filled up with duplicates, no centring. The "
+        "metres in the camera frame, without replacement, short clouds filled up with duplicates, no centering. The "
         "exported frame folders and scene trees ran through both; of a real frame the cloud is equal point for point "
         "to "
         "that of the original folder. The network needs CUDA extensions: not run.",
@@ -61,7 +61,7 @@ GSNET = ModelContract(
         _METRIC,
         "coors are xyz / 0.005 as floats. The network takes them after its minkowski_collate_fn, which floors them, "
         "joins the clouds and drops doubled cells (quantize2original leads back): pass it coors[b] and feats[b].",
-        "Colour is never used: the features are ones.",
+        "Color is never used: the features are ones.",
     ),
     guide='The "15,000 points of AnyGrasp" in guides are GSNet\'s.',
     wrong_frame=_UPSIDE_DOWN,
@@ -84,11 +84,11 @@ ANYGRASP = ModelContract(
         _TABLE,
         "lims filters the grasps that come out, not the points that go in.",
         "The gripper is at most 0.1 m wide.",
-        "get_grasp takes one cloud: use batches of one. Newer versions take no colours.",
+        "get_grasp takes one cloud: use batches of one. Newer versions take no colors.",
     ),
     wrong_frame=_UPSIDE_DOWN,
     checked=(
-        "graspnet/anygrasp_sdk 00dfc57 grasp_detection/demo.py: 0 < z < 1 m, float32 points in metres and colours in "
+        "graspnet/anygrasp_sdk 00dfc57 grasp_detection/demo.py: 0 < z < 1 m, float32 points in metres and colors in "
         "[0, 1] "
         "of all of them. The library is closed: not run.",
     ),
@@ -105,7 +105,7 @@ CONTACT_GRASPNET = ModelContract(
     count=20000,
     sampler="random",
     pad="repeat",
-    centring="mean",
+    centering="mean",
     crop=((-10.0, -10.0, 0.2), (10.0, 10.0, 1.8)),
     guide='Guides say 20,000 points in the camera frame, and "intrinsics as a separate input". The intrinsics only '
     "turn depth into points; the network never sees them.",
@@ -132,7 +132,7 @@ CONTACT_GRASPNET_API = ModelContract(
     crop=CONTACT_GRASPNET.crop,
     max_duplicates=0.1,
     traps=(
-        "The estimator samples, flips and centres by itself: points that were flipped before are flipped back.",
+        "The estimator samples, flips and centers by itself: points that were flipped before are flipped back.",
         "The stock command line needs depth and K in its npz; with xyz alone it stops with an UnboundLocalError.",
     ),
     wrong_frame=_UPSIDE_DOWN,
@@ -157,12 +157,12 @@ M2T2 = ModelContract(
     count=16384,
     sampler="random",
     pad="tile",
-    centring="mean",
-    normalise="before sampling",
+    centering="mean",
+    normalize="before sampling",
     traps=(
-        "The mean is that of the full cloud, before sampling; points stays uncentred.",
+        "The mean is that of the full cloud, before sampling; points stays uncentered.",
         "The sampler repeats whole permutations of a short cloud.",
-        "The colours are part of inputs but unused: use_rgb is off.",
+        "The colors are part of inputs but unused: use_rgb is off.",
         "A held object is 1024 more points in the end effector's frame; this preset makes the scene. Without one the "
         "loader feeds random object_inputs, an identity ee_pose and zeros.",
         "Where scene_bounds are given, its demo sets the height of points within 2 cm of z = 0 to 0.",
@@ -171,7 +171,7 @@ M2T2 = ModelContract(
     checked=(
         "NVlabs/M2T2 734a525 m2t2/dataset.py, dataset_utils.py, config.yaml: xyz minus the mean of the full cloud, "
         "ImageNet "
-        "colours, 16,384 rows by whole permutations. The network needs CUDA extensions: not run.",
+        "colors, 16,384 rows by whole permutations. The network needs CUDA extensions: not run.",
     ),
 )
 
@@ -187,15 +187,15 @@ GRASPGEN = ModelContract(
     counts=(16384,),
     sampler="random with replacement",
     pad="repeat",
-    centring="mean",
-    normalise="before sampling",
+    centering="mean",
+    normalize="before sampling",
     table="removed",
     max_duplicates=0.7,
     traps=(
         "One segmented object, not a scene: cut the object out first.",
-        "The mean is subtracted in metres; the network scales by its own factor: do not normalise to the unit sphere.",
+        "The mean is subtracted in metres; the network scales by its own factor: do not normalize to the unit sphere.",
         "Its depth helper rounds fx, fy, cx, cy to whole pixels: deproject elsewhere.",
-        "At inference nothing is sampled: points whose mean L1 distance to 20 neighbours is 14 mm or more are dropped, "
+        "At inference nothing is sampled: points whose mean L1 distance to 20 neighbors is 14 mm or more are dropped, "
         "and the rest is fed whole.",
     ),
     wrong_frame="The object's pose is free, so the grasps are as good; but they come back in the frame that went in, "

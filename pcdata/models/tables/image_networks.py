@@ -25,7 +25,7 @@ GGCNN = ModelContract(
     traps=(
         _NO_CLOUD,
         "The window is cut from the image pixel for pixel, never squeezed: a pixel's angle is part of what the network "
-        "has learnt. window=N takes another square and resizes it; its code blends depth across edges then, this does "
+        "has learned. window=N takes another square and resizes it; its code blends depth across edges then, this does "
         "not.",
         "Holes are inpainted before the mean is taken: a 0 left in would drag it and be clipped to the closest "
         "surface. The training loader fills nothing in: its files must be whole.",
@@ -40,7 +40,7 @@ GGCNN = ModelContract(
         "1e-6 m on a noisy synthetic capture.",
         "dougsm/ggcnn f10fc95 utils/data/cornell_data.py, grasp_data.py, utils/dataset_processing/image.py, a748338 "
         "grasp.py: the exported images and rectangles ran through the Cornell loader, rotated and zoomed, with and "
-        "without colour.",
+        "without color.",
         "dougsm/ggcnn e0b21ab models/ggcnn.py: the forward pass takes the preset's batch as it is.",
     ),
 )
@@ -59,13 +59,13 @@ GRCONVNET = ModelContract(
         _NO_CLOUD,
         "The window is cut from the image pixel for pixel: around the grasps in training, from the middle live.",
         "Depth comes first, then red, green, blue, each divided by 255 and less the image's mean.",
-        "Its live camera code normalises depth by the colours' rule (/ 255 - mean), unlike its training code; the "
+        "Its live camera code normalizes depth by the colors' rule (/ 255 - mean), unlike its training code; the "
         "preset follows the training code.",
     ),
     wrong_frame=_FRAME,
     checked=(
         "skumra/robotic-grasping ba13afd utils/data/camera_data.py, 84db2fe utils/data/cornell_data.py, "
-        "utils/dataset_processing/image.py: a window of 224 without resizing; depth minus its mean, clipped; colours "
+        "utils/dataset_processing/image.py: a window of 224 without resizing; depth minus its mean, clipped; colors "
         "/ 255 minus one mean; depth first.",
         "skumra/robotic-grasping 050af02 inference/models/grconvnet3.py: the forward pass takes the preset's batch as "
         "it is.",
@@ -84,10 +84,10 @@ FCGQCNN = ModelContract(
     traps=(
         _NO_CLOUD,
         "The policy makes 16 copies of the image, one per depth bin, and the network subtracts each bin's depth and "
-        "normalises by its training set's mean and deviation: give one image in metres.",
+        "normalizes by its training set's mean and deviation: give one image in metres.",
         "Any size runs: examples/policy.py sets the network's size to the image's. 480 x 640 is what the "
         "configurations and the weights' pixel angles are made for.",
-        "It fills holes by averaging their neighbours again and again at half the size (DepthImage.inpaint of the "
+        "It fills holes by averaging their neighbors again and again at half the size (DepthImage.inpaint of the "
         "perception package); the preset copies the nearest reading.",
         "The policy wants a mask of the objects too, which is not part of this tensor.",
         "The camera looks straight down in its training data.",
@@ -95,7 +95,7 @@ FCGQCNN = ModelContract(
     wrong_frame=_FRAME,
     checked=(
         "BerkeleyAutomation/gqcnn 04678ed gqcnn/grasping/policy/fc_policy.py: depth (H, W, 1) in metres, tiled to "
-        "(16, H, W, 1); 499a609 gqcnn/model/tf/network_tf.py: no normalisation outside the network in the mode that "
+        "(16, H, W, 1); 499a609 gqcnn/model/tf/network_tf.py: no normalization outside the network in the mode that "
         "subtracts depth. The network is TensorFlow's: not run.",
     ),
 )

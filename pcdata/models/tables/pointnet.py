@@ -5,7 +5,7 @@ from dataclasses import replace
 from pcdata.models.contract import NORMALS, XYZ, Channel, InputTensor, ModelContract, Role
 
 _CATEGORY = Channel("category", 16, Role.OTHER, 0.0, 1.0)
-_BLOCK = Channel("xyz_column")  # x and y from the column's centre, z as it is
+_BLOCK = Channel("xyz_column")  # x and y from the column's center, z as it is
 _UNIT_RGB = Channel("rgb", 3, Role.COLOR, 0.0, 1.0)
 _ROOM = Channel("xyz_room", 3, Role.OTHER, 0.0, 1.0)  # as parts of the room's extent
 
@@ -35,13 +35,13 @@ POINTNET_CLS = ModelContract(
     sampler="random",
     samplers=("farthest point",),
     pad="error",
-    centring="mean",
+    centering="mean",
     scaling="unit sphere",
-    normalise="after sampling",
+    normalize="after sampling",
     table="removed",
     guide=_GUIDE,
     traps=(
-        "The HDF5 loader does not normalise: the file must be.",
+        "The HDF5 loader does not normalize: the file must be.",
         _FIRST_ROWS_TRAP,
         'Farthest points (sampler="farthest point") are an option of the PyTorch port, off by default.',
         "Yaw is drawn about y: turn z-up clouds, or change the axis.",
@@ -49,7 +49,7 @@ POINTNET_CLS = ModelContract(
     wrong_frame=_TURNED,
     checked=(
         "charlesq34/pointnet 0237262 train.py, 5819bbe provider.py: current_data[:, 0:NUM_POINT] of the file's rows, "
-        "no normalisation, (B, N, 3). The exported HDF5 files ran through this code (slice, shuffle, rotation, "
+        "no normalization, (B, N, 3). The exported HDF5 files ran through this code (slice, shuffle, rotation, "
         "jitter, batches).",
         "yanx27/Pointnet_Pointnet2_pytorch 5e31f21 models/pointnet_cls.py, d65f07f pointnet_utils.py: the forward pass "
         "takes the preset's batch, transposed to (B, 3, N) as its script does.",
@@ -109,17 +109,17 @@ POINTNET_PART = replace(
     sampler="random",
     samplers=(),
     pad="tile",
-    normalise="before sampling",
+    normalize="before sampling",
     choices=("category",),
     traps=(
-        "The training script feeds the 2048 stored points of a shape as they are; its test script normalises the whole "
+        "The training script feeds the 2048 stored points of a shape as they are; its test script normalizes the whole "
         "shape, then repeats it in order up to 3000 points.",
         "The category is an input: it must be known before the parts.",
-        "The HDF5 loader does not normalise: the file must be.",
+        "The HDF5 loader does not normalize: the file must be.",
     ),
     checked=(
         "charlesq34/pointnet 0237262 part_seg/train.py, part_seg/test.py: (B, 2048, 3) and a (B, 16) one-hot; "
-        "normalised, then filled up. The exported HDF5 files, lists and names ran through this code. The network is "
+        "normalized, then filled up. The exported HDF5 files, lists and names ran through this code. The network is "
         "TensorFlow's: not run.",
     ),
 )
@@ -137,7 +137,7 @@ POINTNET2_PART = replace(
     sampler="random with replacement",
     pad="repeat",
     traps=(
-        "Normalised on the full cloud first, then drawn with replacement even where there are enough points: about a "
+        "Normalized on the full cloud first, then drawn with replacement even where there are enough points: about a "
         "third of the rows come twice.",
         "The category is an input: it must be known before the parts.",
     ),
@@ -160,18 +160,18 @@ POINTNET_SEMSEG = ModelContract(
     count=4096,
     sampler="random with replacement",
     pad="repeat",
-    centring="corner",
-    normalise="before sampling",
+    centering="corner",
+    normalize="before sampling",
     column=1.0,
     max_duplicates=0.8,  # a hundred points in a column are enough for its code
     guide=_GUIDE,
     traps=(
-        "z is not centred: it says how high above the floor a point is.",
+        "z is not centered: it says how high above the floor a point is.",
         "Its columns of 1 m stand on a fixed grid, 0.5 m apart, and those with fewer than 100 points are left out; the "
         "preset draws columns around random points, as the PyTorch port does.",
         "Of a column with more than 4096 points it draws with replacement; of a smaller one it "
         "keeps all and adds duplicates, where the preset draws anew.",
-        "Colours are stored 0-255 and divided by 255 in the loader.",
+        "Colors are stored 0-255 and divided by 255 in the loader.",
     ),
     checked=(
         "charlesq34/pointnet 149ff90 sem_seg/indoor3d_util.py: nine channels in this order, x and y from the column's "
@@ -191,12 +191,12 @@ POINTNET2_SEMSEG = replace(
     sampler="random",
     max_duplicates=0.75,  # 1,025 points in a column are enough for its code
     traps=(
-        "z is not centred: it says how high above the floor a point is.",
+        "z is not centered: it says how high above the floor a point is.",
         "Its sampler draws until a column of 1 m has more than 1024 points, and so hangs for ever on a small or thin "
         "scene; the preset gives up after 100 draws and says so.",
         "A column with fewer than 4096 points is drawn with replacement as a whole; the preset keeps every point and "
         "adds duplicates.",
-        "Colours are stored 0-255 and divided by 255 in the loader.",
+        "Colors are stored 0-255 and divided by 255 in the loader.",
     ),
     checked=(
         "yanx27/Pointnet_Pointnet2_pytorch 88790dd data_utils/S3DISDataLoader.py: columns around a random point, the "
@@ -220,7 +220,7 @@ POINTNET2_POLICY_GUIDE = ModelContract(
     table="open",
     guide="This is the guide's contract: exactly 1,024 or 4,096 farthest points, padded with duplicates, in metres.",
     traps=("Policies in code use DP3's PointNet: 512 or 1024 points, short clouds filled up with zero rows.",),
-    wrong_frame="Actions are learnt in the robot's frame; a cloud in the camera frame hides the camera's pose in the "
+    wrong_frame="Actions are learned in the robot's frame; a cloud in the camera frame hides the camera's pose in the "
     "weights, and the policy fails as soon as the camera moves.",
 )
 

@@ -15,8 +15,8 @@ from pcdata.models.contract import (
 )
 
 _STORED = (XYZ, replace(RGB_BYTE, optional=True))
-_NORMALISER = (
-    "The policy normalises by itself, to [-1, 1] per channel by the extremes of the whole data set: zero rows and "
+_NORMALIZER = (
+    "The policy normalizes by itself, to [-1, 1] per channel by the extremes of the whole data set: zero rows and "
     "outliers enter those extremes, and the channels of training and inference must be the same."
 )
 
@@ -39,7 +39,7 @@ DP3_SIM = ModelContract(
     guide='Guides say "voxels of 5-10 mm, 5,000-20,000 of them, in the robot base frame". The code has no voxels: 512 '
     "or 1024 farthest points, and no fixed frame; the released real data are in a turned camera frame.",
     traps=(
-        _NORMALISER,
+        _NORMALIZER,
         "Short clouds get zero rows: points at the origin of whatever frame was chosen.",
         "Six channels are stored, three are used unless use_pc_color is set.",
         "Cropping table and background away is highly recommended by the authors.",
@@ -50,7 +50,7 @@ DP3_SIM = ModelContract(
         "YanjieZe/3D-Diffusion-Policy e65e2ae common/replay_buffer.py, common/sampler.py, dataset/adroit_dataset.py, "
         "model/common/normalizer.py: the exported zarr ran through them with zarr 2.12.0, in memory, compressed and "
         "from "
-        "disk; sequences of 16 steps, normalised to [-1, 1].",
+        "disk; sequences of 16 steps, normalized to [-1, 1].",
         "YanjieZe/3D-Diffusion-Policy e65e2ae gym_util/mjpc_wrapper.py: open box, farthest points on xyz, zero rows."
         " a406207 model/vision/pointnet_extractor.py: the forward pass of PointNetEncoderXYZ and "
         "PointNetEncoderXYZRGB takes "
@@ -71,12 +71,12 @@ DP3_REAL = replace(
         "The published conversion multiplies from the right and drops the last column: it applies the transposed "
         "rotation and loses the translation. Data made by it do not fit data made by ToFrame.",
         "Its recorded depth is in units of 0.25 mm, its stored clouds are float64; the loaders read both as float32.",
-        "Its farthest point sampling fills short clouds with xyz = 0 in the colour of the last point; here the colour "
+        "Its farthest point sampling fills short clouds with xyz = 0 in the color of the last point; here the color "
         "of such rows is 0 too.",
     ),
     checked=(
         "YanjieZe/3D-Diffusion-Policy 22a78fc scripts/convert_real_robot_data.py: 1024 farthest points of an open box, "
-        "colours as stored, the matrix applied from the right.",
+        "colors as stored, the matrix applied from the right.",
     ),
 )
 
@@ -120,7 +120,7 @@ IDP3 = ModelContract(
         "The camera frame is meant: no extrinsics anywhere, so that the policy needs no calibration.",
         "The recorder draws with replacement: many rows come twice; the loader then draws from those without.",
         "The box is open on both sides: a reading clamped to 1.0 m is dropped.",
-        "The recorder uses the depth stream's intrinsics for depth aligned to colour.",
+        "The recorder uses the depth stream's intrinsics for depth aligned to color.",
     ),
     guide="Guides put every diffusion policy into the robot base frame; this one must not be.",
     wrong_frame="In the base frame the crop by depth 0.1-1.0 m cuts by height instead, and egocentric weights meet a "
@@ -128,7 +128,7 @@ IDP3 = ModelContract(
     checked=(
         "YanjieZe/Improved-3D-Diffusion-Policy 3216526 common/multi_realsense.py, dataset/gr1_dex_dataset_3d.py, "
         "model/vision_3d/point_process.py: the first point of each 5 mm cell, 4096 with replacement, zero rows and no "
-        "normalisation. Not run: it records from a camera.",
+        "normalization. Not run: it records from a camera.",
     ),
 )
 
@@ -153,8 +153,8 @@ RISE = ModelContract(
     max_duplicates=0.1,
     guide="Guides sample a fixed count; RISE takes as many 5 mm voxels as there are.",
     traps=(
-        "Features are metres and colours, not voxel indices.",
-        "Cells are cast to integers: cut towards zero, not floored, so the cells next to each axis plane are twice "
+        "Features are metres and colors, not voxel indices.",
+        "Cells are cast to integers: cut toward zero, not floored, so the cells next to each axis plane are twice "
         "as wide.",
         "Readings beyond 3 m are dropped before the voxels, as Open3D does by default: they would move the grid.",
         "Actions are projected into the camera frame too.",
@@ -163,7 +163,7 @@ RISE = ModelContract(
     "or nothing.",
     checked=(
         "rise-policy/RISE 418178a dataset/realworld.py, 76d94ae utils/constants.py: Open3D's voxels, then the closed "
-        "box, ImageNet colours, cells cut towards zero in float64, the cloud's number first. Its load_point_cloud and "
+        "box, ImageNet colors, cells cut toward zero in float64, the cloud's number first. Its load_point_cloud and "
         "the preset gave the same voxels on two noisy synthetic captures: as many, in the same cells; 1 in 7,000 "
         "averages is off by up to 0.4 mm, where rounding puts a point into the next voxel. The network needs "
         "MinkowskiEngine: not run.",
@@ -195,7 +195,7 @@ PERACT = ModelContract(
     traps=(
         "RLBench's box is [-0.3, -0.5, 0.6] to [0.7, 0.5, 1.6]: 100 cells of 1 cm. Its z starts at 0.6 because the "
         "table is at 0.75; a robot with its table at z = 0 needs its own box.",
-        "Colours are in [-1, 1].",
+        "Colors are in [-1, 1].",
         "RLBench stores negative focal lengths: a deprojection that takes them as positive mirrors x and y.",
     ),
     wrong_frame="Actions are cells of this grid: in another frame the box cuts another part of the scene, and the best "
@@ -214,26 +214,26 @@ DIFFUSER_ACTOR = ModelContract(
     source="nickgkan/3d_diffuser_actor 4faf00b: diffuser_actor/trajectory_optimization/diffuser_actor.py:238-246; "
     "diffuser_actor/utils/encoder.py:194-250; datasets/dataset_engine.py:126-142",
     tensors=(
-        InputTensor("pcd_obs", "B V C H W", (XYZ,), content="organised"),
-        InputTensor("rgb_obs", "B V C H W", (RGB_UNIT,), content="organised"),
+        InputTensor("pcd_obs", "B V C H W", (XYZ,), content="organized"),
+        InputTensor("rgb_obs", "B V C H W", (RGB_UNIT,), content="organized"),
     ),
     frame="",
     axes="world, z up",
     image_size=(256, 256),
     max_duplicates=1.0,
     traps=(
-        "The cloud stays organised: one point per pixel, (0, 0, 0) where the sensor saw nothing. Simulated depth has "
-        "no holes; the model's bilinear resize mixes those zeros into their neighbours, so complete the depth first.",
+        "The cloud stays organized: one point per pixel, (0, 0, 0) where the sensor saw nothing. Simulated depth has "
+        "no holes; the model's bilinear resize mixes those zeros into their neighbors, so complete the depth first.",
         "The model brings xyz to [-1, 1] by the bounds of the gripper's positions, by itself.",
-        "On disk colours are in [-1, 1], the model takes [0, 1].",
+        "On disk colors are in [-1, 1], the model takes [0, 1].",
     ),
-    wrong_frame="The normalisation by the gripper's bounds sends points of another frame far out of [-1, 1], where the "
+    wrong_frame="The normalization by the gripper's bounds sends points of another frame far out of [-1, 1], where the "
     "rotary position code repeats itself.",
     checked=(
         "nickgkan/3d_diffuser_actor ba9c8f6 diffuser_actor/trajectory_optimization/diffuser_actor.py, 3c3a2b3 "
         "diffuser_actor/utils/encoder.py, datasets/dataset_engine.py: (B, cameras, 3, H, W), rgb_obs in [0, 1], "
         "pcd_obs in "
-        "world coordinates, normalised inside. The network needs CLIP weights: not run.",
+        "world coordinates, normalized inside. The network needs CLIP weights: not run.",
     ),
 )
 

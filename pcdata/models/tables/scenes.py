@@ -19,24 +19,24 @@ POINTCEPT = ModelContract(
     axes="z up; x and y from the middle of the scene's box, z from its floor",
     voxel=0.02,
     voxel_rule="random",
-    centring="floor",
-    normalise="before sampling",
+    centering="floor",
+    normalize="before sampling",
     max_duplicates=0.1,
     traps=(
-        "feat is what feat_keys name; the ScanNet weights want colours and normals.",
-        "Colours are stored 0-255 and divided by 255 in the loader: files with 0-1 are nearly black.",
+        "feat is what feat_keys name; the ScanNet weights want colors and normals.",
+        "Colors are stored 0-255 and divided by 255 in the loader: files with 0-1 are nearly black.",
         "A random point of each voxel is kept, not the mean.",
-        "Its pipeline centres x and y once more after the voxels, on their own box: at most a voxel off the preset's.",
+        "Its pipeline centers x and y once more after the voxels, on their own box: at most a voxel off the preset's.",
         "In training a sphere of 102,400 points is cut out of larger scenes; the preset keeps the scene.",
         "offset holds the ends of the clouds, so its last value is the number of points.",
     ),
-    wrong_frame="z = 0 is no longer the floor, and the serialisation orders points along the wrong axes: the network "
+    wrong_frame="z = 0 is no longer the floor, and the serialization orders points along the wrong axes: the network "
     "runs and labels badly.",
     checked=(
         "Pointcept/Pointcept 0be8049 pointcept/datasets/defaults.py: the exported folders ran through DefaultDataset, "
         "by split "
         "and by list of splits; 041f5f6 transform.py, 10b7490 configs/scannet/semseg-pt-v3m1-0-base.py: CenterShift, "
-        "GridSample (cells from the lowest), colours / 255, feat = color, normal. The network needs CUDA: not run.",
+        "GridSample (cells from the lowest), colors / 255, feat = color, normal. The network needs CUDA: not run.",
     ),
 )
 

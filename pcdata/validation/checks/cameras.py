@@ -23,7 +23,7 @@ class Intrinsics(Check):
     question = "Can the intrinsics belong to this image?"
     findings: ClassVar = {
         "principal_point": Explained(
-            "distance from the image's centre / image size",
+            "distance from the image's center / image size",
             "{0.principal_point[0]:.0%}",
             "above {0.principal_point[1]:.1%}",
             "lenses are mounted within 5 %; K of an image resized by 0.8 is off by 10 %: halfway. Names the size that "

@@ -1,4 +1,4 @@
-"""Does the colour image lie on the depth image?"""
+"""Does the color image lie on the depth image?"""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ NAME = "color_registration"
 
 
 class ColorOnDepth(Check):
-    """The shift between colour and depth at the rims of near surfaces, in each capture and in all together."""
+    """The shift between color and depth at the rims of near surfaces, in each capture and in all together."""
 
-    question = "Does the colour image lie on the depth image?"
+    question = "Does the color image lie on the depth image?"
     findings: ClassVar = {
         NAME: Explained(
-            "shift between colour and depth at the rims of near surfaces, in pixels",
+            "shift between color and depth at the rims of near surfaces, in pixels",
             "{0.color_shift:g}",
             "above {0.color_shift:g} beyond doubt",
             "halfway between registered and off by 3 pixels",
@@ -40,7 +40,7 @@ class ColorOnDepth(Check):
         self._voted = 0
 
     def frame(self, frame: DepthFrame, before: Sequence[Finding]) -> list[Finding]:
-        """Judge every view that has colour."""
+        """Judge every view that has color."""
         if frame.colors is None:
             return []
         votes = [edge_votes(depth, colors) for depth, colors in zip(frame.depth, frame.colors)]
@@ -63,7 +63,7 @@ class ColorOnDepth(Check):
 
 
 def _judged(votes: EdgeVotes, limits: CaptureLimits, view: int) -> Finding:
-    """Judge the shift between colour and depth at the rims of near surfaces.
+    """Judge the shift between color and depth at the rims of near surfaces.
 
     It fails when even the shortest possible shift is beyond the limit, passes when the shift is within it and one of 3
     pixels can be ruled out, and is unknown otherwise.
@@ -92,7 +92,7 @@ def _judged(votes: EdgeVotes, limits: CaptureLimits, view: int) -> Finding:
 def _in_words(offset: EdgeOffset) -> str:
     (x, y), (off_x, off_y) = offset.shift, offset.spread
     return (
-        f"colour lies {abs(x):.1f} (+-{off_x:.1f}) pixels {'right' if x > 0 else 'left'} of and "
+        f"color lies {abs(x):.1f} (+-{off_x:.1f}) pixels {'right' if x > 0 else 'left'} of and "
         f"{abs(y):.1f} (+-{off_y:.1f}) {'below' if y > 0 else 'above'} depth, at {offset.num_edges} rim points"
     )
 
@@ -103,6 +103,6 @@ def _reason(offset: EdgeOffset) -> str:
 
 def _mend(offset: EdgeOffset) -> str:
     return (
-        "register depth to colour with the factory's extrinsics, at this resolution; check that both images are of "
+        "register depth to color with the factory's extrinsics, at this resolution; check that both images are of "
         f"one moment (shifts beyond {SHIFT_LIMIT} pixels are not found)"
     )

@@ -44,7 +44,7 @@ class Coverage(Check):
 
     def cloud(self, cloud: PointCloud, before: Sequence[Finding]) -> list[Finding]:
         """Judge a cloud whose rows are the pixels of an image."""
-        size = cloud.meta[0].get("organised_size")
+        size = cloud.meta[0].get("organized_size")
         if size is None or cloud.source_index is None:
             return []
         valid = torch.zeros(size[0] * size[1], dtype=torch.bool, device=cloud.device)
@@ -90,7 +90,7 @@ def coverage_of(
             if region.fraction
             else "no region without readings",
             advice=f"whole lines have no reading {where}: the background was cut away, the scene is out of range, "
-            "or a part of the image was not stored; compare with the colour image before you drop it"
+            "or a part of the image was not stored; compare with the color image before you drop it"
             if is_block
             else f"look at what the camera sees {where}: something before the lens, out of range, black, shiny or "
             "transparent; right if the background was cut away on purpose",

@@ -34,7 +34,7 @@ _SHARE = "let more of what one view sees lie in another one: without that no pos
 Pair = tuple[int, int]
 
 
-class Explanation(NamedTuple):
+class _Explanation(NamedTuple):
     """Views whose poses, read by one convention, make the views agree."""
 
     convention: str
@@ -73,7 +73,7 @@ class PoseDirection(Check):
         return [_explained(best, given) if best else _unexplained(views, given)]
 
 
-def _explained(best: list[Explanation], given: dict[Pair, Agreement]) -> Finding:
+def _explained(best: list[_Explanation], given: dict[Pair, Agreement]) -> Finding:
     """Fail the poses of all views, or name the one whose pose alone is read wrongly; or those it may be."""
     name, blamed = best[0].convention, sorted({number for one in best for number in one.views})
     of_blamed = _total(found for pair, found in given.items() if set(pair) & set(blamed))
@@ -130,7 +130,7 @@ def direction_check(verdict: Verdict, given: Agreement, found: str, advice: str,
     )
 
 
-def _explanations(views: dict[int, PosedView], given: dict[Pair, Agreement]) -> Iterable[Explanation]:
+def _explanations(views: dict[int, PosedView], given: dict[Pair, Agreement]) -> Iterable[_Explanation]:
     """Every convention for all views together, and for each alone, that explains clearly more than the poses given."""
     before = _shares(given)
     choices = [tuple(before), *((number,) for number in before if len(before) > 1)]
@@ -144,10 +144,10 @@ def _explanations(views: dict[int, PosedView], given: dict[Pair, Agreement]) -> 
         )
         of_turned, score = _mean(after[number] for number in turned), _mean(after.values())
         if explains_more(of_turned, _mean(before[number] for number in turned)) and score > _mean(before.values()):
-            yield Explanation(convention, turned, of_turned, score)
+            yield _Explanation(convention, turned, of_turned, score)
 
 
-def _best(explanations: Iterable[Explanation]) -> list[Explanation]:
+def _best(explanations: Iterable[_Explanation]) -> list[_Explanation]:
     """Return the best, first, and of the same convention those for another view that are as good."""
     ranked = sorted(explanations, key=lambda one: -one.score)
     return [
@@ -161,8 +161,8 @@ def _best(explanations: Iterable[Explanation]) -> list[Explanation]:
 
 def _far_away(views: dict[int, PosedView]) -> list[tuple[int, float]]:
     """Return the views that stand far from every other camera, where others do not, and how far."""
-    centres = torch.stack([view.pose[:3, 3] for view in views.values()])
-    apart = torch.cdist(centres, centres).fill_diagonal_(torch.inf)
+    centers = torch.stack([view.pose[:3, 3] for view in views.values()])
+    apart = torch.cdist(centers, centers).fill_diagonal_(torch.inf)
     nearest = dict(zip(views, apart.amin(1).tolist()))
     far = [(number, metres) for number, metres in nearest.items() if metres > _FAR]
     return far if len(far) < len(views) or len(views) == 2 else []

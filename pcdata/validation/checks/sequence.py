@@ -67,7 +67,7 @@ class Repeats(Check):
 
 
 def _repeat(name: str, before: tuple[int, str] | None, view: int) -> Finding:
-    what = "depth" if name == "repeated_depth" else "colour"
+    what = "depth" if name == "repeated_depth" else "color"
     found = f"the {what} image is a new one"
     if before is not None:
         ago, sample_id = before

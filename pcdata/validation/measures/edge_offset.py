@@ -1,6 +1,6 @@
-"""How far a colour image is off its depth image, measured where near surfaces end.
+"""How far a color image is off its depth image, measured where near surfaces end.
 
-A registered colour image changes colour where depth jumps. Along the normal of every rim the colour steps around it
+A registered color image changes color where depth jumps. Along the normal of every rim the color steps around it
 vote for an offset; offsets of a rim with normal n are ``shift . n + bias``. The shift moves the left rim of an object
 inwards and the right one outwards; the bias moves all outwards or inwards, as sensors do that make objects fatter
 or thinner, so the two can be told apart wherever an object shows both of two opposite sides.
@@ -30,7 +30,7 @@ _BIAS_LIMIT = 4  # pixels at 640 pixels width; stereo matchers smear an object's
 _NUM_DIRECTIONS = 24  # 15 degrees each: a shift of 12 pixels is blurred by less than 12 sin 7.5 degrees = 1.6
 _GRID_STEP = 0.5  # pixels; a third of the blur, so that leaving out a part can move the best grid point
 _BLUR = 1.5  # pixels, standard deviation: how ragged rims are
-_COLOR_NOISE = 12.0  # grey levels of 255: colour steps below this are noise and compression
+_COLOR_NOISE = 12.0  # gray levels of 255: color steps below this are noise and compression
 _NOISE_STEPS = 4  # steps of that height, summed along a normal, have half a vote
 _MIN_EDGES = 150  # rim points; fewer come from a single small object
 _LEAST_SPREAD = 0.25  # pixels: nobody knows a shift better than that from rims of whole pixels
@@ -39,7 +39,7 @@ _CHANCE = 0.05  # that the true shift is ruled out
 
 @dataclass(frozen=True)
 class EdgeVotes:
-    """Votes for the offset between colour and depth, of one frame or summed over many."""
+    """Votes for the offset between color and depth, of one frame or summed over many."""
 
     histogram: Tensor  # (NUM_GROUPS, 24, T) float32: part of the image, direction of the rim, offset along its normal
     num_edges: int
@@ -52,13 +52,13 @@ class EdgeVotes:
 
 @dataclass(frozen=True)
 class EdgeOffset:
-    """The shift that brings depth onto colour: what is at pixel p in depth is at ``p + shift`` in colour."""
+    """The shift that brings depth onto color: what is at pixel p in depth is at ``p + shift`` in color."""
 
     shift: tuple[float, float]  # pixels, (right, down)
     spread: tuple[float, float]  # pixels: how far each component may be off
     least_length: float  # pixels: of the shortest possible shift
     greatest_length: float  # pixels: of the longest possible one
-    bias: float  # pixels by which the colour rims lie outside the depth rims, all around
+    bias: float  # pixels by which the color rims lie outside the depth rims, all around
     num_edges: int
     problem: str | None  # why the shift cannot be trusted at all; None = it can, within its spread
 
@@ -72,10 +72,10 @@ def edge_votes(
     depth: Tensor,  # (H, W) float32, metres, 0 = no reading
     colors: Tensor,  # (H, W, 3) uint8
 ) -> EdgeVotes:
-    """Let every rim point of the depth image vote for the offsets at which the colour changes along its normal.
+    """Let every rim point of the depth image vote for the offsets at which the color changes along its normal.
 
-    A point has one vote, shared by the colour steps along its normal in proportion to the square of their height, so
-    one bright sticker does not outvote a hundred plain rims. Pixels that are pure black are no image (a colour image
+    A point has one vote, shared by the color steps along its normal in proportion to the square of their height, so
+    one bright sticker does not outvote a hundred plain rims. Pixels that are pure black are no image (a color image
     that was warped onto the depth has them where there is no depth) and do not vote.
     """
     check_tensors("edge_votes", {"depth": depth, "colors": colors}, {"depth": "H W", "colors": "H W 3 : uint8"})
@@ -94,7 +94,7 @@ def edge_votes(
     turn = torch.atan2(normal[:, 1], normal[:, 0]) / (2 * math.pi)
     direction = (turn * _NUM_DIRECTIONS).round().long() % _NUM_DIRECTIONS
     block = (position / max(depth.shape[1] // 8, 1)).long()
-    group = (3 * block[:, 1] + block[:, 0]) % NUM_GROUPS  # neighbouring blocks, and those of one column, fall apart
+    group = (3 * block[:, 1] + block[:, 0]) % NUM_GROUPS  # neighboring blocks, and those of one column, fall apart
     histogram = votes.new_zeros(NUM_GROUPS * _NUM_DIRECTIONS, votes.shape[1])
     histogram.index_add_(0, group * _NUM_DIRECTIONS + direction, votes)
     return EdgeVotes(histogram.view(NUM_GROUPS, _NUM_DIRECTIONS, -1), len(position), scale)
@@ -126,9 +126,9 @@ def offset_from_votes(votes: EdgeVotes) -> EdgeOffset:
     bias = float(biases[which])
     problem: str | None = None
     if max(abs(float(shifts[across])), abs(float(shifts[down]))) >= SHIFT_LIMIT:
-        problem = f"no shift of up to {SHIFT_LIMIT} pixels brings the rims of near surfaces onto edges of the colour"
+        problem = f"no shift of up to {SHIFT_LIMIT} pixels brings the rims of near surfaces onto edges of the color"
     elif abs(bias) >= _BIAS_LIMIT * votes.scale:
-        problem = f"depth and colour disagree by {abs(bias):g} pixels or more on how large the objects are"
+        problem = f"depth and color disagree by {abs(bias):g} pixels or more on how large the objects are"
     elif bool((possible.abs() >= SHIFT_LIMIT).any()):
         problem = f"a shift of {SHIFT_LIMIT} pixels fits nearly as well as any other"
     elif bool(kept[:, :, [0, -1]].any()):
@@ -221,7 +221,7 @@ def _scores(histogram: Tensor, scale: int) -> Tensor:
 
 
 def _vertex(values: Tensor, peak: int) -> float:
-    """Return where the parabola through a peak and its neighbours is highest, relative to the peak."""
+    """Return where the parabola through a peak and its neighbors is highest, relative to the peak."""
     if not 0 < peak < len(values) - 1:
         return 0.0
     left, middle, right = values[peak - 1 : peak + 2].tolist()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-_NEXT = 0.02  # of the value: how far the neighbourhood reaches that a pile is compared with
+_NEXT = 0.02  # of the value: how far the neighborhood reaches that a pile is compared with
 
 
 class Pile(NamedTuple):

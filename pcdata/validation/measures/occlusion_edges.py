@@ -1,4 +1,4 @@
-"""Where a depth image ends at the rim of a near surface: the edges that a registered colour image shares with it."""
+"""Where a depth image ends at the rim of a near surface: the edges that a registered color image shares with it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def occlusion_edges(
     """
     check_tensors("occlusion_edges", {"depth": depth}, {"depth": "H W"})
     scale = resolution_scale(depth.shape[1])
-    # Wider images are searched in every second (third, ...) line: neighbouring lines tell nearly the same.
+    # Wider images are searched in every second (third, ...) line: neighboring lines tell nearly the same.
     across = _search_rows(depth[::scale], scale)
     down = _search_rows(depth[:, ::scale].T.contiguous(), scale)
     u = torch.cat([across.column, down.line * scale])

@@ -1,4 +1,4 @@
-"""Registration of depth to colour, against the same scene rendered from the colour camera."""
+"""Registration of depth to color, against the same scene rendered from the color camera."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Pair:
     depth: Tensor
     depth_from_color: Tensor
     color_camera: Camera
-    truth: Tensor  # (1, Hc, Wc) what the colour camera would measure
+    truth: Tensor  # (1, Hc, Wc) what the color camera would measure
     registered: RegisteredDepth
 
 
@@ -52,7 +52,7 @@ def pair(color_camera: Camera, depth_from_color: Tensor, seed: int = 3) -> Pair:
 
 
 def seen_by_depth_camera(one: Pair) -> Tensor:
-    """(Hc, Wc): the colour pixels whose true surface the depth camera measures too, clear of its edges."""
+    """(Hc, Wc): the color pixels whose true surface the depth camera measures too, clear of its edges."""
     camera, truth = one.color_camera, one.truth
     points, ptr, index = deproject_depth(truth, camera.intrinsics, distortion=camera.distortion)
     there = transform_points(points, ptr, one.depth_from_color)
@@ -142,7 +142,7 @@ def test_hidden_readings_are_those_that_the_color_camera_cannot_see(pairs, size,
 
 
 def test_an_occluder_hides_what_lies_behind_it_and_marks_where():
-    # A plate at 0.5 m before a wall at 1 m; the colour camera stands 10 cm to the right: the plate moves 20 pixels to
+    # A plate at 0.5 m before a wall at 1 m; the color camera stands 10 cm to the right: the plate moves 20 pixels to
     # the left in its image, the wall 10, so the plate covers 10 columns of the wall that the depth camera sees.
     depth = torch.full((1, 40, 100), 1.0)
     depth[..., 50:70] = 0.5
@@ -151,7 +151,7 @@ def test_an_occluder_hides_what_lies_behind_it_and_marks_where():
     row = result.depth[0, 20]
     assert bool((row[:30] == 1).all())
     assert bool((row[30:50] == 0.5).all())
-    assert bool((row[50:60] == 0).all()), "seen by the colour camera alone"
+    assert bool((row[50:60] == 0).all()), "seen by the color camera alone"
     assert bool((row[60:90] == 1).all())
     assert bool((row[90:] == 0).all()), "beyond the depth image"
     assert result.hidden[0, 20].nonzero().flatten().tolist() == [*range(10), *range(40, 50)]

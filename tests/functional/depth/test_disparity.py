@@ -67,7 +67,7 @@ def test_noise_on_a_slanted_plane_goes_down_and_its_edge_stays_where_it_is():
     assert float(error.std()) < 0.5 * float(noise.std())
     side = found > truth - torch.where(u < 80, 0.0, 100.0) + 50
     assert torch.equal(side, u >= 80), "no pixel changed sides"
-    assert float(error[:, 70:80].abs().max()) < 10, "and none was drawn towards the other side"
+    assert float(error[:, 70:80].abs().max()) < 10, "and none was drawn toward the other side"
 
 
 def test_holes_stay_holes_and_nothing_passes_through_them():

@@ -96,7 +96,7 @@ def test_the_resized_depth_with_resized_intrinsics_lies_on_the_same_plane(size, 
     resized, _ = resize_depth(depth, size=size, max_jump=max_jump)
     points = deproject_depth(resized, camera.resized(size).intrinsics)[0].double()
     error = ((points @ normal - offset).reshape(*size)).abs()
-    # Half a pixel at the border is sampled outside the first centres, where the edge pixel stands for it.
+    # Half a pixel at the border is sampled outside the first centers, where the edge pixel stands for it.
     assert float(error[2:-2, 2:-2].max()) < (1e-6 if max_jump else 0.02)
 
 

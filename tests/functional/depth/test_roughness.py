@@ -39,7 +39,7 @@ def test_an_edge_is_no_roughness(diagonal: bool):
     assert float(depth_roughness(depth, torch.full_like(depth, 0.001), torch.full_like(depth, 0.05)).max()) == 0.0
 
 
-def test_a_reading_at_odds_with_all_its_neighbours_fits_nowhere():
+def test_a_reading_at_odds_with_all_its_neighbors_fits_nowhere():
     depth = torch.ones(1, 9, 9, dtype=torch.float64)
     depth[0, 4, 4] = 1.5
     rough = depth_roughness(depth, torch.full_like(depth, 0.001), torch.full_like(depth, 0.05))

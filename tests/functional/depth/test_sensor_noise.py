@@ -1,4 +1,4 @@
-"""The pieces of the sensor model: slopes of known planes, neighbours across jumps, disparity errors."""
+"""The pieces of the sensor model: slopes of known planes, neighbors across jumps, disparity errors."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_pixels_without_readings_around_have_no_slope():
     assert not bool(surface_slope(depth, FOCAL).any())
 
 
-def test_the_neighbour_across_the_largest_jump_is_found():
+def test_the_neighbor_across_the_largest_jump_is_found():
     depth = torch.tensor([[[1.0, 1.0, 1.2], [1.0, 1.1, 3.0], [1.0, 1.0, 1.0]]])
     assert facing_depth(depth)[0, 1].tolist() == pytest.approx([1.1, 3.0, 1.0])
 

@@ -22,7 +22,7 @@ INTRINSICS = torch.tensor([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]
 
 
 def view(seed: int) -> tsdf.FusionView:
-    """A bumpy surface a metre away, with holes, colours, labels and weights."""
+    """A bumpy surface a metre away, with holes, colors, labels and weights."""
     generator = seeded(seed)
     depth = 1.0 + 0.05 * torch.rand(48, 64, generator=generator)
     depth[torch.rand(48, 64, generator=generator) < 0.1] = 0.0

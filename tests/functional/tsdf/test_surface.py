@@ -77,7 +77,7 @@ def test_a_linear_field_gives_its_direction_whatever_was_not_seen(backend, seed)
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("radius", [6, 15])  # voxels
-def test_normals_of_a_ball_lead_away_from_its_centre(backend, radius):
+def test_normals_of_a_ball_lead_away_from_its_center(backend, radius):
     size = radius * GRID.voxel_size
     found = tsdf.find_crossings(field_of(lambda places: places.norm(dim=-1) - size, blocks=3), GRID, backend=backend)
     cosine = (found.normals * torch.nn.functional.normalize(found.points, dim=1)).sum(1).clamp(-1, 1)

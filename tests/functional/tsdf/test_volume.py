@@ -96,7 +96,7 @@ def test_weights_are_those_of_the_formula():
 
 
 def test_many_views_stay_within_rounding_of_the_exact_mean():
-    """Stored distances and colours are integers, updated view by view; the mean in float64 is the truth."""
+    """Stored distances and colors are integers, updated view by view; the mean in float64 is the truth."""
     generator = seeded(0)
     depth = 0.5 + 0.004 * torch.randn(200, generator=generator)
     colors = torch.randint(40, 200, (200, 1, 24, 32, 3), generator=generator, dtype=torch.uint8)
@@ -109,7 +109,7 @@ def test_many_views_stay_within_rounding_of_the_exact_mean():
         assert found == pytest.approx(float(colors[:, 0, 11, 16, channel].double().mean()), abs=1.5)
 
 
-def test_a_colour_that_does_not_change_stays_exact():
+def test_a_color_that_does_not_change_stays_exact():
     colors = torch.randint(256, (1, 24, 32, 3), generator=seeded(1), dtype=torch.uint8)
     volume = volume_of(*[frame_of(wall(0.5), colors=colors)] * 30)
     packed = stored(volume, "color", (0, 0, 50))
@@ -362,7 +362,7 @@ def test_the_core_finds_the_rows_that_the_reference_finds():
 
 
 @needs_core
-def test_the_core_packs_colours_as_the_reference_does():
+def test_the_core_packs_colors_as_the_reference_does():
     colors = torch.randint(256, (7, 9, 3), generator=seeded(3), dtype=torch.uint8)
     assert torch.equal(tsdf.pack_colors(colors, backend="torch"), tsdf.pack_colors(colors, backend="cpu"))
 

@@ -102,7 +102,7 @@ def test_every_field_lands_where_its_name_says(tmp_path: Path, encoding: str) ->
 
 
 @pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
-def test_rgb_as_float_bits_gives_the_same_colours_as_rgba_integers(tmp_path: Path, encoding: str) -> None:
+def test_rgb_as_float_bits_gives_the_same_colors_as_rgba_integers(tmp_path: Path, encoding: str) -> None:
     bits = np.array([0x00102030, 0x7FC00001, 0xFFFFFFFF], dtype=np.uint32)  # the last two are NaN patterns
     as_float = pcd([*XYZ, ("rgb", "F", 4, 1)], [*COORDINATES.T, bits.view(np.float32)], encoding)
     as_int = pcd([*XYZ, ("rgba", "U", 4, 1)], [*COORDINATES.T, bits], encoding)
@@ -124,7 +124,7 @@ def test_rows_without_a_reading_are_dropped_and_source_index_keeps_the_pixel(tmp
     assert cloud.labels is not None
     assert cloud.labels.tolist() == [0, 4, 5]
     assert cloud.points[:, 0].tolist() == [0, 3, 4]
-    assert cloud.meta[0]["organised_size"] == [2, 3]
+    assert cloud.meta[0]["organized_size"] == [2, 3]
 
 
 def test_the_sensor_position_and_orientation_are_kept(tmp_path: Path) -> None:
@@ -374,7 +374,7 @@ def test_real_clouds_equal_what_open3d_reads(test_data: Path) -> None:
         assert np.array_equal(found.points.numpy(), np.asarray(expected.points)), file
         assert found.colors is not None
         assert np.array_equal((found.colors * 255).round().numpy(), np.rint(np.asarray(expected.colors) * 255)), file
-        assert found.meta[0]["organised_size"] == [480, 640]
+        assert found.meta[0]["organized_size"] == [480, 640]
 
 
 def test_real_labels_are_those_of_the_readme(test_data: Path) -> None:
@@ -385,7 +385,7 @@ def test_real_labels_are_those_of_the_readme(test_data: Path) -> None:
     assert labels & set(range(20, 30))  # the first object
     assert cloud.source_index is not None
     assert int(cloud.source_index.max()) < 480 * 640
-    # A pixel's column and row agree with its direction: right of the centre x > 0, below it y > 0.
+    # A pixel's column and row agree with its direction: right of the center x > 0, below it y > 0.
     column, row = cloud.source_index % 640, cloud.source_index // 640
     assert bool((cloud.points[column > 400, 0] > 0).all())
     assert bool((cloud.points[row > 320, 1] > 0).all())

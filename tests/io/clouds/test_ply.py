@@ -94,7 +94,7 @@ XYZ = "element vertex {}\nproperty float x\nproperty float y\nproperty float z"
         ("float", (1.000001, 0, 0.2), (1, 0, 0.2)),
     ],
 )
-def test_colours_of_every_type_land_in_0_to_1(
+def test_colors_of_every_type_land_in_0_to_1(
     tmp_path: Path, kind: str, values: tuple[float, ...], expected: tuple[float, ...]
 ) -> None:
     declarations = XYZ.format(1) + "".join(f"\nproperty {kind} {name}" for name in ("red", "green", "blue"))
@@ -104,7 +104,7 @@ def test_colours_of_every_type_land_in_0_to_1(
 
 
 @pytest.mark.parametrize("values", [(127.5, 0, 255), (300, 0, 1), (-1, 0, 1), (np.nan, 0, 0)])
-def test_colours_on_no_known_scale_are_refused(tmp_path: Path, values: tuple[float, ...]) -> None:
+def test_colors_on_no_known_scale_are_refused(tmp_path: Path, values: tuple[float, ...]) -> None:
     declarations = XYZ.format(1) + "".join(f"\nproperty float {name}" for name in ("red", "green", "blue"))
     with pytest.raises(CaptureError, match=r"floats in 0\.\.1"):
         read_ply(write(tmp_path / "c.ply", ply("ascii", declarations, ("", (0, 0, 1, *values)))))

@@ -104,7 +104,7 @@ def test_labels_that_are_not_whole_are_refused_with_a_way_out(tmp_path: Path, su
 
 @each_reader
 @pytest.mark.parametrize("value", [-1, -100, 255])
-def test_marks_of_unlabelled_points_are_kept_as_they_are(tmp_path: Path, suffix: str, value: int) -> None:
+def test_marks_of_unlabeled_points_are_kept_as_they_are(tmp_path: Path, suffix: str, value: int) -> None:
     odd = classes()
     odd[::5] = value
     assert value in READERS[suffix](write(tmp_path, suffix, scalar_Label=odd)).labels.tolist()
@@ -163,7 +163,7 @@ def test_a_vector_of_which_one_column_is_misnamed_is_refused(
 
 
 @each_reader
-def test_two_sets_of_normals_or_colours_are_refused(tmp_path: Path, suffix: str) -> None:
+def test_two_sets_of_normals_or_colors_are_refused(tmp_path: Path, suffix: str) -> None:
     both = {name: np.full(N, 0.5, "f4") for names in NORMALS.values() for name in names}
     with pytest.raises(CaptureError, match="may both be the normals"):
         READERS[suffix](write(tmp_path, suffix, **both))
@@ -172,7 +172,7 @@ def test_two_sets_of_normals_or_colours_are_refused(tmp_path: Path, suffix: str)
 @each_reader
 @pytest.mark.parametrize("dtype", ["u4", "f4", "i4"])
 @pytest.mark.parametrize("name", ["rgb", "rgba"])
-def test_packed_colours_are_unpacked(tmp_path: Path, suffix: str, name: str, dtype: str) -> None:
+def test_packed_colors_are_unpacked(tmp_path: Path, suffix: str, name: str, dtype: str) -> None:
     packed = np.full(N, 0x00336699, "u4").view(dtype)
     cloud = READERS[suffix](write(tmp_path, suffix, **{name: packed}))
     assert torch.allclose(cloud.colors, torch.tensor([0.2, 0.4, 0.6]))

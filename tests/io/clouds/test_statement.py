@@ -88,7 +88,7 @@ def test_frame_unit_viewpoint_source_and_kinds_come_back(
 
 
 @each_format
-def test_a_normalised_cloud_stays_one_and_knows_its_way_back(
+def test_a_normalized_cloud_stays_one_and_knows_its_way_back(
     tmp_path: Path, suffix: str, write: Callable[..., None], read: Callable[..., PointCloud], encoding: str
 ) -> None:
     metric = cloud_with_everything()

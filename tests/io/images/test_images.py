@@ -113,11 +113,11 @@ def test_a_frame_without_any_reading_is_refused(tmp_path: Path, raw: np.ndarray)
 
 
 @pytest.mark.parametrize(
-    ("mode", "word"), [("L", "8-bit grey"), ("P", "palette"), ("RGB", "colour"), ("RGBA", "alpha"), ("1", "1-bit")]
+    ("mode", "word"), [("L", "8-bit gray"), ("P", "palette"), ("RGB", "color"), ("RGBA", "alpha"), ("1", "1-bit")]
 )
 def test_pictures_of_depth_are_refused_as_depth(tmp_path: Path, mode: str, word: str) -> None:
     Image.new(mode, (4, 4)).save(tmp_path / "d.png")
-    with pytest.raises(CaptureError, match=f"must be 16-bit grey, but this is a .*{word}"):
+    with pytest.raises(CaptureError, match=f"must be 16-bit gray, but this is a .*{word}"):
         read_depth(tmp_path / "d.png", metres_per_unit=0.001)
 
 
@@ -261,7 +261,7 @@ def test_rounding_on_request_errs_by_half_a_unit_at_most(tmp_path: Path) -> None
     assert float((read_depth(tmp_path / "d.png", metres_per_unit=0.001) - depth).abs().max()) <= 0.0005 + 1e-6
 
 
-def test_colour_survives_a_round_trip_and_alpha_is_dropped(tmp_path: Path) -> None:
+def test_color_survives_a_round_trip_and_alpha_is_dropped(tmp_path: Path) -> None:
     colors = torch.randint(0, 256, (5, 7, 3), dtype=torch.uint8)
     write_color(tmp_path / "c.png", colors)
     assert torch.equal(read_color(tmp_path / "c.png"), colors)
@@ -275,13 +275,13 @@ def test_colour_survives_a_round_trip_and_alpha_is_dropped(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("mode", "name"), [("L", "c.png"), ("P", "c.png"), ("L", "c.jpg"), ("CMYK", "c.jpg"), ("LA", "c.png")]
 )
-def test_images_without_three_colours_are_refused_as_colour(tmp_path: Path, mode: str, name: str) -> None:
+def test_images_without_three_colors_are_refused_as_color(tmp_path: Path, mode: str, name: str) -> None:
     Image.new(mode, (3, 3)).save(tmp_path / name)
     with pytest.raises(CaptureError, match="must be 8-bit RGB"):
         read_color(tmp_path / name)
 
 
-def test_sixteen_bit_colour_is_refused_though_pillow_would_cut_it_down(tmp_path: Path) -> None:
+def test_sixteen_bit_color_is_refused_though_pillow_would_cut_it_down(tmp_path: Path) -> None:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
@@ -311,7 +311,7 @@ def test_labels_of_a_palette_image_are_its_indices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["RGB", "1"])
-def test_colours_and_masks_are_refused_as_labels(tmp_path: Path, mode: str) -> None:
+def test_colors_and_masks_are_refused_as_labels(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (3, 3)).save(tmp_path / "l.png")
     with pytest.raises(CaptureError, match="labels must be"):
         read_labels(tmp_path / "l.png")
@@ -322,7 +322,7 @@ def test_masks_are_true_wherever_they_are_not_zero(tmp_path: Path, array: np.nda
     assert read_mask(save(tmp_path / "m.png", array)).tolist() == [[True, False]]
 
 
-def test_colour_is_refused_as_a_mask(tmp_path: Path) -> None:
+def test_color_is_refused_as_a_mask(tmp_path: Path) -> None:
     Image.new("RGB", (3, 3)).save(tmp_path / "m.png")
-    with pytest.raises(CaptureError, match="1-bit or 8-bit grey"):
+    with pytest.raises(CaptureError, match="1-bit or 8-bit gray"):
         read_mask(tmp_path / "m.png")

@@ -186,12 +186,12 @@ def test_a_part_of_a_source_holds_what_it_says(source: CaptureSource) -> None:
 def test_unknown_options_are_refused_with_those_nearest(name: str, tmp_path: Path) -> None:
     if name in LAYOUTS:
         path, known = CAPTURES[name](tmp_path / "captures"), options_of(LAYOUTS[name])
-        misspelt: Any = {f"{known[0]}x": 1}
+        misspelled: Any = {f"{known[0]}x": 1}
     else:
         path, known = still(tmp_path / "captures"), fields_of(COMBINATORS[name])
-        misspelt = {name: {f"{known[0]}x": 1}}
+        misspelled = {name: {f"{known[0]}x": 1}}
     with pytest.raises(ConfigError, match=f"did you mean '{known[0]}'"):
-        open_source(path, kind=name if name in LAYOUTS else None, **misspelt)
+        open_source(path, kind=name if name in LAYOUTS else None, **misspelled)
     with pytest.raises(ConfigError, match="did you mean 'averaged'"):
         open_source(path, kind=name if name in LAYOUTS else None, average=3)
 
@@ -323,7 +323,7 @@ class Arrays(Source):
         super().__init__(path, [file.stem for file in Path(path).glob("*.npy")])
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return any(path.glob("*.npy"))
 
     def files(self, sample_id: str) -> dict[str, Path]:

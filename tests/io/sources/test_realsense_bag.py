@@ -1,4 +1,4 @@
-"""RealSense recordings: depth in the recorded unit, colour registered by the recorded transform."""
+"""RealSense recordings: depth in the recorded unit, color registered by the recorded transform."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def test_depth_comes_in_order_in_the_recorded_unit_with_its_camera(tmp_path):
         assert frame.provenance["timestamps"] == [pytest.approx(0.1 + 0.033 * number)]
 
 
-def test_registered_depth_lies_on_the_colour_image_nearest_in_time(tmp_path):
+def test_registered_depth_lies_on_the_color_image_nearest_in_time(tmp_path):
     path = written(tmp_path / "a.bag", recording())
     source = open_source(path, registered=True, max_time_apart=0.01)
     assert source.ids == ["000000", "000001"]
     frame = source.load("000001")
     assert int(frame.colors[0, 0, 0, 1]) == 50
     assert frame.provenance["color_seconds_later"] == pytest.approx(0.005)
-    # A point that both see has moved by f * shift / z to the right in the colour image.
+    # A point that both see has moved by f * shift / z to the right in the color image.
     assert torch.equal(
         torch.tensor(frame.provenance["registered"]["color_from_depth"])[0, :3, 3], torch.tensor([SHIFT, 0, 0])
     )
@@ -106,7 +106,7 @@ def test_what_a_recording_lacks_is_named(tmp_path):
         open_source(path, registered=True)
 
 
-def test_colour_too_late_for_every_depth_is_refused_with_the_gap(tmp_path):
+def test_color_too_late_for_every_depth_is_refused_with_the_gap(tmp_path):
     path = written(tmp_path / "a.bag", recording())
     with pytest.raises(CaptureError, match=r"within 0.001 s; the nearest is 0.005 s off"):
         open_source(path, registered=True, max_time_apart=0.001)
@@ -187,8 +187,8 @@ def test_a_folder_with_one_recording_is_that_recording(tmp_path):
         open_source(tmp_path / "take")
 
 
-def test_the_colour_stream_that_is_not_read_is_told_with_the_way_to_read_it(tmp_path):
+def test_the_color_stream_that_is_not_read_is_told_with_the_way_to_read_it(tmp_path):
     path = written(tmp_path / "a.bag", recording())
     (line,) = open_source(path).unread()
-    assert line == f"colour stream {COLOR}/image/data (2 messages); registered=True (--registered) reads it"
+    assert line == f"color stream {COLOR}/image/data (2 messages); registered=True (--registered) reads it"
     assert open_source(path, registered=True).unread() == []

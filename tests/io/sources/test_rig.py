@@ -137,7 +137,7 @@ def test_a_camera_on_the_gripper_has_its_own_poses_beside_calibrated_ones(
         RigSource(rig, calibration=known, frame_id="base")
 
 
-def test_colour_labels_and_confidence_reach_the_points_of_their_camera(rig: Path, frames: list[DepthFrame]) -> None:
+def test_color_labels_and_confidence_reach_the_points_of_their_camera(rig: Path, frames: list[DepthFrame]) -> None:
     chain = Compose([Deproject(), ToFrame(frame="base"), MergeViews()])
     cloud = chain(open_source(rig).load("f0"))
     assert isinstance(cloud, PointCloud)
@@ -302,14 +302,14 @@ def test_a_calibration_must_lead_to_a_frame_that_is_named(calibrated: tuple[Path
 
 
 def test_only_folders_that_are_all_of_the_plain_layout_are_a_rig(rig: Path) -> None:
-    assert RigSource.recognises(rig)
+    assert RigSource.recognizes(rig)
     (rig / ".trash").mkdir()
     (rig / "rig.yaml").write_text("")
-    assert RigSource.recognises(rig)
-    assert not RigSource.recognises(rig / "left")
-    assert not RigSource.recognises(rig / "rig.yaml")
+    assert RigSource.recognizes(rig)
+    assert not RigSource.recognizes(rig / "left")
+    assert not RigSource.recognizes(rig / "rig.yaml")
     (rig / "notes").mkdir()
-    assert not RigSource.recognises(rig)
+    assert not RigSource.recognizes(rig)
     with pytest.raises(CaptureError, match=r"left/, notes/, rig\.yaml, right/, top/"):
         open_source(rig)
     with pytest.raises(CaptureError, match="notes is of another layout"):
@@ -319,7 +319,7 @@ def test_only_folders_that_are_all_of_the_plain_layout_are_a_rig(rig: Path) -> N
 def test_one_camera_is_no_rig(rig: Path) -> None:
     for name in ("right", "top"):
         shutil.rmtree(rig / name)
-    assert not RigSource.recognises(rig)
+    assert not RigSource.recognizes(rig)
     with pytest.raises(CaptureError, match=r"needs two or more folders.*found left"):
         open_source(rig, kind="rig")
 

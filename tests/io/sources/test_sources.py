@@ -341,10 +341,10 @@ def test_the_real_seven_scenes_sequence_has_the_documented_facts(test_data: Path
         assert frame.camera.intrinsics[0, 0, 0] == 585
 
 
-def test_the_real_labelled_clouds_open_as_one_source(test_data: Path) -> None:
+def test_the_real_labeled_clouds_open_as_one_source(test_data: Path) -> None:
     source = open_source(test_data / "osd")
     assert {"learn0", "learn16", "learn44"} <= set(source.ids)
     cloud = source.load("learn0")
     assert isinstance(cloud, PointCloud)
     assert cloud.labels is not None
-    assert cloud.meta[0]["organised_size"] == [480, 640]
+    assert cloud.meta[0]["organized_size"] == [480, 640]

@@ -126,7 +126,7 @@ def test_frames_keep_any_name(name):
         {"unit": "feet"},
         {"kinds": []},
         {"kinds": {"a": "invariant"}},
-        {"kinds": {"a": "colourful"}},
+        {"kinds": {"a": "colorful"}},
         {"meta": 3},
         {"meta": [1]},
         {"meta": [{}, {}]},

@@ -90,7 +90,7 @@ def test_depth_that_units_cannot_say_exactly_stays_float(tmp_path, change):
     _assert_read_back(frame, tmp_path)
 
 
-def test_a_capture_without_colour_and_pose_reads_back(tmp_path):
+def test_a_capture_without_color_and_pose_reads_back(tmp_path):
     frame = _frame(torch.full((1, 12, 16), 1.5))
     write_capture(frame, tmp_path)
     assert sorted(path.name for path in (tmp_path / "view0").iterdir()) == ["depth", "intrinsics.json"]

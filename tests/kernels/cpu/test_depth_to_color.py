@@ -1,4 +1,4 @@
-"""The compiled registration of depth to colour gives the reference's images bit for bit."""
+"""The compiled registration of depth to color gives the reference's images bit for bit."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_depth_images_without_pixels_give_empty_images(size):
 
 
 def test_equally_near_readings_leave_the_first_on_any_number_of_threads():
-    depth = torch.ones(1, 300, 40)  # many readings for every colour pixel
+    depth = torch.ones(1, 300, 40)  # many readings for every color pixel
     case = arguments(depth, (5, 4), torch.eye(4, dtype=torch.float64)[None])
     for count in (1, 2, 4):
         with threads(count):
@@ -167,7 +167,7 @@ def test_equally_near_readings_leave_the_first_on_any_number_of_threads():
 
 def test_a_reading_just_before_the_camera_covers_the_image():
     depth = torch.full((1, 20, 30), 2.0)
-    depth[0, 10, 14] = 0.9901  # beside the axis, 0.1 mm before the colour camera
+    depth[0, 10, 14] = 0.9901  # beside the axis, 0.1 mm before the color camera
     result = assert_same(arguments(depth, (40, 60), moved(1, (0.0, 0.0, 1.0), 0.0, (0.0, 0.0, -0.99))))
     assert bool((result.pixel_index == 10 * 30 + 14).all())
 

@@ -67,7 +67,7 @@ def depth_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray
     return z
 
 
-def organised(rng: np.random.Generator) -> tuple[Tensor, Tensor, ImageGrid]:
+def organized(rng: np.random.Generator) -> tuple[Tensor, Tensor, ImageGrid]:
     """One to three clouds on images of one size, one pixel to a few thousand; masked, cropped, perhaps moved."""
     height, width = (
         (1, 1),
@@ -281,8 +281,8 @@ def each_case(first: int, body: Callable[[np.random.Generator], None]) -> None:
             raise
 
 
-def test_organised_clouds_full_of_ties_equal_the_reference(machine: str):
-    each_case(0, lambda rng: fuzz_neighborhoods(rng, *organised(rng)))
+def test_organized_clouds_full_of_ties_equal_the_reference(machine: str):
+    each_case(0, lambda rng: fuzz_neighborhoods(rng, *organized(rng)))
 
 
 def test_ragged_clouds_equal_the_reference(machine: str):

@@ -119,7 +119,7 @@ def test_images_of_any_size_equal_the_reference(distortion, size):
     assert_same(*both("deproject_into_box", *cameras, colors, images, **region((-1.0,) * 3, (1.0,) * 3)))
 
 
-def test_all_256_colours_equal_the_reference():
+def test_all_256_colors_equal_the_reference():
     depth = torch.ones(1, 16, 16)
     colors = torch.arange(256, dtype=torch.uint8).reshape(1, 16, 16, 1).expand(-1, -1, -1, 3)
     assert_same(*both("deproject_images", depth, K, None, colors, {}))

@@ -1,4 +1,4 @@
-"""The compiled neighbour kernels against their references: equal bit for bit where the answer is discrete."""
+"""The compiled neighbor kernels against their references: equal bit for bit where the answer is discrete."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def assert_normals(
     unit = torch.nn.functional.normalize(ours[planar])  # float32 normals are unit to 1e-7 only
     along = torch.einsum("ni,nij,nj->n", unit, covariance[planar], unit)
     size = covariance[planar].diagonal(dim1=1, dim2=2).sum(1)
-    # The kernel centres its sums on the query, this check on the mean: they differ by roundings of whole sums.
+    # The kernel centers its sums on the query, this check on the mean: they differ by roundings of whole sums.
     assert bool((along - values[:, 0] <= 1e-9 * size).all())
     # Between a direction that stands out and the one agreed on lie gaps as small as rounding.
     gap = (values[:, 1] - values[:, 0]) / size
@@ -367,8 +367,8 @@ def test_a_signal_ends_a_long_call_within_a_second():
     assert time.process_time() - started < 1.3
 
 
-@pytest.mark.parametrize("organised", [False, True])
-def test_working_space_is_at_most_a_hundred_bytes_per_point(organised: bool):
+@pytest.mark.parametrize("organized", [False, True])
+def test_working_space_is_at_most_a_hundred_bytes_per_point(organized: bool):
     side = 700
     code = f"""
         import resource, torch
@@ -383,7 +383,7 @@ def test_working_space_is_at_most_a_hundred_bytes_per_point(organised: bool):
         del u, v, z
         F.statistical_outlier_mask(points[:2000], backend="cpu")
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        F.statistical_outlier_mask(points, grid=grid if {organised} else None, backend="cpu")
+        F.statistical_outlier_mask(points, grid=grid if {organized} else None, backend="cpu")
         print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(points))
     """
     done = run_python(textwrap.dedent(code))
@@ -417,9 +417,9 @@ def test_a_real_frame_gives_the_same_with_its_grid_shuffled_and_by_another_tree(
     rows = grid.pixel_index < 200 * grid.size[1]  # its upper part
     points, grid = points[rows], replace(grid, pixel_index=grid.pixel_index[rows])
     index, distance = F.knn(points, k=20, backend="cpu")
-    organised = F.knn(points, k=20, grid=grid, backend="cpu")
-    assert torch.equal(organised[0], index)
-    assert torch.equal(organised[1], distance)
+    organized = F.knn(points, k=20, grid=grid, backend="cpu")
+    assert torch.equal(organized[0], index)
+    assert torch.equal(organized[1], distance)
     order = torch.randperm(len(points))
     back = torch.empty_like(order)
     back[order] = torch.arange(len(order))

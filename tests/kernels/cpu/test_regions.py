@@ -272,7 +272,7 @@ def many_points() -> Tensor:
 @pytest.mark.parametrize(
     "call",
     [
-        # A million neighbours wanted of each point, and none to be had: hours of counting.
+        # A million neighbors wanted of each point, and none to be had: hours of counting.
         lambda points: radius_outlier_mask(points, radius=0.4, min_neighbors=1_000_000, backend="cpu"),
         lambda points: dbscan(points, eps=0.4, min_points=1_000_000, backend="cpu"),
         lambda points: dbscan(points, eps=0.003, min_points=3, backend="cpu"),

@@ -56,7 +56,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def organised(rows: int, columns: int) -> Tensor:
+def organized(rows: int, columns: int) -> Tensor:
     """A tilted table with a ball on it and millimetre depth, in scan order."""
     v, u = torch.meshgrid(torch.arange(rows) / rows, torch.arange(columns) / columns, indexing="ij")
     ball = (0.04 - (u - 0.5) ** 2 - (v - 0.5) ** 2).clamp(min=0).sqrt()
@@ -70,8 +70,8 @@ def line(count: int) -> Tensor:
 
 # name -> points and points per cloud
 CLOUDS: dict[str, tuple[Tensor, list[int]]] = {
-    "organised": (organised(60, 80), [4800]),
-    "shuffled": (organised(60, 80)[torch.randperm(4800, generator=torch.Generator().manual_seed(0))], [4800]),
+    "organized": (organized(60, 80), [4800]),
+    "shuffled": (organized(60, 80)[torch.randperm(4800, generator=torch.Generator().manual_seed(0))], [4800]),
     "duplicates": (torch.randint(3, (500, 3), generator=torch.Generator().manual_seed(0)).float(), [500]),
     "all the same": (torch.ones(100, 3), [100]),
     "collinear": (line(300), [300]),
@@ -82,8 +82,8 @@ CLOUDS: dict[str, tuple[Tensor, list[int]]] = {
     "signed zeros": (torch.tensor([[0.0, -0.0, 0.0], [-0.0, 0.0, -0.0], [1.0, -0.0, 0.0]]), [3]),
     "one point": (torch.tensor([[1.0, 2.0, 3.0]]), [1]),
     "ragged": (random(1500, 3), [0, 700, 1, 0, 33, 766, 0]),
-    "large": (organised(200, 300), [60_000]),
-    "large and small": (torch.cat([random(5, 3), organised(150, 200), random(40, 3)]), [5, 30_000, 40]),
+    "large": (organized(200, 300), [60_000]),
+    "large and small": (torch.cat([random(5, 3), organized(150, 200), random(40, 3)]), [5, 30_000, 40]),
     "empty": (torch.empty(0, 3), [0]),
 }
 
@@ -158,7 +158,7 @@ def test_farthest_points_of_none_or_too_few():
 
 
 def test_many_farthest_points_of_a_large_cloud_equal_the_reference():
-    points = organised(120, 160)
+    points = organized(120, 160)
     assert_equal_to_reference(farthest_point_sample, points, num_samples=2000)
 
 
@@ -264,7 +264,7 @@ def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses,
 def test_inlier_counts_equal_the_reference():
     from pcdata.functional import planes
 
-    points, ptr = organised(100, 101), torch.tensor([0, 4000, 4003, 10100])
+    points, ptr = organized(100, 101), torch.tensor([0, 4000, 4003, 10100])
     triples, which = planes._draw_triples([4000, 3, 6097], 77, [0, 1, 2])
     drawn = [planes.draw_planes(points, ptr, triples, which, backend=name) for name in ("cpu", "torch")]
     torch.testing.assert_close(*drawn, rtol=0, atol=1e-12, equal_nan=True)
@@ -307,7 +307,7 @@ def test_ten_thousand_small_clouds_take_a_small_multiple_of_one_large_one(operat
 
 
 def test_the_plane_is_the_same_bits_for_any_thread_count():
-    points = organised(300, 400)
+    points = organized(300, 400)
     before = torch.get_num_threads()
     found = []
     for count in (1, 2, 7):

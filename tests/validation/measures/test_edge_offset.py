@@ -1,4 +1,4 @@
-"""The shift between colour and depth: found where it is known, told apart from fattened objects, else not given."""
+"""The shift between color and depth: found where it is known, told apart from fattened objects, else not given."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def shelves_color(down: int, *, posts: bool) -> Tensor:
 
 
 def test_rims_of_one_side_alone_leave_open_whether_they_are_shifted_or_fat() -> None:
-    """Seen from their upper rims, boards that depth makes 3 pixels fatter are boards whose colour lies lower."""
+    """Seen from their upper rims, boards that depth makes 3 pixels fatter are boards whose color lies lower."""
     for grow, down in ((3, 0), (0, 3)):
         offset = measured(shelves_depth(grow, posts=False), shelves_color(down, posts=False))
         assert offset.problem is not None or offset.least_length < 0.5
@@ -120,7 +120,7 @@ def test_a_single_part_of_the_image_is_never_sure_evidence() -> None:
     assert offset.problem is not None
 
 
-def test_too_few_rims_and_colours_that_share_no_edge_give_a_reason_instead_of_a_number() -> None:
+def test_too_few_rims_and_colors_that_share_no_edge_give_a_reason_instead_of_a_number() -> None:
     flat = measured(torch.full((HEIGHT, WIDTH), 0.8), plates_color())
     assert flat.problem is not None
     assert "0 points on the rims" in flat.problem
@@ -131,7 +131,7 @@ def test_too_few_rims_and_colours_that_share_no_edge_give_a_reason_instead_of_a_
 
 
 def test_black_pixels_are_no_image_and_do_not_vote() -> None:
-    """Colour warped onto the depth is black where there is no depth: that edge fits by construction."""
+    """Color warped onto the depth is black where there is no depth: that edge fits by construction."""
     depth = plates_depth().masked_fill(inside(6.0) & ~inside(), 0.0)
     colors = plates_color((5, 0))
     colors[depth == 0] = 0

@@ -1,6 +1,6 @@
 // Statistical outliers: the mean distance to the nearest neighbors, and which means are unusual for their cloud.
 //
-// Source: Rusu et al., Towards 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
+// Source: Rusu et al., Toward 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
 #include "pc/neighbors/batch_search.hpp"
 #include "pc/neighbors/nearest_keys.hpp"
 

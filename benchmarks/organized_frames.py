@@ -1,6 +1,6 @@
-"""Organised real captures through normals and outliers, one process per frame: no crash, and the reference's answers.
+"""Organized real captures through normals and outliers, one process per frame: no crash, and the reference's answers.
 
-    PCDATA_TEST_DATA=... python benchmarks/organised_frames.py [--limit 2] [--out RESULTS.json]
+    PCDATA_TEST_DATA=... python benchmarks/organized_frames.py [--limit 2] [--out RESULTS.json]
 
 Of every folder that a source reads, and of every other folder of 16-bit PNG, EXR or .npy depth images, the first
 ``--limit`` frames; the latter with a camera made up, for only the geometry of the pixels matters here. In a process of
@@ -64,9 +64,9 @@ def check_cloud(cloud: Any) -> dict[str, Any]:
 
     from pcdata.functional.image_grid import ImageGrid
 
-    if "organised_size" not in cloud.meta[0]:
-        return {"skipped": "neither a depth frame nor an organised cloud"}
-    height, width = cloud.meta[0]["organised_size"]
+    if "organized_size" not in cloud.meta[0]:
+        return {"skipped": "neither a depth frame nor an organized cloud"}
+    height, width = cloud.meta[0]["organized_size"]
     camera = [[525.0, 0, (width - 1) / 2], [0, 525.0, (height - 1) / 2], [0, 0, 1]]
     grid = ImageGrid(cloud.source_index, (height, width), torch.tensor([camera], dtype=torch.float64))
     return compared(cloud.points, cloud.ptr, grid)
