@@ -241,7 +241,7 @@ def test_a_named_file_may_be_a_link_to_anywhere(tmp_path: Path) -> None:
 # -- what exists and is not read ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["pose", "color", "RGB", "image", "Depths", "label", "mask", "conf", "camera_poses"])
+@pytest.mark.parametrize("name", ["pose", "colour", "RGB", "image", "Depths", "label", "mask", "conf", "camera_poses"])
 def test_a_folder_that_looks_like_a_role_is_read_or_refused_and_the_advice_works(name: str, tmp_path: Path) -> None:
     root = folder(tmp_path / "c", ["1"])
     role = {"pose": "pose", "camera_poses": "pose", "label": "labels", "mask": "mask", "conf": "confidence"}
@@ -262,7 +262,7 @@ def test_a_folder_that_looks_like_a_role_is_read_or_refused_and_the_advice_works
 
 def test_wrong_names_of_folders_are_refused(tmp_path: Path) -> None:
     root = folder(tmp_path / "c", ["1"])
-    for wrong in ({"color": "rgb"}, {"color": "/etc"}, {"color": "../c/color"}, {"depth": None}, {"color": 3}):
+    for wrong in ({"colour": "rgb"}, {"color": "/etc"}, {"color": "../c/color"}, {"depth": None}, {"color": 3}):
         with pytest.raises(ConfigError):
             open_source(root, folders=wrong)
     with pytest.raises(CaptureError, match="has no folder 'rgb'"):
