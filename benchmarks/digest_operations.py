@@ -179,6 +179,12 @@ def _parts() -> dict[str, list[Tensor]]:
     return {name: [field[:50], field[50:]] for name, field in _fields().items()}
 
 
+def _fillers() -> dict[str, int]:
+    """What stands for no value: -1 where that is a signed integer."""
+    signed = (torch.int16, torch.int32, torch.int64)
+    return {name: -1 if values[0].dtype in signed else 0 for name, values in _parts().items()}
+
+
 def _mask() -> Tensor:
     return torch.rand(rendered(2, 5).depth.shape, generator=seeded(8)) < 0.7
 
@@ -202,7 +208,7 @@ def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "pick_rows", "index", lambda: ((_fields(), rows), {})
     yield "pick_rows", "mask", lambda: ((_fields(), points(90, 1)[:, 0] > 0.1), {})
     yield "join_rows", "two", lambda: ((_parts(),), {})
-    yield "pad_rows", "two", lambda: ((_parts(), 60), {})
+    yield "pad_rows", "two", lambda: ((_parts(), 60, _fillers()), {})
     for name in ("transform_points", "transform_directions"):
         yield name, "one", lambda: ((points(90, 1), ptr_of(90), poses(2)[:1]), {})
         yield name, "two", lambda: ((points(90, 1), ptr_of(50, 40), poses(2)), {})
