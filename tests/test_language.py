@@ -35,4 +35,4 @@ def test_words_are_spelled_as_in_american_english():
 
 
 def test_a_british_word_is_seen_in_any_name():
-    assert british_words("The_Colours of a neighbour, centred") == {"the_colours", "neighbour"}
+    assert british_words("The_Colours of a neighbour, centred") == {"the_colours", "neighbour", "centred"}
