@@ -11,7 +11,16 @@ import torch
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli import main
 from pcdata.errors import PcdataError
-from pcdata.io import write_calibration, write_color, write_depth, write_labels, write_mask, write_pcd, write_ply
+from pcdata.io import (
+    write_calibration,
+    write_color,
+    write_depth,
+    write_labels,
+    write_mask,
+    write_pcd,
+    write_ply,
+    write_volume,
+)
 from pcdata.io.calibration.capture_camera import write_pose
 from pcdata.io.images.confidence import write_confidence
 from pcdata.io.writers.capture_folder import write_capture
@@ -36,7 +45,7 @@ WRITERS = {
     "mesh.ply": lambda path: write_ply(path, volume().extract_mesh()),
     "a.pcd": lambda path: write_pcd(path, cloud()),
     "packed.pcd": lambda path: write_pcd(path, cloud(), encoding="binary_compressed"),
-    "volume.npz": lambda path: volume().save(path),
+    "volume.npz": lambda path: write_volume(path, volume()),
     "cell.yaml": lambda path: write_calibration(
         path, Calibration(transforms={"a_from_b": torch.eye(4, dtype=torch.float64)})
     ),

@@ -154,12 +154,12 @@ def test_every_way_of_writing_it_down_leads_back(tmp_path):
 
 def test_unknown_sections_and_faults_in_any_section_are_told_together():
     with pytest.raises(ConfigError) as caught:
-        T.Compose.from_yaml("depth:\n  - Deprojekt\naugmentation: []\ncloud:\n  - Center\n", name="p.yaml")
+        T.Compose.from_yaml("depth:\n  - Deprojekt\naugmentation: []\ncloud:\n  - Centr\n", name="p.yaml")
     own = "one of your own needs --import FILE.py"
     assert str(caught.value).splitlines() == [
         f"p.yaml:2:5: unknown transform 'Deprojekt'; did you mean 'Deproject'?; {own}",
         "p.yaml:3:1: unknown section 'augmentation'; a pipeline has depth, cloud, augment",
-        f"p.yaml:5:5: unknown transform 'Center'; did you mean 'Center' or 'CropCenter'?; {own}",
+        f"p.yaml:5:5: unknown transform 'Centr'; did you mean 'Center' or 'CropCenter'?; {own}",
     ]
 
 
