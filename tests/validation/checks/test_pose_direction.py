@@ -62,7 +62,7 @@ def direction(checks: list[Finding]) -> Finding:
         (in_centimetres, "centimetres"),
     ],
 )
-@pytest.mark.parametrize("view", [0, 1, 2])
+@pytest.mark.parametrize("view", [0, 2])
 def test_one_pose_of_another_convention_is_named_with_it_and_no_other_view_is_blamed(
     num_views: int, mistake: Callable[[Tensor], Tensor], words: str, view: int
 ) -> None:
