@@ -39,3 +39,11 @@ def test_what_is_tested_as_oldest_is_what_is_stated():
 def test_every_needed_package_is_tested_at_its_oldest():
     needed, _ = stated()
     assert {re.split(r"[>=<]", line)[0] for line in needed} <= oldest().keys()
+
+
+def test_the_tests_that_ci_names_are_there():
+    named = [
+        path for script in (ROOT / ".ci").iterdir() for path in re.findall(r"tests/[\w/]+\.py", script.read_text())
+    ]
+    assert len(named) >= 10
+    assert [path for path in named if not (ROOT / path).exists()] == []
