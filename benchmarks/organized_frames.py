@@ -162,7 +162,8 @@ def main() -> None:
         start = time.perf_counter()
         command = [sys.executable, __file__, "--frame", folder, capture]
         done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-        row: dict[str, Any] = {"frame": f"{Path(folder).relative_to(data)}/{capture}", "exit": done.returncode}
+        # A loose file is named by its own path, a capture by its id within the folder.
+        row: dict[str, Any] = {"frame": str((Path(folder) / capture).relative_to(data)), "exit": done.returncode}
         if done.returncode == 0:
             row |= json.loads(done.stdout.splitlines()[-1])
         else:
