@@ -1,9 +1,9 @@
 """A small tabletop world, ray-cast analytically: depth, color, labels, normals and poses with known truth."""
 
-from pcdata.synthetic.noise import SensorNoise
 from pcdata.synthetic.shapes import Box, Cylinder, Shape, Sphere
-from pcdata.synthetic.source import SyntheticSource, tabletop_frames
+from pcdata.synthetic.stereo_camera import SensorNoise
 from pcdata.synthetic.tabletop import BASE_FRAME, Tabletop, tabletop
+from pcdata.synthetic.tabletop_source import SyntheticSource, tabletop_frames
 from pcdata.synthetic.teleop import TeleopSource, TeleopState
 from pcdata.synthetic.viewpoints import Miscalibration, look_at
 

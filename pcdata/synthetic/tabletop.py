@@ -12,11 +12,11 @@ from torch import Tensor
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.rng import generator_for
 from pcdata.structures import Camera, DepthFrame
-from pcdata.synthetic.noise import SensorNoise, noise_named
 from pcdata.synthetic.raycast import Hits, cast, ray_directions
 from pcdata.synthetic.scene import make_floor, make_table, place_objects
 from pcdata.synthetic.shading import own_colors, shade
 from pcdata.synthetic.shapes import Box, Shape
+from pcdata.synthetic.stereo_camera import SensorNoise, noise_named
 from pcdata.synthetic.viewpoints import Miscalibration, place_cameras
 from pcdata.threads import torch_on_one_thread
 

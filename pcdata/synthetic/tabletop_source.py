@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pcdata.errors import ConfigError
 from pcdata.files.sample_names import check_known
 from pcdata.structures import DepthFrame
-from pcdata.synthetic.noise import SensorNoise, noise_named
+from pcdata.synthetic.stereo_camera import SensorNoise, noise_named
 from pcdata.synthetic.tabletop import Tabletop, tabletop
 from pcdata.synthetic.viewpoints import Miscalibration
 
