@@ -49,7 +49,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "action": "append",
             "type": lambda text: name_and_value(text),
             "metavar": "ROLE=NAME",
-            "help": "name of the folder of a role (depth, color, labels, mask, confidence, pose, signals); "
+            "help": "name of the folder of a role (depth, color, labels, mask, confidence, pose, intrinsics, signals); "
             "ROLE= leaves it out",
         },
     ),

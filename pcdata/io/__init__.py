@@ -26,14 +26,19 @@ from pcdata.io.sources.temporal import TemporalFilterDepth, TemporallyFilteredSo
 from pcdata.io.store.stores import STORES, Store, register_store
 from pcdata.io.store.volumes import read_volume, write_volume
 from pcdata.io.writers.capture_folder import write_capture
+from pcdata.io.writers.conversion import convert
+from pcdata.io.writers.registry import WRITERS, register_writer
+from pcdata.io.writers.writer import Captures, Writer, WrittenReport
 
 __all__ = [
     "COMBINATORS",
     "LAYOUTS",
     "STORES",
+    "WRITERS",
     "AveragedSource",
     "CaptureCamera",
     "CaptureSource",
+    "Captures",
     "CombinedSource",
     "JoinedSource",
     "Source",
@@ -41,6 +46,9 @@ __all__ = [
     "SubsetSource",
     "TemporalFilterDepth",
     "TemporallyFilteredSource",
+    "Writer",
+    "WrittenReport",
+    "convert",
     "open_source",
     "read_calibration",
     "read_capture_camera",
@@ -59,6 +67,7 @@ __all__ = [
     "register_combinator",
     "register_layout",
     "register_store",
+    "register_writer",
     "write_calibration",
     "write_capture",
     "write_capture_camera",

@@ -72,7 +72,8 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
 
-    The last three are optional, as are ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
+    The last three are optional, as are ``skew`` in pixels, ``is_window`` of an image that was cut from a larger one,
+    ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
     "swapped"), ``background_label``, the id that means "no object", and ``invalid_values``, a list of stored depths
     besides 0 that mean "no reading"; ``calibration``, a calibration file beside this one whose camera counts instead,
     ``camera``, its name there, and ``folders``, names of folders by role; ``notes``, ``sensor``, ``serial``,
@@ -86,6 +87,18 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
     """
     where = f"read_capture_camera: {path}"
     return capture_camera_of(where, json_object(where, read_text(where, path), error=CaptureError))
+
+
+def read_camera(path: str | os.PathLike[str]) -> Camera:
+    """Read a file that states the intrinsics of one image and nothing else, see :func:`read_capture_camera`.
+
+    Raises:
+        CaptureError: the file is missing or wrong, or states what is of all images, such as the unit.
+    """
+    stated = read_capture_camera(path)
+    if others := [key for key, name in _STATED.items() if getattr(stated, name) is not None]:
+        raise CaptureError(f"read_camera: {path}: {others[0]} is of all images; say it in intrinsics.json")
+    return stated.camera
 
 
 def capture_camera_of(where: str, data: dict[str, Any]) -> CaptureCamera:
@@ -108,8 +121,19 @@ def capture_camera_of(where: str, data: dict[str, Any]) -> CaptureCamera:
         folders = None if folders is None else check_folders(where, folders)
     except ConfigError as error:  # what would be wrong of an argument is wrong in the file
         raise CaptureError(str(error)) from error
+    is_window = data.get("is_window", False)
+    if not isinstance(is_window, bool):
+        raise CaptureError(f"{where}: 'is_window' must be true or false, got {is_window!r:.80}")
     camera = _camera(
-        where, fx=fx, fy=fy, cx=cx, cy=cy, size=(height, width), distortion=_distortion(where, data.get("distortion"))
+        where,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        skew=_number(where, "skew", data.get("skew", 0.0)),
+        size=(height, width),
+        distortion=_distortion(where, data.get("distortion")),
+        is_window=is_window,
     )
     return CaptureCamera(
         camera=camera,
@@ -129,15 +153,17 @@ def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamer
     """Write the JSON file from which :func:`read_capture_camera` returns the same numbers.
 
     Raises:
-        CaptureError: there is more than one camera, its axes are skewed, or the file cannot be written.
+        CaptureError: there is more than one camera, or the file cannot be written.
     """
     where = f"write_capture_camera: {path}"
     camera = calibration.camera
     k = camera.intrinsics[0].tolist()
-    if camera.num_views != 1 or k[0][1] != 0.0:
-        raise CaptureError(f"{where}: the file describes one camera without skew, got {camera!r}; write one per view")
+    if camera.num_views != 1:
+        raise CaptureError(f"{where}: the file describes one camera, got {camera!r}; write one per view")
     data: dict[str, Any] = {"width": camera.size[1], "height": camera.size[0]}
     data |= {"fx": k[0][0], "fy": k[1][1], "cx": k[0][2], "cy": k[1][2]}
+    data |= {"skew": k[0][1]} if k[0][1] else {}
+    data |= {"is_window": True} if camera.is_window else {}
     if camera.distortion is not None:
         data["distortion"] = camera.distortion[0].tolist()
     data |= {key: value for key, name in _STATED.items() if (value := getattr(calibration, name)) is not None}
@@ -204,15 +230,26 @@ def write_pose(path: str | os.PathLike[str], pose: Tensor) -> None:
         temporary.write_text(rows + "\n", encoding="utf-8")
 
 
-def _camera(where: str, **values: Any) -> Camera:
+def _camera(where: str, *, skew: float = 0.0, is_window: bool = False, **values: Any) -> Camera:
     try:
-        return Camera.pinhole(**values)
+        if not skew and not is_window:
+            return Camera.pinhole(**values)
+        fx, fy, cx, cy = (values[name] for name in ("fx", "fy", "cx", "cy"))
+        lens = values.get("distortion")
+        return Camera.from_dict(
+            {
+                "intrinsics": [[[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]],
+                "size": values["size"],
+                "distortion": None if lens is None else [lens],
+                "is_window": is_window,
+            }
+        )
     except PcdataError as error:
         raise IntrinsicsError(f"{where}: {error}") from error
 
 
 def _check_keys(where: str, data: dict[str, Any]) -> None:
-    known = (*_REQUIRED, "distortion", *_STATED, *_REMARKS)
+    known = (*_REQUIRED, "skew", "is_window", "distortion", *_STATED, *_REMARKS)
     faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
     for key in data:
         if key not in known:

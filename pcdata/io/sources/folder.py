@@ -15,7 +15,7 @@ from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, positions
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.io.arrays.signal_files import read_signals
-from pcdata.io.calibration.capture_camera import read_capture_camera
+from pcdata.io.calibration.capture_camera import read_camera, read_capture_camera
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.folder_roles import ROLES, role_folders
 from pcdata.io.sources.frame_files import make_frame
@@ -49,6 +49,7 @@ class FolderSource(Source):
     needs = (
         "intrinsics.json (or camera.json) and depth/NAME.png|tiff|npy; optional color/NAME.png|jpg, labels/NAME.png, "
         "masks/NAME.png, confidence/NAME.png (8-bit levels 0..3), poses/NAME.txt (4x4, world from camera), "
+        "intrinsics/NAME.json (of a camera that changes), "
         "signals/NAME.json (joints, actions, texts; docs/signals.md), timestamps.json (seconds by NAME)"
     )
 
@@ -82,7 +83,7 @@ class FolderSource(Source):
             camera: its name in the calibration; None = the only one. ``intrinsics.json`` may state both, with the
                 calibration as a file beside it, and ``folders`` too.
             folders: the names of folders that are called otherwise, by role, such as ``{"pose": "pose"}``; None leaves
-                a role out. The roles: depth, color, labels, mask, confidence, pose, signals.
+                a role out. The roles: depth, color, labels, mask, confidence, pose, intrinsics, signals.
             links_to: folders outside that links in the capture may lead to; no other ones are followed out of it.
 
         Raises:
@@ -126,6 +127,11 @@ class FolderSource(Source):
         self.invalid_values = invalid if stated.invalid_values is None else stated.invalid_values
         background_label = check_label(str(path), background_label)
         self.background_label = one_value(present[0], "background_label", stated.background_label, background_label)
+        if replacing is not None and "intrinsics" in roles:
+            raise CaptureError(
+                f"folder source {path}: both intrinsics/ and a calibration say what the camera is; leave one of them "
+                "out (--folder intrinsics=)"
+            )
         check_links(link for folder in roles.values() for link in links_in(folder))  # all of them in one message
         self._files = {role: by_stem(folder, ROLES[role][1]) for role, folder in roles.items()}
         self._used = {present[0], *roles.values(), *([path / stated.calibration] if stated.calibration else [])}
@@ -175,7 +181,7 @@ class FolderSource(Source):
                 depth_encoding=self.depth_encoding,
                 invalid_values=self.invalid_values,
             ),
-            camera=self.camera,
+            camera=read_camera(files["intrinsics"]) if "intrinsics" in files else self.camera,
             sample_id=sample_id,
             frame_id=self.frame_id,
             capture_index=self._positions[sample_id],

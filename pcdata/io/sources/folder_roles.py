@@ -18,6 +18,7 @@ ROLES = {  # role: folder, suffixes
     "mask": ("masks", (".png",)),
     "confidence": ("confidence", (".png",)),
     "pose": ("poses", (".txt", ".npy")),
+    "intrinsics": ("intrinsics", (".json",)),
     "signals": ("signals", (".json",)),
 }
 # What other exporters call the same, without case, plural s and separators.
@@ -28,6 +29,7 @@ _OTHER_NAMES = {
     "mask": ("mask", "workspacemask", "objectmask"),
     "confidence": ("confidence", "conf", "confidencemap"),
     "pose": ("pose", "camerapose", "campose", "extrinsic", "trajectory"),
+    "intrinsics": ("intrinsic", "camera", "caminfo"),
     "signals": ("signal", "robotstate", "action"),
 }
 

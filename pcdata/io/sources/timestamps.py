@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pcdata.errors import CaptureError
-from pcdata.files.opening import read_text
+from pcdata.files.opening import read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.io.sources.source import check_partners
 
@@ -28,6 +29,13 @@ def read_timestamps(path: Path, ids: Iterable[str]) -> dict[str, float]:
         raise CaptureError(f'{where}: must be a JSON object of seconds by name, such as {{"0001": 12.033}}')
     check_partners(where, ids, {"timestamp": times})
     return {name: float(time) for name, time in times.items()}
+
+
+def write_timestamps(path: Path, times: Mapping[str, float]) -> None:
+    """Write the seconds of captures by name for :func:`read_timestamps`."""
+    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(time, allow_nan=False)}" for name, time in times.items())
+    with replacing(f"write_timestamps: {path}", path) as temporary:
+        temporary.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
 
 def _is_time(value: object) -> bool:

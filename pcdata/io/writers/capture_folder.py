@@ -1,20 +1,24 @@
-"""Deliver a capture beside its cloud: a plain folder per view that :func:`pcdata.open_source` reads back."""
+"""Captures as plain folders that :func:`pcdata.open_source` reads back: one for each camera."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
-from torch import Tensor
+from typing import ClassVar
 
 from pcdata.errors import CaptureError, WriteError, write_fault
-from pcdata.files.npy import write_npy
-from pcdata.io.arrays.signal_files import write_signals
-from pcdata.io.calibration.capture_camera import CaptureCamera, write_capture_camera, write_pose
-from pcdata.io.images.confidence import write_confidence
-from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
+from pcdata.files.sample_names import check_names, in_order, in_order_of_last_number
+from pcdata.io.sources.episode_file import write_episodes
+from pcdata.io.sources.listing import is_litter
+from pcdata.io.store.manifest import key_of
+from pcdata.io.writers.registry import register_writer
+from pcdata.io.writers.view_folder import ViewFolder
+from pcdata.io.writers.writer import KEPT, Captures, Writer
 from pcdata.structures import DepthFrame
+
+_FORBIDDEN = {*'/\\<>:"|?*'}  # in names of files, of one system or another
+_LONGEST = 200  # bytes of a name, of the 255 that a file name may have
 
 
 def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
@@ -31,59 +35,89 @@ def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
         raise WriteError(f"{folder}: has {there[0]} already, and nothing is written over; choose a new folder")
     try:
         for v, view in enumerate(views):
-            _write_view(frame, v, view)
+            written = ViewFolder(view)
+            written.add("0", frame, v)
+            written.close({})
     except OSError as error:
         raise WriteError(f"{folder}: cannot be written: {write_fault(error)}") from error
 
 
-def _write_view(frame: DepthFrame, v: int, view: Path) -> None:
-    (view / "depth").mkdir(parents=True)
-    unit = _write_depth(view / "depth", frame.depth[v], frame.provenance.get("metres_per_unit"))
-    background = None
-    if frame.labels is not None:
-        background = _free_label(frame.labels[v])
-        (view / "labels").mkdir()
-        write_labels(view / "labels" / "0.png", frame.labels[v], background_label=background)
-    calibration = CaptureCamera(
-        camera=frame.camera.view(v), metres_per_unit=unit, frame_id=frame.frame_id, background_label=background
+@register_writer
+@dataclass(frozen=True, kw_only=True)
+class FolderWriter(Writer):
+    """The layout ``folder`` for one camera, ``rig`` for several; with ``episodes.json`` and ``timestamps.json``."""
+
+    kind: ClassVar[str] = "folder"
+    layout: ClassVar[str] = "depth/NAME.png and the like, a folder for each of several cameras (layouts folder, rig)"
+    keeps: ClassVar[frozenset[str]] = frozenset(KEPT)
+
+    def write(self, captures: Captures, folder: Path) -> None:
+        """Write all captures; what all share, such as the depth unit, is settled by the last."""
+        names = _file_names(captures.ids)
+        if renamed := sum(name != sample_id for sample_id, name in names.items()):
+            captures.note(f"{renamed} captures have ids that no file can be called by, or not in this order: renamed")
+        views: list[ViewFolder] = []
+        for sample_id, frame in captures:
+            if not views:
+                views = _view_folders(frame, folder)
+            if frame.num_views != len(views):
+                raise CaptureError(
+                    f"{sample_id}: has {frame.num_views} views, but those before it {len(views)}; write these apart "
+                    "(--only, --skip)"
+                )
+            for view, written in enumerate(views):
+                written.add(names[sample_id], frame, view)
+        times = captures.times()
+        if times and len(times) < len(names):
+            captures.lose("times", f"only {len(times)} of {len(names)} captures have one, and a folder has all or none")
+            times = {}
+        for written in views:
+            written.close({names[sample_id]: time for sample_id, time in times.items()})
+        if captures.episodes:
+            write_episodes(folder, captures.episodes, list(names.values()))
+
+
+def _view_folders(first: DepthFrame, folder: Path) -> list[ViewFolder]:
+    if first.num_views == 1:
+        return [ViewFolder(folder)]
+    if first.world_from_camera is None:
+        raise CaptureError(
+            f"{first.sample_id}: its {first.num_views} cameras have no poses, so nobody could join them: open it with "
+            "a calibration (--calibration and --frame), or write one camera at a time"
+        )
+    cameras = first.provenance.get("cameras")
+    usual = [f"view{v}" for v in range(first.num_views)]
+    names = [*map(str, cameras)] if isinstance(cameras, list) and len(cameras) == first.num_views else usual
+    alike = len({name.casefold() for name in names}) < len(names)
+    if alike or not all(name and _names_files(name) for name in names) or in_order_of_last_number(names) != names:
+        names = usual
+    # The moment's signals are the same for all views; one folder that has them is enough.
+    return [ViewFolder(folder / name, with_signals=not number) for number, name in enumerate(names)]
+
+
+def _file_names(ids: list[str]) -> dict[str, str]:
+    """Return the name of every capture's files by its id: names in whose order they are read back."""
+    keys = [sample_id if _names_files(sample_id) else key_of(sample_id) for sample_id in ids]
+    if len({key.casefold() for key in keys}) < len(keys) or not _stand_in_order(keys):
+        digits = len(str(len(ids) - 1))
+        keys = [f"{place:0{digits}d}_{key}" for place, key in enumerate(keys)]
+    return dict(zip(ids, keys))
+
+
+def _names_files(sample_id: str) -> bool:
+    """Say whether an id can be what files and folders are called, on any system."""
+    return (
+        sample_id.isprintable()
+        and not is_litter(sample_id)
+        and not _FORBIDDEN & {*sample_id}
+        and sample_id == sample_id.strip(" .")
+        and len(sample_id.encode()) <= _LONGEST
     )
-    write_capture_camera(view / "intrinsics.json", calibration)
-    for part, name, values, write in (
-        ("masks", "0.png", frame.mask, write_mask),
-        ("color", "0.png", frame.colors, write_color),
-        ("confidence", "0.png", frame.confidence, write_confidence),
-        ("poses", "0.txt", frame.world_from_camera, write_pose),
-    ):
-        if values is not None:
-            (view / part).mkdir()
-            write(view / part / name, values[v])
-    if frame.recorded_signals:
-        (view / "signals").mkdir()
-        write_signals(view / "signals" / "0.json", frame.recorded_signals)
 
 
-def _free_label(labels: Tensor) -> int:
-    """Return the largest 16-bit id that no pixel has; there is one, or the ids do not fit anyway."""
-    used = set(labels.unique().tolist())
-    return next((label for label in range(65535, -1, -1) if label not in used), 65535)
-
-
-def _write_depth(folder: Path, depth: Tensor, unit: float | None) -> float:
-    """Write one depth image and return the length of its stored unit."""
-    metres = depth.cpu().numpy()
-    # Filtered or resampled depth is no longer whole units, as the reader turns them into metres.
-    if unit is not None and np.array_equal(_whole_units(metres, float(unit)), metres):
-        try:
-            write_depth(folder / "0.png", depth, metres_per_unit=unit)
-        except WriteError:
-            raise
-        except CaptureError:  # more than 65535 units
-            pass
-        else:
-            return unit
-    write_npy(folder / "0.npy", metres)
-    return 1.0
-
-
-def _whole_units(metres: np.ndarray, unit: float) -> np.ndarray:
-    return (np.rint(metres.astype(np.float64) / unit) * unit).astype(np.float32)
+def _stand_in_order(names: list[str]) -> bool:
+    try:
+        check_names("convert", names)
+    except CaptureError:
+        return False
+    return in_order(names) == names

@@ -1,0 +1,73 @@
+"""Write the captures of any source in another layout: all of it, or nothing."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from pcdata.errors import CacheError, ConfigError, PcdataError, write_fault
+from pcdata.files.whole_folders import complete_or_nothing, is_free
+from pcdata.io.sources.capture_source import all_within, skipped_of
+from pcdata.io.sources.open_source import open_source
+from pcdata.io.writers.registry import writer_named
+from pcdata.io.writers.writer import Captures, WrittenReport
+from pcdata.io.writers.writers import WRITERS
+from pcdata.progress import Progress
+
+_WHERE = "convert"
+
+
+def convert(
+    source: Any, to: str, out: str | os.PathLike[str], *, progress: Progress | None = None, **options: Any
+) -> WrittenReport:
+    """Write captures in another layout, which :func:`pcdata.open_source` reads.
+
+    One capture is in memory at a time. The folder appears under its name only when it is complete, and nothing is
+    written over.
+
+    Args:
+        source: captures, such as :func:`pcdata.open_source` gives; or a path that it opens without options.
+        to: the layout, one of :data:`pcdata.io.WRITERS`.
+        out: the folder, which is new, and not inside the captures.
+        progress: called after every capture.
+        **options: of the layout; see docs/convert.md.
+
+    Returns:
+        What was written, what was lost of it, and what was left out.
+
+    Raises:
+        ConfigError: no such layout or option, or the folder is inside the captures.
+        CacheError: the folder exists, or cannot be written.
+        PcdataError: a capture cannot be read, or does not fit the layout.
+    """
+    writer = writer_named(_WHERE, to, options)
+    opened = open_source(source) if isinstance(source, (str, os.PathLike)) else source
+    folder = Path(os.path.realpath(Path(out).expanduser()))
+    _check_outside(folder, opened)
+    if not is_free(folder):
+        raise CacheError(f"{_WHERE}: {folder} exists already, and nothing is written over; choose a new folder")
+    report = WrittenReport(folder, writer.kind, left_out=skipped_of(opened))
+    captures = Captures(opened, writer.keeps, report, progress)
+    report.episodes = len(captures.episodes)
+    with complete_or_nothing(folder, note=captures.note) as partial:
+        try:
+            writer.write(captures, partial)
+        except OSError as error:
+            if isinstance(error, PcdataError):
+                raise
+            raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
+        captures.inputs.check(_WHERE)
+        report.size = sum(file.stat().st_size for file in partial.rglob("*") if file.is_file())
+    return report
+
+
+def _check_outside(folder: Path, source: Any) -> None:
+    """Require a folder that no capture is read from: what is written there would become part of it."""
+    for one in all_within(source):
+        path = getattr(one, "path", None)
+        if isinstance(path, Path) and folder.is_relative_to(real := Path(os.path.realpath(path))):
+            raise ConfigError(f"{_WHERE}: {folder} is inside the captures {real}; choose a folder outside")
+
+
+__all__ = ["WRITERS", "convert"]
