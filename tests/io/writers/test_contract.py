@@ -114,7 +114,7 @@ def test_what_is_there_is_never_written_over(kind: str, tmp_path: Path) -> None:
     (tmp_path / "out" / "mine").write_text("mine")
     with pytest.raises(CacheError, match="exists already, and nothing is written over"):
         convert(made_captures(), kind, tmp_path / "out")
-    assert tree(tmp_path) == {"out/mine": b"mine"}
+    assert tree(tmp_path) == {"out": None, "out/mine": b"mine"}
 
 
 def test_a_full_disk_leaves_nothing(kind: str, tmp_path: Path) -> None:
