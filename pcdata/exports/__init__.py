@@ -2,7 +2,7 @@
 
 from pcdata.exports.export_check import check_export, is_export
 from pcdata.exports.exporter import export_dataset
-from pcdata.exports.registry import register_target
+from pcdata.exports.registry import register_target, targets_of
 from pcdata.exports.target import Item, Target
 from pcdata.exports.targets import TARGETS
 
@@ -14,4 +14,5 @@ __all__ = [
     "export_dataset",
     "is_export",
     "register_target",
+    "targets_of",
 ]

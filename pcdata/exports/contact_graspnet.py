@@ -38,6 +38,7 @@ class _ContactGraspNet(Target):
     name: ClassVar[str] = "contact_graspnet"
     takes: ClassVar[Literal["captures"]] = "captures"
     model: ClassVar[str] = "contact_graspnet_api"
+    also: ClassVar[tuple[str, ...]] = ("contact_graspnet",)  # what its own code makes of that, 20,000 centered points
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"crop", "count"})
     layout: ClassVar[str] = "one npz per capture: depth (metres), K, and segmap and rgb where the capture has them"
 

@@ -14,6 +14,7 @@ from pcdata.datasets import CachedCloudDataset
 from pcdata.datasets.samples import SampleDataset
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.exports.copies import copy_name
+from pcdata.exports.kept_captures import captures_of, steps_not_run
 from pcdata.exports.target import Target
 from pcdata.files.sample_names import check_known
 from pcdata.io import open_source
@@ -187,8 +188,8 @@ def is_built(path: str | os.PathLike[str]) -> bool:
     return (absolute(path) / FILE_NAME).is_file()
 
 
-def open_for(target: Target, source: Any, **draws: int | None) -> CaptureSource:
-    """Return the samples for a target; paths are opened.
+def open_for(target: Target, source: Any, **draws: int | None) -> tuple[CaptureSource, list[str]]:
+    """Return the samples for a target, and what to note of them; paths are opened.
 
     Args:
         target: what they are for.
@@ -196,27 +197,29 @@ def open_for(target: Target, source: Any, **draws: int | None) -> CaptureSource:
         draws: seed, epoch and copies, as :class:`DrawnClouds` takes them.
 
     Raises:
-        ConfigError: captures were given where clouds are exported, or the other way round.
+        ConfigError: captures were given where clouds are exported, or clouds whose captures are not known where those
+            are exported, or draws where nothing is drawn.
         CaptureError: there are no samples, or two have one id.
         DTypeError: neither a path nor something with ids and load.
     """
     given: Any = source
     if isinstance(source, str | os.PathLike):
         given = CachedCloudDataset(absolute(source)) if is_built(source) else open_source(source)
+    note = None
+    if isinstance(given, SampleDataset) and target.takes == "captures":
+        note = steps_not_run(given)
+        given = captures_of(target.name, given)
     if isinstance(given, SampleDataset):
-        if target.takes == "captures":
-            raise ConfigError(
-                f"export: {target.name} is made of depth images, but {source} is a built dataset of clouds; give the "
-                "captures that it was built from"
-            )
         given = DrawnClouds(given, by_episode=target.of_episodes, **draws)
+        note = given.note()
     elif stated := ", ".join(name for name, value in draws.items() if value is not None):
         raise ConfigError(
-            f"export: {stated} is of the random end of a built dataset's pipeline, and {source} has none; leave it out"
+            f"export: {stated} is of the random end of a dataset's pipeline, which does not run on {source} for "
+            f"{target.name}; leave it out"
         )
     checked_ids("export", given)
     opened: CaptureSource = given
-    return opened
+    return opened, [] if note is None else [note]
 
 
 def stated_by_model(source: Any, kind: type[Target]) -> dict[str, Any]:
@@ -225,7 +228,7 @@ def stated_by_model(source: Any, kind: type[Target]) -> dict[str, Any]:
     if isinstance(source, str | os.PathLike) and is_built(source):
         given = CachedCloudDataset(absolute(source))
     model: dict[str, Any] = dict(given.manifest.model) if isinstance(given, CachedCloudDataset) else {}
-    if model.get("name") != kind.model:
+    if model.get("name") not in kind.models():
         return {}
     known = {field.name for field in fields(kind)}
     choices: dict[str, Any] = {name: model["choices"].get(name) for name in {"frame", "num_points"} & known}

@@ -73,7 +73,8 @@ def export_dataset(
         source: what ``pcdata build`` wrote (for targets of clouds) or captures (for targets of depth images), as
             a path or an object with ``ids`` and ``load``; or a dataset of clouds. The random end of a pipeline runs on
             what was stored, and the record names it; of ``CachedCloudDataset(folder, augment=None)`` nothing random
-            runs.
+            runs. For targets of depth images a dataset stands for its captures: those that the build kept
+            (``output: {keep_raw: true}``), or those that it processes on the fly.
         target: one of :data:`pcdata.exports.TARGETS`.
         out: the folder of the export.
         seed: of the random end, together with the epoch, the sample and the copy; None = 0, or the dataset's.
@@ -98,17 +99,15 @@ def export_dataset(
     chosen = target_named(target, options)
     if stated := stated_by_model(source, type(chosen)):
         chosen = target_named(target, {**stated, **options})
-    opened = open_for(chosen, source, seed=seed, epoch=epoch, copies=copies)
+    opened, notes = open_for(chosen, source, seed=seed, epoch=epoch, copies=copies)
     ids = list(opened.ids)
     folder = Path(os.path.realpath(Path(out).expanduser()))
     report = _ExportReport(folder, chosen.name)
     run = _Run(chosen, opened, report, progress)
     if skip_bad:
         run.leave_out_bad()
-    draws = {}
-    if isinstance(opened, DrawnClouds):
-        draws = opened.draws()
-        report.notes += [note] if (note := opened.note()) else []
+    report.notes += notes
+    draws = opened.draws() if isinstance(opened, DrawnClouds) else {}
     exported = [sample_id for sample_id in ids if sample_id not in report.left_out]
     plan = ExportRecord(
         chosen.name,

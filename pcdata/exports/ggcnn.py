@@ -27,7 +27,6 @@ from pcdata.io.store.manifest import key_of
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import CompleteDepth, InpaintDepth
 
-_SIZE = (480, 640)  # (height, width) that the loader crops from
 _WHY_SIZE = "the loader crops as if it were"
 _FIRST, _LAST = 100, 9999  # pcd0100 is the first of the original, four digits are the pattern
 _CORNERS = 4
@@ -52,6 +51,8 @@ class _GGCNN(Target):
     name: ClassVar[str] = "ggcnn"
     takes: ClassVar[Literal["captures"]] = "captures"
     model: ClassVar[str] = "ggcnn"
+    also: ClassVar[tuple[str, ...]] = ("grconvnet",)  # utils/data/cornell_data.py of skumra/robotic-grasping
+    image_size: ClassVar[tuple[int, int] | None] = (480, 640)  # that the loaders crop from
     layout: ClassVar[str] = "Cornell names: pcdNNNNd.tiff (float32 metres), pcdNNNNr.png, pcdNNNNcpos.txt"
 
     grasps: Path | Mapping[str, Any] | None = None
@@ -78,7 +79,7 @@ class _GGCNN(Target):
         """Return the view, its depth without holes (or as said), and the corners of grasps."""
         where = f"ggcnn: sample {sample_id!r}"
         frame = one_view(where, data, self.view)
-        check_size(where, frame, _SIZE, _WHY_SIZE, self.any_size)
+        check_size(where, frame, self.image_size, _WHY_SIZE, self.any_size)
         require_image(where, self, frame)
         if self.colors:
             colors_of(where, frame, "; or say colors=false for depth alone")

@@ -25,7 +25,6 @@ from pcdata.io.images.writing import depth_units, write_color, write_depth
 from pcdata.io.store.manifest import key_of
 from pcdata.structures import DepthFrame, PointCloud
 
-SIZE = (720, 1280)  # (height, width) that the loaders assert
 _WHY_SIZE = "graspnet-baseline asserts it"
 _MILLIMETRE = 0.001
 _MOST_OBJECTS = 255  # of an 8-bit label
@@ -47,6 +46,7 @@ class GraspNetImages(Target):
     takes: ClassVar[Literal["captures"]] = "captures"
     model: ClassVar[str] = "graspnet_baseline"
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"count"})
+    image_size: ClassVar[tuple[int, int] | None] = (720, 1280)
 
     view: int | None = None
     any_size: bool = False
@@ -58,7 +58,7 @@ class GraspNetImages(Target):
         """Return the view to write, of the size that the loader asserts, with color and depth that the units hold."""
         where = f"{self.name}: sample {sample_id!r}"
         frame = one_view(where, data, self.view)
-        check_size(where, frame, SIZE, _WHY_SIZE, self.any_size)
+        check_size(where, frame, self.image_size, _WHY_SIZE, self.any_size)
         require_depth(where, self, frame)
         colors_of(where, frame)
         if frame.labels is not None:

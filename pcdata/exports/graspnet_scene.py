@@ -45,6 +45,7 @@ class _GraspNetScenes(GraspNetImages):
     """
 
     name: ClassVar[str] = "graspnet_scene"
+    also: ClassVar[tuple[str, ...]] = ("gsnet",)  # dataset/graspnet_dataset.py of rhett-chen/graspness_implementation
     layout: ClassVar[str] = (
         "scenes/scene_XXXX/CAMERA/: rgb, depth, label, meta, camK.npy, camera_poses.npy, cam0_wrt_table.npy"
     )
@@ -52,6 +53,11 @@ class _GraspNetScenes(GraspNetImages):
     camera: Literal["realsense", "kinect"] = "realsense"
     first_scene: Annotated[int, annotated_types.Interval(ge=0, le=9999)] = 0
     frames_per_scene: Annotated[int, annotated_types.Interval(ge=1, le=10000)] = 256
+
+    @classmethod
+    def example(cls, ids: Sequence[str]) -> dict[str, Any]:
+        """One scene, where the samples do not fill whole ones."""
+        return {"frames_per_scene": len(ids)} if len(ids) % cls.frames_per_scene else {}
 
     def plan(self, ids: Sequence[str], episodes: Sequence[Episode], left_out: Collection[str]) -> list[Item]:
         """Whole scenes alone: one with a frame that does not fit is left out, and those after it move up."""

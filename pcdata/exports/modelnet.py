@@ -42,11 +42,17 @@ class ModelNet(Target):
     name: ClassVar[str] = "modelnet"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointnet2_cls"
+    also: ClassVar[tuple[str, ...]] = ("pointnet2_cls_tf",)
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"count", "unit", "scale", "normalization"})
     layout: ClassVar[str] = "a text per shape: x,y,z,nx,ny,nz; modelnet40_train.txt, modelnet40_test.txt, shape names"
 
     table: Given | None = None
     num_points: Annotated[int, annotated_types.Ge(1)] = 1024
+
+    @classmethod
+    def example(cls, ids: Sequence[str]) -> dict[str, Any]:
+        """All of one class."""
+        return {"table": {sample_id: {"class": "mug"} for sample_id in ids}}
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One file per sample."""

@@ -41,6 +41,7 @@ class Pointcept(Target):
     name: ClassVar[str] = "pointcept"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointcept"
+    also: ClassVar[tuple[str, ...]] = ("sonata", "concerto", "utonia")  # Pointcept's own configurations of them
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"normalization", "duplicates"})
     layout: ClassVar[str] = "a folder per scene: coord, color, normal, segment, instance .npy"
 

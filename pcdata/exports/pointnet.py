@@ -50,6 +50,11 @@ class PointNet(Target):
     prefix: str = "data/modelnet40_ply_hdf5_2048"
 
     @classmethod
+    def example(cls, ids: Sequence[str]) -> dict[str, Any]:
+        """All of one class."""
+        return {"table": {sample_id: {"class": "mug"} for sample_id in ids}}
+
+    @classmethod
     def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
         """The files with shapes."""
         files = sorted(file for file in folder.glob("ply_data_*.h5") if not file.is_symlink())

@@ -26,6 +26,17 @@ def register_target(target: type[Target]) -> type[Target]:
             raise ConfigError(f"{where}: {target.__name__}.{name} must be a text; see pcdata.exports.Target")
     if target.takes not in ("clouds", "captures"):
         raise ConfigError(f"{where}: {target.__name__}.takes must be 'clouds' or 'captures', got {target.takes!r}")
-    contract_named(target.model)
+    for model in target.models():
+        contract_named(model)
     TARGETS.add(target.name, target)
     return target
+
+
+def targets_of(model: str) -> list[str]:
+    """Return the targets that the data of a model's preset can be exported to; none where no loader is known.
+
+    Raises:
+        ConfigError: no such model.
+    """
+    contract_named(model)
+    return [name for name, target in TARGETS.items() if model in target.models()]

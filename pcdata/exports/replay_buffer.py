@@ -319,7 +319,7 @@ def _buffer(name: str, model: str, arrays: str, *, colors: bool = True, image: b
 
 
 REPLAY_BUFFERS: tuple[type[Target], ...] = (
-    _buffer("dp3", "dp3_sim", "point_cloud state action img", image=True, color="rgb_255"),
+    _buffer("dp3", "dp3_sim", "point_cloud state action img", image=True, color="rgb_255", also=("dp3_real",)),
     _buffer(
         "dexart",
         "dexart",

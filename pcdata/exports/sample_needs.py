@@ -83,9 +83,9 @@ def one_view(where: str, data: Any, view: int | None) -> DepthFrame:
     return frame
 
 
-def check_size(where: str, frame: DepthFrame, size: tuple[int, int], reason: str, any_size: bool) -> None:
+def check_size(where: str, frame: DepthFrame, size: tuple[int, int] | None, reason: str, any_size: bool) -> None:
     """Require (height, width), unless any size is wanted."""
-    if not any_size and frame.size != size:
+    if not any_size and size is not None and frame.size != size:
         raise ShapeError(
             f"{where}: the image must be {size[1]}x{size[0]}, since {reason}, but it is {frame.size[1]}x"
             f"{frame.size[0]}; record or resize to it, or say any_size=true for a loader changed to yours"

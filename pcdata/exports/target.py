@@ -45,6 +45,18 @@ class Target(ABC):
     model: ClassVar[str]  # the contract in pcdata.models of what its loader feeds; samples are held to it
     left_to_loader: ClassVar[frozenset[str]] = frozenset()  # rules of the contract that the loader itself makes true
     of_episodes: ClassVar[bool] = False  # its samples are steps: those of one episode share their random draws
+    also: ClassVar[tuple[str, ...]] = ()  # further contracts: their loaders read the same files
+    image_size: ClassVar[tuple[int, int] | None] = None  # (height, width) that the loader asserts; None = any
+
+    @classmethod
+    def models(cls) -> tuple[str, ...]:
+        """Return the contracts whose presets' data it exports."""
+        return (cls.model, *cls.also)
+
+    @classmethod
+    def example(cls, ids: Sequence[str]) -> dict[str, Any]:
+        """Return the options that must be given for these samples, such as somebody could give; here none."""
+        return {}
 
     @property
     def robot_stays(self) -> bool:

@@ -322,7 +322,7 @@ def test_a_built_dataset_is_exported_as_stored_and_with_its_random_end(built, tm
 
 
 def test_images_are_not_made_of_clouds(built, tmp_path):
-    with pytest.raises(ConfigError, match="built dataset of clouds; give the captures"):
+    with pytest.raises(ConfigError, match="has clouds alone; give the captures"):
         export_dataset(built, "ggcnn", tmp_path / "out")
 
 

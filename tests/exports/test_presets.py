@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,19 +12,21 @@ import pytest
 import torch
 
 from pcdata.build import BuildConfig, build_dataset, config_from_yaml
+from pcdata.build.model_section import stored_preset
 from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset, CloudDataset
 from pcdata.errors import CacheError, CaptureError, ConfigError
-from pcdata.exports import TARGETS, export_dataset
+from pcdata.exports import TARGETS, export_dataset, targets_of
 from pcdata.exports.export_record import FILE_NAME
-from pcdata.models import CONTRACTS, preset
+from pcdata.models import CONTRACTS, Preset, preset
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import RandomSample
-from tests.exports.samples import Samples, cloud
+from tests.exports.samples import Samples, cloud, tree
+from tests.exports.scenes import Episodes
 from tests.exports.test_dp3 import replay_buffer
+from tests.models.captures import made_preset
 
-CHOICES: dict[str, Any] = {"frame": "camera", "crop": None, "category": 0}  # answers to what a contract leaves open
-FOR_CLOUDS = {name: target for name, target in TARGETS.items() if target.takes == "clouds"}
+EXPORTED = [(target, model) for target, kind in TARGETS.items() for model in kind.models()]
 
 
 def scenes(number: int = 3, count: int = 3000) -> Samples:
@@ -33,39 +36,61 @@ def scenes(number: int = 3, count: int = 3000) -> Samples:
     return Samples({name: replace(one, points=0.3 * one.points + away) for name, one in made.items()})
 
 
-def options_for(target: str, ids: list[str]) -> dict[str, Any]:
-    """What a target asks for besides the samples."""
-    names = TARGETS[target].__dataclass_fields__
-    given: dict[str, Any] = {}
-    if "table" in names:
-        given["table"] = {sample_id: {"class": "mug"} for sample_id in ids}
-    if "episodes" in names:
-        robot = {"samples": np.array(ids), "state": np.zeros((len(ids), 7)), "action": np.zeros((len(ids), 4))}
-        robot |= {"imagin_robot": np.zeros((len(ids), 96, 7))} if target == "dexart" else {}
-        given["episodes"] = {"e": robot}
-    return given
+def built_for(made: Preset, source: Episodes, folder: Path) -> Any:
+    """What a preset makes of captures: built with them beside it, or on the fly, where a build cannot store it."""
+    try:
+        stored_preset(made)
+    except ConfigError:
+        return made.dataset(source)
+    config = config_from_yaml("output: {format: npz, keep_raw: true}").for_model(made)
+    return build_dataset(config, source, folder).folder
 
 
-def presets_of(target: str) -> list[str]:
-    """The target's own contract, and those that differ from it in where the data come from alone."""
-    model = TARGETS[target].model
-    kin = {"dp3_sim": ["dp3_sim", "dp3_real"], "pointnet2_cls": ["pointnet2_cls", "pointnet2_cls_tf"]}
-    return kin.get(model, [model])
-
-
-@pytest.mark.parametrize(
-    ("target", "model"), [(target, model) for target in FOR_CLOUDS for model in presets_of(target)]
-)
-def test_what_a_preset_builds_is_exported(tmp_path, target, model):
-    made = preset(model, **{name: CHOICES[name] for name in CONTRACTS[model].required_choices})
-    source = scenes()
-    build_dataset(BuildConfig().for_model(made), source, tmp_path / "built")
-    report = export_dataset(tmp_path / "built", target, tmp_path / "out", **options_for(target, source.ids))
-    assert report.written == 3
-    random = made.pipeline.is_random
+@pytest.mark.parametrize(("target", "model"), EXPORTED)
+def test_what_a_preset_makes_of_captures_is_exported_and_its_own_check_takes_it(tmp_path, target, model):
+    """No target, no model and no option is named here: a new one is reached by itself."""
+    kind, made = TARGETS[target], made_preset(model)
+    # In images 0 is the background; in clouds it is a number like others.
+    source = Episodes(kind.image_size or (240, 320), first_label=int(kind.takes == "captures"))
+    report = export_dataset(
+        built_for(made, source, tmp_path / "built"), target, tmp_path / "out", **kind.example(source.ids)
+    )
+    assert (report.written, report.left_out) == (2, {})
+    random = kind.takes == "clouds" and made.pipeline.is_random
     draws = json.loads((tmp_path / "out" / FILE_NAME).read_text())["draws"]
     assert bool(draws) == random
     assert any("seed 0, epoch 0" in note for note in report.notes) == random
+
+
+def test_every_model_is_exported_or_has_no_target():
+    reached = {model for _, model in EXPORTED}
+    for model in CONTRACTS:
+        assert targets_of(model) == [target for target, one in EXPORTED if one == model]
+        assert bool(targets_of(model)) == (model in reached)
+    with pytest.raises(ConfigError, match="no model contract"):
+        targets_of("nothing")
+
+
+def test_a_target_of_images_takes_the_captures_behind_clouds_or_says_what_to_do(tmp_path):
+    source, options = Episodes(), {"any_size": True}
+    config = config_from_yaml("depth: [Deproject]\ncloud: [RandomSample: {num_points: 64}]\noutput: {keep_raw: true}")
+    build_dataset(config, source, tmp_path / "kept")
+    report = export_dataset(tmp_path / "kept", "graspnet", tmp_path / "of the build", **options)
+    assert any("Deproject, RandomSample did not run" in note for note in report.notes)
+    export_dataset(source, "graspnet", tmp_path / "of the captures", **options)
+    fly = CloudDataset(source, config.pipeline)
+    export_dataset(fly, "graspnet", tmp_path / "of the fly", **options)
+    wanted = {name: data for name, data in tree(tmp_path / "of the captures").items() if name != FILE_NAME}
+    for name in ("of the build", "of the fly"):
+        assert {key: data for key, data in tree(tmp_path / name).items() if key != FILE_NAME} == wanted, name
+    build_dataset(replace(config, output=type(config.output)()), source, tmp_path / "alone")
+    for given, message, more in [
+        (tmp_path / "alone", r"give the captures .*, or build it with output: \{keep_raw: true\}", {}),
+        (CloudDataset(source, config.pipeline, repeats=2), "without repeats", {}),
+        (tmp_path / "kept", "seed is of the random end .* leave it out", {"seed": 1}),
+    ]:
+        with pytest.raises(ConfigError, match=message):
+            export_dataset(given, "graspnet", tmp_path / "out", **options, **more)
 
 
 # -- the random end ------------------------------------------------------------------------------------------------
@@ -137,7 +162,7 @@ def test_what_says_nothing_about_the_draws_is_refused(built, tmp_path):
             export_dataset(built, "pointcept", tmp_path / "out", **options)
     with pytest.raises(ConfigError, match="draws nothing, so 2 copies would be alike"):
         export_dataset(CachedCloudDataset(built, augment=None), "pointcept", tmp_path / "out", copies=2)
-    with pytest.raises(ConfigError, match="seed is of the random end of a built dataset"):
+    with pytest.raises(ConfigError, match="seed is of the random end of a dataset"):
         export_dataset(scenes(), "pointcept", tmp_path / "out", seed=1)
     assert not (tmp_path / "out").exists()
 
