@@ -311,7 +311,9 @@ class OwnTarget(Target):
 def test_stores_collates_and_targets_of_ones_own_are_used_by_their_names(tmp_path):
     own = written(tmp_path / "others.py", OTHERS)
     text = "depth: [Deproject]\noutput: {format: own}\nloader: {collate: counts}\n"
-    with pytest.raises(ConfigError, match=r"(?s)output.format: .*hdf5, npz, pt.*--import.*loader.collate: .*packed"):
+    with pytest.raises(
+        ConfigError, match=r"(?s)output.format: .*hdf5, npz, packed, pt.*--import.*loader.collate: .*packed"
+    ):
         config_from_yaml(text)
     pcdata.import_file(own)
     source = SyntheticSource(num_scenes=1, num_objects=1, size=(24, 32))
@@ -325,7 +327,7 @@ def test_stores_collates_and_targets_of_ones_own_are_used_by_their_names(tmp_pat
     assert 'collate_fn=COLLATES["counts"]' in script.replace("'", '"')
     assert "--import FILE.py, for others.py" in script
     forget()
-    with pytest.raises(CacheError, match=r"format must be one of hdf5, npz, pt, got 'own'.*--import"):
+    with pytest.raises(CacheError, match=r"format must be one of hdf5, npz, packed, pt, got 'own'.*--import"):
         Manifest.read(out)
 
 

@@ -38,7 +38,7 @@ CHECKS = (
     "color_on_depth",
     "pose_direction_over_time",
 )
-FORMATS = ("hdf5", "npz", "pt")
+FORMATS = ("hdf5", "npz", "packed", "pt")
 WEIGHTINGS = ("constant", "inverse_square", "angle")
 CARVINGS = ("never", "near", "everywhere")
 MODELS = (

@@ -17,7 +17,7 @@ from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, Pcd
 from pcdata.io.store.manifest import Manifest, key_of
 from tests.messages import told
 
-FORMATS = ["hdf5", "npz", "pt"]
+FORMATS = ["hdf5", "npz", "packed", "pt"]
 
 
 class Clouds:

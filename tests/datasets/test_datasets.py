@@ -17,7 +17,7 @@ from pcdata.io.store.manifest import checksum_of
 from pcdata.transforms import Compose, MaskDepth, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
 from tests.messages import told
 
-FORMATS = ["hdf5", "npz", "pt"]
+FORMATS = ["hdf5", "npz", "packed", "pt"]
 
 
 class FixedSource:

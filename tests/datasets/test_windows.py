@@ -46,16 +46,16 @@ NUM_OBS, HORIZON = 2, 4
 @pytest.fixture(scope="module")
 def caches(tmp_path_factory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("windows")
-    for form in ("hdf5", "npz", "pt"):
+    for form in ("hdf5", "npz", "packed", "pt"):
         build_dataset(config_from_yaml(f"{PIPELINE}output: {{format: {form}}}\n"), SOURCE, root / form)
-    return {form: root / form for form in ("hdf5", "npz", "pt")}
+    return {form: root / form for form in ("hdf5", "npz", "packed", "pt")}
 
 
 def on_the_fly(transform: Compose | None = None, **options) -> CloudDataset:
     return CloudDataset(SOURCE, transform or config_from_yaml(PIPELINE).pipeline, **options)
 
 
-@pytest.fixture(params=["on the fly", "npz", "hdf5", "pt"])
+@pytest.fixture(params=["on the fly", "npz", "hdf5", "packed", "pt"])
 def windows(request, caches) -> EpisodeWindows:
     data = on_the_fly(seed=3) if request.param == "on the fly" else CachedCloudDataset(caches[request.param], seed=3)
     return EpisodeWindows(data, NUM_OBS, HORIZON)

@@ -41,7 +41,7 @@ def assert_equal(given, wanted) -> None:
         assert torch.equal(a, b), name
 
 
-@pytest.fixture(params=["hdf5", "npz", "pt", "on the fly"])
+@pytest.fixture(params=["hdf5", "npz", "packed", "pt", "on the fly"])
 def dataset(request, source, config, caches):
     if request.param == "on the fly":
         return CloudDataset(source, config.pipeline, seed=3)

@@ -387,7 +387,7 @@ def test_names_that_differ_by_case_alone_are_stored(tmp_path):
         cloud = cloud.with_signal(name, torch.full((1,), float(place)), "invariant")
     eye = torch.eye(4, dtype=torch.float64)[None]
     cloud = replace(cloud, frames={"Tool": eye, "tool": 2 * eye})
-    for form in ("npz", "hdf5", "pt"):
+    for form in ("npz", "hdf5", "packed", "pt"):
         store = STORES[form](tmp_path)
         store.write("k", record_from_cloud(cloud))
         store.close()

@@ -28,8 +28,8 @@ SCHEMA = "pcdata.cloud/1"
 SIGNALS_SCHEMA = "pcdata.signals/1"
 
 _CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
-_EXTRA, _FRAMES, _SIGNALS = "extra.", "frames.", "signals."
-_DERIVED = ("intrinsics", "extrinsics")
+EXTRA, _FRAMES, _SIGNALS = "extra.", "frames.", "signals."
+DERIVED = ("intrinsics", "extrinsics")  # repeat the facts, for other tools
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def record_from_cloud(cloud: PointCloud) -> Record:
     arrays = {name: _array(name, value) for name in FIELDS if (value := getattr(cloud, name)) is not None}
     if cloud.labels is not None:
         arrays["labels"] = _labels_as_int32(arrays["labels"])
-    arrays |= {_EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
+    arrays |= {EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
     # Frames may be called "robot/base_link", and a slash would open a group in HDF5.
     frames = _array_names(_FRAMES, cloud.frames)
     arrays |= {frames[name]: _array(name, matrix) for name, matrix in cloud.frames.items()}
@@ -105,8 +105,8 @@ def cloud_from_record(record: Record) -> PointCloud:
         schema = info.get("schema") if isinstance(info, Mapping) else info
         raise CacheError(f"not a cloud record: schema must be {SCHEMA!r}, got {schema!r}")
     _check_info(info)
-    tensors = {name: _tensor(name, array) for name, array in record.arrays.items() if name not in _DERIVED}
-    extra = {name.removeprefix(_EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(_EXTRA)}
+    tensors = {name: _tensor(name, array) for name, array in record.arrays.items() if name not in DERIVED}
+    extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
     frames = {
         unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
     }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
@@ -54,6 +54,32 @@ class Store:
             CacheError: missing, damaged or hostile; says which file.
         """
         raise NotImplementedError
+
+    def digest(self, key: str) -> str:
+        """Return the digest of a record as it is stored.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        return self.read(key).digest()
+
+    def read_joined(self, keys: Sequence[str]) -> Record | None:
+        """Read some records as one, that of their clouds in a row; None where this store, or these records, cannot.
+
+        The digests of the records were compared before: see :meth:`identity`.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        return None
+
+    def identity(self) -> tuple[int, ...] | None:
+        """Return what tells the file that this process reads, and keeps, from others of its name.
+
+        So long as it is the same, a record whose digest was right once is not compared again. None = files are opened
+        again for every record, which is compared each time.
+        """
+        return None
 
     def close(self) -> None:
         """Flush to disk and close any handle of this process."""

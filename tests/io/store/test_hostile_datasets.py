@@ -60,7 +60,7 @@ def test_a_dataset_whose_files_are_links_to_elsewhere_is_refused(tmp_path, form,
     if part == "file":
         shutil.move(path, other)
         path.symlink_to(other)
-    elif form == "hdf5":
+    elif path.parent == folder:
         pytest.skip("its file lies in the dataset's own folder, which the user names")
     else:
         shutil.move(path.parent, other)

@@ -1,0 +1,107 @@
+"""Datasets made for training: the arrays of all clouds end to end in one file that is mapped into memory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.errors import CacheError
+from pcdata.io.store.cloud_record import DERIVED, Record, parse_info
+from pcdata.io.store.joined_record import joined_record
+from pcdata.io.store.packed_file import PackedFile, PackedWriter, open_packed
+from pcdata.io.store.store import INFO, Compression, Store, damage_named, register_store, writing
+
+
+@register_store
+class _PackedStore(Store):
+    """``clouds.packed``: see :mod:`pcdata.io.store.packed_file` for its bytes.
+
+    It is written once, from the first record to :meth:`close`; it is opened once in every process, and what is checked
+    then, its end and its tables, is not checked again. Records are read by copying their rows out of the mapped file,
+    all records of a batch into one array of each field.
+    """
+
+    format = "packed"
+    compressions = ("none",)
+    suffix = ".packed"
+
+    def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
+        super().__init__(folder, compression)
+        self.path = self.folder / "clouds.packed"
+        self._writer: PackedWriter | None = None
+        self._opened_file: PackedFile | None = None
+
+    def path_of(self, key: str) -> Path:
+        """Return the one file that holds all records."""
+        return self.path
+
+    def write(self, key: str, record: Record) -> None:
+        """Add one record; it is on disk after :meth:`close`."""
+        text = np.frombuffer(record.info_text().encode(), np.uint8)
+        with writing(self.path):
+            writer, self._writer = self._writer or PackedWriter(self.path), None
+            writer.add(key, {**record.arrays, INFO: text})
+            self._writer = writer  # one that failed is not gone on with
+
+    def close(self) -> None:
+        """Force what was written to disk, or forget the mapped file of this process."""
+        writer, self._writer, self._opened_file = self._writer, None, None
+        if writer is not None:
+            with writing(self.path):
+                writer.finish()
+
+    def read(self, key: str) -> Record:
+        """Read one record; its arrays are the caller's own."""
+        with damage_named(self.path):
+            file = self._mapped()
+            arrays = {name: array.copy() for name, array in file.record(file.place_of(key)).items()}
+            return Record(arrays, parse_info(_text_of(arrays)))
+
+    def digest(self, key: str) -> str:
+        """Return the digest of one record, computed where it lies."""
+        with damage_named(self.path):
+            file = self._mapped()
+            arrays = file.record(file.place_of(key))
+            return Record(arrays, parse_info(_text_of(arrays))).digest()
+
+    def read_joined(self, keys: Sequence[str]) -> Record | None:
+        """Read records as one, every array copied once."""
+        with damage_named(self.path):
+            file = self._mapped()
+            joined = file.joined([file.place_of(key) for key in keys], DERIVED)
+            if joined is None:
+                return None
+            arrays, rows = joined
+            text = arrays.pop(INFO).tobytes()
+            ends = rows.pop(INFO).cumsum().tolist()
+            texts = [text[begin:end] for begin, end in zip([0, *ends], ends)]
+            # The strict parser looked at each when its digest was compared.
+            return joined_record(arrays, rows, json.loads(b"[" + b",".join(texts) + b"]"))
+
+    def identity(self) -> tuple[int, ...]:
+        """Return what tells the mapped file from another of its name."""
+        with damage_named(self.path):
+            return self._mapped().identity
+
+    def _mapped(self) -> PackedFile:
+        if self._writer is not None:
+            raise CacheError(f"{self.path}: is being written; close the store, then read")
+        if self._opened_file is None:
+            with self._opened(self.path) as file:
+                self._opened_file = open_packed(file)
+        return self._opened_file
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_writer": None, "_opened_file": None}
+
+
+def _text_of(arrays: dict[str, NDArray[Any]]) -> bytes:
+    text = arrays.pop(INFO, None)
+    if text is None or text.dtype != np.uint8:
+        raise CacheError(f"has a record without the text {INFO!r}")
+    return text.tobytes()
