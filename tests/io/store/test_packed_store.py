@@ -83,8 +83,8 @@ def test_records_read_as_one_are_the_batch_of_their_clouds(tmp_path, monkeypatch
 
 def test_records_that_cannot_share_a_batch_are_not_read_as_one(tmp_path):
     other_frame = PointCloud(points=torch.zeros(2, 3), frame_id="camera")
-    labelled = PointCloud(points=torch.zeros(2, 3), frame_id="base", labels=torch.zeros(2, dtype=torch.int64))
-    write(tmp_path, [plain(4), other_frame, labelled, plain(3, 1)])
+    with_labels = PointCloud(points=torch.zeros(2, 3), frame_id="base", labels=torch.zeros(2, dtype=torch.int64))
+    write(tmp_path, [plain(4), other_frame, with_labels, plain(3, 1)])
     store = STORES["packed"](tmp_path)
     assert store.read_joined(["k0", "k3"]) is not None
     assert store.read_joined(["k0", "k1"]) is None
