@@ -53,14 +53,15 @@ class PackedWriter:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._place = 0  # bytes written
+        self._place = len(_MAGIC)  # bytes written
         self._held = 0  # bytes in memory
         self._keys: set[str] = set()
         self._waiting: dict[_Form, list[tuple[str, list[NDArray[Any]]]]] = {}
         self._groups: list[dict[str, Any]] = []
         self._tables: list[bytes] = []
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._append("xb", [_MAGIC])
+        with open(path, "xb") as file:
+            file.write(_MAGIC)
 
     def add(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Add one record.
@@ -97,7 +98,7 @@ class PackedWriter:
         total = hashlib.sha256()
         for part in tail:
             total.update(part)
-        self._append("ab", [*tail, _END.pack(begin, len(index), total.digest(), _MAGIC)], sync=True)
+        self._append([*tail, _END.pack(begin, len(index), total.digest(), _MAGIC)], sync=True)
 
     def _table(self, content: bytes) -> list[int]:
         """Place a table among those at the end; return where it lies and how long it is."""
@@ -128,12 +129,12 @@ class PackedWriter:
                 place += sum(array.nbytes for array in arrays)
             keys = "\n".join(key for key, _ in records).encode("utf-8", "surrogatepass")
             self._groups.append({"records": len(records), "columns": columns, "keys": keys, "tables": tables})
-            self._append("ab", parts)
+            self._append(parts)
         if waiting:
-            self._append("ab", [bytes(-self._place % _ALIGNED)])
+            self._append([bytes(-self._place % _ALIGNED)])
 
-    def _append(self, mode: str, parts: Sequence[Any], *, sync: bool = False) -> None:
-        with open(self._path, mode) as file:
+    def _append(self, parts: Sequence[Any], *, sync: bool = False) -> None:
+        with open(self._path, "ab") as file:
             if file.tell() != self._place:
                 raise CacheError(f"{self._path}: was changed while it was written")
             for part in parts:
