@@ -87,9 +87,27 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         },
     ),
 }
-_COMBINED = {  # combinator: what its flag makes of N captures; a test holds the table to the registry
-    "averaged": "average every N consecutive captures of a still scene into one",
-    "temporal": "filter each capture with the N - 1 before it",
+_COMBINED: dict[str, tuple[str, dict[str, Any]]] = {  # combinator: the field that its flag says, and the flag
+    "averaged": (
+        "num_frames",
+        {
+            "type": lambda text: positive(text),
+            "metavar": "N",
+            "help": "average every N consecutive captures of a still scene into one",
+        },
+    ),
+    "temporal": (
+        "num_frames",
+        {"type": lambda text: positive(text), "metavar": "N", "help": "filter each capture with the N - 1 before it"},
+    ),
+    "convention": (
+        "axes",
+        {
+            "choices": ("opencv", "opengl", "coppeliasim", "body"),
+            "help": "axes of the cameras that the poses are of, where they are not OpenCV's; its other fields (poses, "
+            "depth, near, far, rows, principal_point) are --option convention.FIELD=VALUE",
+        },
+    ),
 }
 _NO_OPTIONS = {  # of opening captures, not of their layout
     "path": "the path itself",
@@ -145,8 +163,8 @@ def add_combinator_options(command: argparse.ArgumentParser) -> None:
         help="any option of the layout by its name in Python, or a field of a combinator, such as "
         "averaged.max_jump=0.05; repeatable",
     )
-    for name, told in _COMBINED.items():
-        command.add_argument(f"--{name}", type=positive, metavar="N", help=told)
+    for name, (_, described) in _COMBINED.items():
+        command.add_argument(f"--{name}", **described)
 
 
 def add_skip_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:
@@ -180,7 +198,9 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
             given[name] = value
     if "folders" in given:
         given["folders"] = {role: folder or None for role, folder in given["folders"]}
-    given |= {name: number for name in _COMBINED if (number := getattr(arguments, name, None)) is not None}
+    for name, (field, _) in _COMBINED.items():
+        if (value := getattr(arguments, name, None)) is not None:
+            given[name] = value if field == "num_frames" else {field: value}
     for name, text in getattr(arguments, "option", []):
         combinator, dot, inner = name.partition(".")
         if dot:

@@ -20,6 +20,7 @@ from pcdata.io.sources import (  # noqa: F401
     cloud_files,
     averaged,
     temporal,
+    convention,
 )
 
 # isort: on

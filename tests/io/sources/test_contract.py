@@ -43,6 +43,7 @@ from tests.warm import run_python
 COMBINED: dict[str, dict[str, Any]] = {  # by combinator: how it is said of a capture of three frames
     "averaged": {"num_frames": 3, "min_count": 1, "max_moving": 1},
     "temporal": {"num_frames": 2, "alpha": 0.5},
+    "convention": {"axes": "opengl", "rows": "bottom_first"},
 }
 
 
