@@ -16,7 +16,7 @@ from scipy.io import savemat
 from pcdata.errors import CaptureError
 from pcdata.io import open_source, write_pcd, write_ply
 from pcdata.structures import PointCloud
-from tests import published_captures
+from tests import published_captures, simulated_captures
 
 HEIGHT, WIDTH = 6, 8
 K: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
@@ -123,5 +123,6 @@ CAPTURES: dict[str, Callable[[Path], Path]] = {  # by layout; a test holds the t
     "realsense_bag": bag_capture,
     "clouds": cloud_files,
     **published_captures.CAPTURES,
+    **simulated_captures.CAPTURES,
 }
 OPTIONS: dict[str, dict[str, Any]] = published_captures.OPTIONS  # by layout: what its files cannot say

@@ -18,6 +18,8 @@ KINDS = (
     "apc",
     "bop",
     "rlbench",
+    "robomimic",
+    "maniskill",
     "pairs",
     "realsense_bag",
     "azure_kinect",

@@ -39,7 +39,8 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         "--camera",
         {
             "metavar": "NAME",
-            "help": "which camera, of the calibration or of a bop or rlbench scene (default: the only one)",
+            "help": "which camera, of the calibration or of a bop, rlbench, robomimic or maniskill recording "
+            "(default: the only one, or all)",
         },
     ),
     "frame_id": ("--frame", {"metavar": "NAME", "help": "frame that the poses lead to, such as base"}),
@@ -59,7 +60,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "type": float,
             "nargs": 4,
             "metavar": ("FX", "FY", "CX", "CY"),
-            "help": "pixels, where no file has them: seven_scenes, tum, nyu_raw, pairs",
+            "help": "pixels, where no file has them: seven_scenes, tum, nyu_raw, pairs, robomimic",
         },
     ),
     "registered": (
@@ -73,6 +74,25 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
     "labels_from": (
         "--labels-from",
         {"metavar": "COLUMN", "help": "column of cloud files that holds the labels; of bop, object or instance"},
+    ),
+    "signals": (
+        "--signals",
+        {
+            "type": lambda text: value_of(text),
+            "metavar": "YAML",
+            "help": "kinds of recorded streams by name, as '{eef: {kind: pose xyz_quat_xyzw, frame: base}}'; null "
+            "leaves one out: robomimic, maniskill",
+        },
+    ),
+    "depth_values": (
+        "--depth-values",
+        {"choices": ("z", "z_buffer"), "help": "metres, or a renderer's buffer between near and far: robomimic"},
+    ),
+    "near": ("--near", {"type": float, "metavar": "M", "help": "plane where a buffer is 0: robomimic"}),
+    "far": ("--far", {"type": float, "metavar": "M", "help": "plane where a buffer is 1: robomimic"}),
+    "rows": (
+        "--rows",
+        {"choices": ("top_first", "bottom_first"), "help": "which row of an image is stored first: robomimic"},
     ),
     "links_to": (
         "--links-to",

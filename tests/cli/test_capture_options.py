@@ -69,6 +69,11 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "labels_from": (["scalar_Label"], "scalar_Label"),
         "links_to": (["/store"], ["/store"]),
         "max_time_apart": (["0.05"], 0.05),
+        "signals": (["{joints: {kind: invariant}, debug: null}"], {"joints": {"kind": "invariant"}, "debug": None}),
+        "depth_values": (["z_buffer"], "z_buffer"),
+        "near": (["0.01"], 0.01),
+        "far": (["4"], 4.0),
+        "rows": (["bottom_first"], "bottom_first"),
     }
     for name, (flag, _) in _FLAGS.items():
         text, value = words[name]
@@ -96,6 +101,9 @@ def test_combinators_are_flags_and_their_fields_are_options() -> None:
         "temporal": {"alpha": 0.2, "delta": 9}
     }
     assert given_options(parsed("--option", "temporal=true")) == {"temporal": True}
+    assert given_options(parsed("--convention", "opengl", "--option", "convention.depth=ray")) == {
+        "convention": {"axes": "opengl", "depth": "ray"}
+    }
     with pytest.raises(ConfigError, match="given twice"):
         given_options(parsed("--averaged", "10", "--option", "averaged.num_frames=5"))
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from torch import Tensor
-
 from pcdata.errors import CaptureError, ConfigError, DTypeError, near_matches
 from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.rendered import (
@@ -26,13 +24,11 @@ from pcdata.io.sources.capture_source import CaptureSource, checked_ids
 from pcdata.io.sources.combine import CombinedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.registry import register_combinator
-from pcdata.structures import Camera, DepthFrame
-from pcdata.structures.structure import derived
+from pcdata.io.sources.rendered_images import ROWS, centered_camera, upright_image
+from pcdata.structures import DepthFrame
 
 POSES = ("world_from_camera", "camera_from_world")
-ROWS = ("top_first", "bottom_first")
 PRINCIPAL_POINTS = ("center", "corner")
-_CORNER = 0.5  # pixels from the corner of a pixel to its center
 
 
 @register_combinator
@@ -154,18 +150,6 @@ class ConventionSource(CombinedSource):
             confidence=upright.get("confidence"),
             mask=upright.get("mask"),
         )
-
-
-def upright_image(image: Tensor, rows: str) -> Tensor:  # (V, H, W, ...)
-    """Return images whose first row is the top one."""
-    return image.flip(1) if rows == "bottom_first" else image
-
-
-def centered_camera(camera: Camera) -> Camera:
-    """Return a camera whose principal point counts from the corner of the first pixel, counted from its center."""
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, :2, 2] -= _CORNER
-    return derived(camera, intrinsics=intrinsics)
 
 
 _SAID = ("axes", "poses", "depth", "near", "far", "rows", "principal_point")

@@ -14,6 +14,8 @@ from pcdata.io.sources import (  # noqa: F401
     apc,
     bop,
     rlbench,
+    robomimic,
+    maniskill,
     pairs,
     realsense_bag,
     azure_kinect,

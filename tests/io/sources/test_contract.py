@@ -179,8 +179,10 @@ def test_a_part_of_a_source_holds_what_it_says(source: CaptureSource) -> None:
         part.load(rest[0] if rest else "absent")
     if rest:
         left = source.without({first: "blurred"})
-        assert (left.ids, left.skipped) == (rest, {first: "blurred"})
-        assert left.without([rest[0]]).skipped == {first: "blurred", rest[0]: "listed"} if rest[1:] else True
+        before = source.skipped  # a recording may leave samples out of itself
+        assert (left.ids, left.skipped) == (rest, {**before, first: "blurred"})
+        if rest[1:]:
+            assert left.without([rest[0]]).skipped == {**before, first: "blurred", rest[0]: "listed"}
     for wrong in ([], ["absent"], "text"):
         with pytest.raises(PcdataError):
             source.subset(wrong)

@@ -1,0 +1,415 @@
+"""Demonstrations in one HDF5 file: a group for each episode, in it an array for each stream with a row for each step.
+
+A layout of this kind says which groups are episodes, what the arrays in one are, and how a view of a step is read; ids,
+episodes, signals and the safety of reading are the same for all. The file is open only while something is read.
+
+Source: HDF5 File Format Specification 3.0 (what is refused: see :mod:`pcdata.io.arrays.hdf5_arrays`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.errors import CacheError, CaptureError, PcdataError
+from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file, open_input
+from pcdata.files.sample_names import check_known, in_order, name_some, positions
+from pcdata.files.strict_json import json_object
+from pcdata.io.arrays.hdf5_arrays import checked_dataset, hard_linked, open_hdf5
+from pcdata.io.sources.joined_views import join_views
+from pcdata.io.sources.listing import absolute, is_file
+from pcdata.io.sources.source import Source
+from pcdata.io.sources.stated_kinds import KindAndFrame, check_stated_names, kind_of, signal_of, stated_kinds
+from pcdata.structures import DepthFrame, Episode, Signal
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_SUFFIXES = (".h5", ".hdf5")
+_MAX_EPISODES = 100_000
+_MAX_STREAMS = 1000  # in one episode
+_MAX_TEXT = 1 << 24  # characters of one attribute: the model of a kitchen takes some millions
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Arrays of an episode that are one signal, their columns side by side.
+
+    Args:
+        arrays: their paths within the episode's group.
+        kind: what they are and in which frame, as the format says; None = it says nothing.
+    """
+
+    arrays: tuple[str, ...]
+    kind: KindAndFrame | None = None
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode.
+
+    Args:
+        group: its path in the file.
+        length: its steps that are read.
+        attributes: JSON-able facts.
+        texts: signals of kind text, the same in every step.
+        seconds: between two steps; None = not known.
+    """
+
+    group: str
+    length: int
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+    seconds: float | None = None
+
+
+class DemonstrationSource(Source):
+    """The steps of all episodes of a file, one after another; a sample is called ``EPISODE_STEP``."""
+
+    def __init__(
+        self,
+        path: Path,
+        demonstrations: Mapping[str, Demonstration],
+        streams: Mapping[str, Stream],
+        *,
+        cameras: Sequence[str],
+        signals: Mapping[str, Any] | None,
+        frame_id: str,
+        skipped: Mapping[str, str],
+        unread: Sequence[str],
+    ) -> None:
+        """Take the list.
+
+        Args:
+            path: the file.
+            demonstrations: by name.
+            streams: the arrays that become signals, by the names of the signals.
+            cameras: whose images are the views of a sample.
+            signals: what is stated of the streams, see :func:`stated_kinds`.
+            frame_id: where the poses of the cameras lead to.
+            skipped: samples that were left out, and why.
+            unread: what is not read although it could be, in words.
+
+        Raises:
+            CaptureError: there is no step, or names cannot be told apart.
+            ConfigError: what is stated is no kind, or of a stream that is not there.
+        """
+        where = f"{self.kind} source {path}"
+        texts = {name for one in demonstrations.values() for name in one.texts}
+        stated = stated_kinds(where, signals)
+        check_stated_names(where, stated, {*streams, *texts})
+        kinds = {name: kind_of(name, stated, stream.kind) for name, stream in streams.items()}
+        self._streams = {name: (streams[name].arrays, kind) for name, kind in kinds.items() if kind is not None}
+        self._left_out = frozenset(name for name, kind in stated.items() if kind is None)
+        self._demonstrations = dict(demonstrations)
+        self._told = list(unread)
+        self.cameras = list(cameras)
+        self.frame_id = frame_id
+        ids = [sample_name(name, step) for name, one in demonstrations.items() for step in range(one.length)]
+        super().__init__(path, ids)
+        self._skipped = dict(skipped)
+        self._positions = positions(self._ids)
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        """An HDF5 file with such episodes."""
+        if not is_file(path) or path.suffix.lower() not in _SUFFIXES:
+            return False
+        try:
+            with open_input("recognizes", path, max_bytes=MAX_STREAMED_BYTES) as stream:
+                if stream.read(len(_MAGIC)) != _MAGIC:
+                    return False
+            with opened("recognizes", path) as file:
+                return cls._is_such(file)
+        except (PcdataError, OSError):
+            return False
+
+    @classmethod
+    @abstractmethod
+    def _is_such(cls, file: Any) -> bool:
+        """Say whether an open file is of this layout."""
+
+    @abstractmethod
+    def _view(self, steps: Steps, camera: str, sample_id: str) -> DepthFrame:
+        """Read the view of one camera."""
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the file, which holds every sample."""
+        return {"recording": self.path}
+
+    def unread(self) -> list[str]:
+        """Name the arrays of the file that are not read."""
+        return list(self._told)
+
+    def signals(self, sample_id: str) -> Mapping[str, Signal]:
+        """Read the signals of one step alone.
+
+        Raises:
+            CaptureError: the sample is unknown, or an array of it is damaged or not of its kind.
+        """
+        check_known(str(self), sample_id, self._known)
+        with opened(str(self), self.path) as file:
+            return self._signals(self._steps(file, sample_id))
+
+    def _read_episodes(self) -> list[Episode]:
+        found, places = [], {name: place for place, name in enumerate(self._ids)}
+        for name, one in self._demonstrations.items():
+            first = places[sample_name(name, 0)]
+            if self._ids[first + one.length - 1] != sample_name(name, one.length - 1):
+                raise CaptureError(f"{self}: the names of the episodes stand in no order; name them alike, as demo_0")
+            times = [step * one.seconds for step in range(one.length)] if one.seconds else []
+            found.append(Episode(name, first, one.length, times, one.attributes))
+        return sorted(found, key=lambda episode: episode.first)
+
+    def _load(self, sample_id: str) -> DepthFrame:
+        with opened(str(self), self.path) as file:
+            steps = self._steps(file, sample_id)
+            frames = [self._view(steps, camera, sample_id) for camera in self.cameras]
+            signals = self._signals(steps)
+        facts = [frame.provenance for frame in frames]
+        shared = {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
+        if steps.seconds:
+            shared["timestamps"] = [steps.step * steps.seconds]
+        frame = join_views(frames, {**shared, "cameras": self.cameras})
+        return replace(frame, recorded_signals=signals, capture_index=self._positions[sample_id])
+
+    def _steps(self, file: Any, sample_id: str) -> Steps:
+        name, _, step = sample_id.rpartition("_")
+        one = self._demonstrations[name]
+        group = hard_linked(file, one.group)
+        if group is None:
+            raise CaptureError(f"{self}: the group {one.group} is there no more")
+        return Steps(f"{self.path}: {one.group}", group, int(step), self.path.stat().st_size, one)
+
+    def _signals(self, steps: Steps) -> dict[str, Signal]:
+        found: dict[str, Signal] = {}
+        for name, (arrays, kind) in self._streams.items():
+            rows = [steps.row(array) for array in arrays]
+            values = rows[0] if len(rows) == 1 else np.concatenate(rows)
+            found[name] = signal_of(f"{steps.where}: step {steps.step}", name, _tensor(values)[None], kind)
+        for name, text in steps.demonstration.texts.items():
+            if name not in self._left_out:
+                found[name] = signal_of(steps.where, name, (text,), ("text", None))
+        return found
+
+
+@dataclass(frozen=True)
+class Steps:
+    """One step of an episode of an open file."""
+
+    where: str
+    group: Any
+    step: int
+    file_bytes: int
+    demonstration: Demonstration
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds between two steps."""
+        return self.demonstration.seconds
+
+    def row(self, name: str) -> NDArray[Any]:
+        """Return the row of this step of an array.
+
+        Raises:
+            CaptureError: there is none.
+        """
+        array = checked_dataset(self.group, name, self.file_bytes)
+        if not array.shape or array.shape[0] <= self.step:
+            raise CaptureError(f"{self.where}/{name}: has shape {array.shape}, but no row of step {self.step}")
+        if array.dtype.kind not in "biuf":
+            raise CaptureError(f"{self.where}/{name}: must hold numbers, got {array.dtype}")
+        return np.asarray(array[self.step])
+
+    def has(self, name: str) -> bool:
+        """Whether the episode has such an array."""
+        return hard_linked(self.group, name) is not None
+
+
+def plane_of(steps: Steps, name: str) -> NDArray[Any]:  # (H, W)
+    """Read the image of one channel of a step, whose channel may be an axis of its own.
+
+    Raises:
+        CaptureError: it has another shape.
+    """
+    image = steps.row(name)
+    if image.ndim == 3 and image.shape[-1] == 1:
+        image = image[..., 0]
+    if image.ndim != 2 or not image.size:
+        raise CaptureError(f"{steps.where}/{name}: an image of one channel is (steps, H, W, 1), got {image.shape} each")
+    return image
+
+
+def color_of(steps: Steps, name: str) -> NDArray[Any]:  # (H, W, 3) uint8
+    """Read the color image of a step; a fourth channel, which is opacity, is dropped.
+
+    Raises:
+        CaptureError: it has another shape or dtype.
+    """
+    image = steps.row(name)
+    if image.ndim != 3 or image.shape[-1] not in (3, 4) or image.dtype != np.uint8:
+        raise CaptureError(
+            f"{steps.where}/{name}: a color image is (steps, H, W, 3) uint8, got {image.dtype} of {image.shape} each"
+        )
+    return np.ascontiguousarray(image[..., :3])
+
+
+@contextmanager
+def opened(where: str, path: Path) -> Iterator[Any]:
+    """Open an HDF5 file for as long as something of it is read.
+
+    Raises:
+        CaptureError: whatever is wrong with it.
+    """
+    path = absolute(path)
+    existing_file(where, path, max_bytes=MAX_STREAMED_BYTES)
+    try:
+        with open_hdf5(path) as file:
+            yield file
+    except CacheError as error:
+        raise CaptureError(f"{where}: {error}") from error
+    except PcdataError:
+        raise
+    except MemoryError as error:
+        raise CaptureError(f"{where}: there is not enough memory to read it ({error}); the file may be fine") from error
+    except Exception as error:  # h5py raises many types on damaged bytes
+        raise CaptureError(
+            f"{where}: cannot be read ({type(error).__name__}: {str(error)[:200]}); damaged, cut short or of another "
+            "format? Copy or write it again"
+        ) from error
+
+
+def episode_names(where: str, group: Any, prefix: str) -> list[str]:
+    """Return the names of the groups that are episodes, as a person counts.
+
+    Raises:
+        CaptureError: there are more than any recording has.
+    """
+    import h5py
+
+    if len(group) > _MAX_EPISODES:
+        raise CaptureError(f"{where}: has {len(group)} entries, more than {_MAX_EPISODES}")
+    names = [name for name in group if name.startswith(prefix) and name[len(prefix) :].isdecimal()]
+    return in_order(name for name in names if isinstance(hard_linked(group, name), h5py.Group))
+
+
+def arrays_below(where: str, group: Any, name: str) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of numbers at or below a path in a group, by their paths.
+
+    Raises:
+        CaptureError: there are more than any recording has, or groups that hold themselves.
+    """
+    import h5py
+
+    found: dict[str, tuple[int, ...]] = {}
+    waiting, looked = [name], 0
+    while waiting:
+        path, looked = waiting.pop(), looked + 1
+        if looked > _MAX_STREAMS:
+            raise CaptureError(f"{where}/{name}: has more than {_MAX_STREAMS} arrays")
+        item = hard_linked(group, path)
+        if isinstance(item, h5py.Group):
+            if len(item) > _MAX_STREAMS:
+                raise CaptureError(f"{where}/{path}: has {len(item)} entries, more than {_MAX_STREAMS}")
+            waiting.extend(f"{path}/{part}" for part in item)
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
+            found[path] = item.shape
+    return dict(sorted(found.items()))
+
+
+def text_attribute(where: str, group: Any, name: str) -> str | None:
+    """Return an attribute that is one text; None where there is none.
+
+    Raises:
+        CaptureError: it is something else, or longer than any is.
+    """
+    if name not in group.attrs:
+        return None
+    stored = group.attrs.get_id(name)
+    if stored.shape != () or stored.get_storage_size() > _MAX_TEXT:
+        raise CaptureError(f"{where}: the attribute {name} must be one text, got shape {stored.shape}")
+    value = group.attrs[name]
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "strict")
+    if not isinstance(value, str) or len(value) > _MAX_TEXT:
+        raise CaptureError(f"{where}: the attribute {name} must be one text, got {type(value).__name__}")
+    return value
+
+
+def json_attribute(where: str, group: Any, name: str) -> dict[str, Any]:
+    """Return an attribute that is a JSON object; an empty one where there is none.
+
+    Raises:
+        CaptureError: it is something else.
+    """
+    text = text_attribute(where, group, name)
+    return {} if text is None else json_object(f"{where}: the attribute {name}", text, error=CaptureError)
+
+
+def number_attribute(where: str, group: Any, name: str) -> float | None:
+    """Return an attribute that is one number; None where there is none.
+
+    Raises:
+        CaptureError: it is something else.
+    """
+    if name not in group.attrs:
+        return None
+    stored = group.attrs.get_id(name)
+    if stored.shape not in ((), (1,)) or stored.dtype.kind not in "iuf":
+        raise CaptureError(f"{where}: the attribute {name} must be one number, got {stored.dtype} of {stored.shape}")
+    return float(np.asarray(group.attrs[name]).reshape(-1)[0])
+
+
+def check_lengths(where: str, lengths: Mapping[str, int]) -> int:
+    """Return the number of steps that arrays of one episode have.
+
+    Raises:
+        CaptureError: they have different ones.
+    """
+    if len({*lengths.values()}) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise CaptureError(f"{where}: the images have different numbers of steps: {told}; was the file cut short?")
+    return next(iter(lengths.values()))
+
+
+def same_cameras(where: str, first: Sequence[str], names: Sequence[str], episode: str) -> None:
+    """Require an episode to have the cameras of the first.
+
+    Raises:
+        CaptureError: one is missing, or there is another.
+    """
+    if list(first) != list(names):
+        raise CaptureError(
+            f"{where}: {episode} has depth of {name_some(names) or 'no camera'}, the first episode of "
+            f"{name_some(first)}; name the cameras that all have, one at a time (--camera NAME)"
+        )
+
+
+def without_frame(
+    streams: Mapping[str, Stream], stated: Mapping[str, Any] | None
+) -> tuple[dict[str, Stream], list[str]]:
+    """Return the signals of a capture that does not know the frame they are in, and what is said of the others."""
+    lost = [name for name, one in streams.items() if one.kind and one.kind[1] and name not in (stated or {})]
+    told = f"signals {name_some(lost)}: where the camera is in their frame is not known; state the poses by calibration"
+    return {name: one for name, one in streams.items() if name not in lost}, [told] if lost else []
+
+
+def sample_name(name: str, step: int) -> str:
+    """Return the id of a step of an episode."""
+    return f"{name}_{step:06d}"
+
+
+def _tensor(values: NDArray[Any]) -> Tensor:
+    """Return numbers as a tensor; whole numbers that no tensor of old versions has become wider ones."""
+    wider = {"u2": np.int32, "u4": np.int64, "u8": np.int64}.get(values.dtype.str[1:])
+    if values.dtype.str[1:] == "u8" and values.size and int(values.max()) > np.iinfo(np.int64).max:
+        raise CaptureError(f"numbers up to {int(values.max())} are more than any tensor holds")
+    native = values.astype(wider if wider is not None else values.dtype.newbyteorder("="))
+    return torch.from_numpy(np.ascontiguousarray(native)) if native.ndim else torch.from_numpy(native.reshape(1))[0]
