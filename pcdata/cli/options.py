@@ -76,12 +76,13 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {"metavar": "COLUMN", "help": "column of cloud files that holds the labels; of bop, object or instance"},
     ),
     "signals": (
-        "--signals",
+        "--signal",
         {
-            "type": lambda text: value_of(text),
-            "metavar": "YAML",
-            "help": "kinds of recorded streams by name, as '{eef: {kind: pose xyz_quat_xyzw, frame: base}}'; null "
-            "leaves one out: robomimic, maniskill",
+            "action": "append",
+            "type": lambda text: name_and_value(text),
+            "metavar": "NAME=KIND",
+            "help": "kind of a recorded stream, such as 'eef=pose xyz_quat_xyzw in base' or joints=invariant; NAME= "
+            "leaves it out; repeatable: robomimic, maniskill",
         },
     ),
     "depth_values": (
@@ -218,6 +219,8 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
             given[name] = value
     if "folders" in given:
         given["folders"] = {role: folder or None for role, folder in given["folders"]}
+    if "signals" in given:
+        given["signals"] = {name: _stated_kind(said) for name, said in given["signals"]}
     for name, (field, _) in _COMBINED.items():
         if (value := getattr(arguments, name, None)) is not None:
             given[name] = value if field == "num_frames" else {field: value}
@@ -236,6 +239,12 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
             raise ConfigError(f"--option {name}: this option is given twice; give it once")
         given[name] = value_of(text)
     return given
+
+
+def _stated_kind(text: str) -> dict[str, str] | None:
+    """Read ``KIND in FRAME`` or ``KIND``; nothing = the stream is left out."""
+    kind, mark, frame = (part.strip() for part in text.rpartition(" in "))
+    return ({"kind": kind, "frame": frame} if mark else {"kind": frame}) if text.strip() else None
 
 
 def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:

@@ -69,7 +69,7 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "labels_from": (["scalar_Label"], "scalar_Label"),
         "links_to": (["/store"], ["/store"]),
         "max_time_apart": (["0.05"], 0.05),
-        "signals": (["{joints: {kind: invariant}, debug: null}"], {"joints": {"kind": "invariant"}, "debug": None}),
+        "signals": (["eef=pose xyz_quat_xyzw in base"], {"eef": {"kind": "pose xyz_quat_xyzw", "frame": "base"}}),
         "depth_values": (["z_buffer"], "z_buffer"),
         "near": (["0.01"], 0.01),
         "far": (["4"], 4.0),
@@ -81,6 +81,9 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         assert getattr(parsed(), attribute_of(flag)) is None
     assert given_options(parsed("--folder", "color=rgb", "--folder", "pose=")) == {
         "folders": {"color": "rgb", "pose": None}
+    }
+    assert given_options(parsed("--signal", "joints=invariant 7", "--signal", "debug=")) == {
+        "signals": {"joints": {"kind": "invariant 7"}, "debug": None}
     }
 
 
