@@ -37,7 +37,7 @@ EXTRAS = {
         _Extra("numcodecs", "zarr", "zarr chunks packed with Blosc, Zstandard or LZ4"),
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
         _Extra("av", "av", "recordings of an Azure Kinect (.mkv)"),
-        _Extra("rosbags", "ros", "RealSense recordings (.bag)"),
+        _Extra("rosbags", "ros", "RealSense recordings (.bag), and ROS 2 recordings (.mcap)"),
         _Extra("open3d", "open3d", "viewing and comparing with Open3D"),
         _Extra(
             "torch_cluster",

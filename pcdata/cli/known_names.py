@@ -129,6 +129,10 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "pointcept": ("table", "segment", "instance", "frame"),
     "ggcnn": ("grasps", "holes", "colors", "view", "any_size"),
 }  # with their options
+WRITERS: dict[str, tuple[str, ...]] = {
+    "folder": (),
+    "mcap": ("color", "quality", "compression"),
+}  # with their options
 SENSORS = (
     "realsense_d415",
     "realsense_d435",

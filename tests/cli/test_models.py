@@ -20,7 +20,7 @@ from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import export_dataset
 from pcdata.exports.targets import TARGETS
-from pcdata.io import CaptureCamera, write_capture_camera, write_color, write_depth, write_pose
+from pcdata.io import WRITERS, CaptureCamera, write_capture_camera, write_color, write_depth, write_pose
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.sources.registry import LAYOUTS
 from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
@@ -243,6 +243,7 @@ def test_help_knows_the_names_of_every_registry():
     assert tuple(CONTRACTS) == known_names.MODELS
     assert tuple(CHOICES) == known_names.CHOICES
     assert {name: tuple(f.name for f in fields(one)) for name, one in TARGETS.items()} == known_names.TARGETS
+    assert {name: tuple(f.name for f in fields(one)) for name, one in WRITERS.items()} == known_names.WRITERS
     assert tuple(sensor_profiles()) == known_names.SENSORS
     assert METHODS == known_names.REFINERS
     for one in CONTRACTS.values():
@@ -255,6 +256,7 @@ def test_help_knows_the_names_of_every_registry():
         (["build"], [*known_names.MODELS, *known_names.KINDS, *known_names.FORMATS, *known_names.CHOICES]),
         (["check"], [*known_names.MODELS, *known_names.CHOICES]),
         (["export"], [*known_names.TARGETS, *known_names.KINDS, "frames_per_scene", "label_offset"]),
+        (["convert"], [*known_names.WRITERS, *known_names.KINDS, "quality"]),
         (["validate"], [*known_names.CHECKS, *known_names.SENSORS, *known_names.KINDS]),
         (["calib", "check"], known_names.SENSORS),
         (["calib", "refine"], known_names.REFINERS),

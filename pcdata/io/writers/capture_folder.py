@@ -8,17 +8,13 @@ from pathlib import Path
 from typing import ClassVar
 
 from pcdata.errors import CaptureError, WriteError, write_fault
-from pcdata.files.sample_names import check_names, in_order, in_order_of_last_number
+from pcdata.files.sample_names import in_order_of_last_number
 from pcdata.io.sources.episode_file import write_episodes
-from pcdata.io.sources.listing import is_litter
-from pcdata.io.store.manifest import key_of
+from pcdata.io.writers.file_names import file_names
 from pcdata.io.writers.registry import register_writer
 from pcdata.io.writers.view_folder import ViewFolder
 from pcdata.io.writers.writer import KEPT, Captures, Writer
 from pcdata.structures import DepthFrame
-
-_FORBIDDEN = {*'/\\<>:"|?*'}  # in names of files, of one system or another
-_LONGEST = 200  # bytes of a name, of the 255 that a file name may have
 
 
 def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
@@ -53,7 +49,7 @@ class FolderWriter(Writer):
 
     def write(self, captures: Captures, folder: Path) -> None:
         """Write all captures; what all share, such as the depth unit, is settled by the last."""
-        names = _file_names(captures.ids)
+        names = dict(zip(captures.ids, file_names(captures.ids)))
         if renamed := sum(name != sample_id for sample_id, name in names.items()):
             captures.note(f"{renamed} captures have ids that no file can be called by, or not in this order: renamed")
         views: list[ViewFolder] = []
@@ -86,38 +82,7 @@ def _view_folders(first: DepthFrame, folder: Path) -> list[ViewFolder]:
             "a calibration (--calibration and --frame), or write one camera at a time"
         )
     cameras = first.provenance.get("cameras")
-    usual = [f"view{v}" for v in range(first.num_views)]
-    names = [*map(str, cameras)] if isinstance(cameras, list) and len(cameras) == first.num_views else usual
-    alike = len({name.casefold() for name in names}) < len(names)
-    if alike or not all(name and _names_files(name) for name in names) or in_order_of_last_number(names) != names:
-        names = usual
+    told = [*map(str, cameras)] if isinstance(cameras, list) and len(cameras) == first.num_views else []
+    names = file_names(told or [f"view{v}" for v in range(first.num_views)], in_order_of_last_number)
     # The moment's signals are the same for all views; one folder that has them is enough.
     return [ViewFolder(folder / name, with_signals=not number) for number, name in enumerate(names)]
-
-
-def _file_names(ids: list[str]) -> dict[str, str]:
-    """Return the name of every capture's files by its id: names in whose order they are read back."""
-    keys = [sample_id if _names_files(sample_id) else key_of(sample_id) for sample_id in ids]
-    if len({key.casefold() for key in keys}) < len(keys) or not _stand_in_order(keys):
-        digits = len(str(len(ids) - 1))
-        keys = [f"{place:0{digits}d}_{key}" for place, key in enumerate(keys)]
-    return dict(zip(ids, keys))
-
-
-def _names_files(sample_id: str) -> bool:
-    """Say whether an id can be what files and folders are called, on any system."""
-    return (
-        sample_id.isprintable()
-        and not is_litter(sample_id)
-        and not _FORBIDDEN & {*sample_id}
-        and sample_id == sample_id.strip(" .")
-        and len(sample_id.encode()) <= _LONGEST
-    )
-
-
-def _stand_in_order(names: list[str]) -> bool:
-    try:
-        check_names("convert", names)
-    except CaptureError:
-        return False
-    return in_order(names) == names

