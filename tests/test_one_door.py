@@ -25,6 +25,7 @@ ALLOWED = {
         "files('pcdata.sensors').joinpath('profiles.yaml').read_text": "a file of the package"
     },
     "io/images/reading.py": {"Image.open": "of bytes"},
+    "io/images/writing.py": {"Image.open": "of bytes that it has made"},
     "io/images/exr.py": {"library.File": "after the door, when its structure was checked"},
     "io/sources/matroska.py": {"av.open": "of a stream that the door has opened"},
     "io/sources/rosbag.py": {"rosbag1.Reader": "after open_input"},

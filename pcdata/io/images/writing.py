@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 
 import numpy as np
@@ -92,6 +93,20 @@ def write_color(
     check_tensors(where, {"colors": colors}, {"colors": "H W 3 : uint8"})
     with replacing(where, path) as temporary:
         Image.fromarray(colors.detach().cpu().numpy()).save(temporary, format="PNG")
+
+
+def packed_color(
+    colors: Tensor,  # (H, W, 3) uint8
+    form: str,
+    quality: int,
+) -> tuple[bytes, int]:
+    """Return RGB as the bytes of a "png" or a "jpeg" of some quality, and by how many of 255 levels it differs."""
+    pixels = colors.detach().cpu().numpy()
+    packed = io.BytesIO()
+    Image.fromarray(pixels).save(packed, format=form, quality=quality)
+    with Image.open(io.BytesIO(packed.getvalue())) as again:
+        apart = np.abs(np.asarray(again).astype(np.int16) - pixels)
+    return packed.getvalue(), int(apart.max(initial=0))
 
 
 @locates_path

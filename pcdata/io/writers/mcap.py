@@ -7,7 +7,6 @@ expect both (REP 118); so nobody has to know a unit. What ROS has no message for
 from __future__ import annotations
 
 import importlib
-import io
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -17,10 +16,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from PIL import Image
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError
+from pcdata.io.images.writing import packed_color
 from pcdata.io.writers.file_names import file_names
 from pcdata.io.writers.registry import register_writer
 from pcdata.io.writers.ros_messages import RosMessages, exact_as_doubles
@@ -172,17 +171,13 @@ class _Recording:
             self._send(f"/{own}/pose_matrix", self.messages.array(frame.world_from_camera[0].numpy()), stamp)
 
     def _add_color(self, own: str, header: Any, colors: Tensor, stamp: int) -> None:
-        pixels = colors.numpy()
         if self.writer.color == "raw":
-            self._send(f"/{own}/color/image_raw", self.messages.image(header, pixels), stamp)
+            self._send(f"/{own}/color/image_raw", self.messages.image(header, colors.numpy()), stamp)
             return
-        packed = io.BytesIO()
-        Image.fromarray(pixels).save(packed, format=self.writer.color, quality=self.writer.quality)
+        packed, apart = packed_color(colors, self.writer.color, self.writer.quality)
         if self.writer.color == "jpeg":
-            with Image.open(io.BytesIO(packed.getvalue())) as again:
-                apart = int(np.abs(np.asarray(again).astype(np.int16) - pixels).max())
             self.captures.lose("color", f"JPEG of quality {self.writer.quality}", levels=apart, captures=1)
-        message = self.messages.compressed(header, self.writer.color, packed.getvalue())
+        message = self.messages.compressed(header, self.writer.color, packed)
         self._send(f"/{own}/color/image_raw/compressed", message, stamp)
 
     def _add_signal_facts(self, frame: DepthFrame) -> None:
