@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,7 +38,7 @@ _MILLIMETRES = 0.001
 @register_writer
 @dataclass(frozen=True, kw_only=True)
 class McapWriter(Writer):
-    """A ROS 2 recording per episode, each in a folder with its ``metadata.yaml``, as ``ros2 bag record`` leaves them.
+    """A ROS 2 recording of each episode, and of what lies between them.
 
     Args:
         color: "raw" and "png" lose nothing; "jpeg" is small.
@@ -46,7 +47,7 @@ class McapWriter(Writer):
     """
 
     kind: ClassVar[str] = "mcap"
-    layout: ClassVar[str] = "EPISODE/EPISODE.mcap, a ROS 2 recording of each episode (ros2 bag, Foxglove, RViz)"
+    layout: ClassVar[str] = "EPISODE.mcap, a ROS 2 recording of each episode (ros2 bag, Foxglove, RViz)"
     keeps: ClassVar[frozenset[str]] = frozenset(KEPT)
 
     color: Literal["raw", "png", "jpeg"] = "raw"
@@ -65,7 +66,7 @@ class McapWriter(Writer):
         messages = RosMessages()
         parts = _parts(captures)
         for name, (ids, episode) in zip(file_names([name for name, _, _ in parts]), ((b, c) for _, b, c in parts)):
-            with _opened(folder / name, self.compression) as bag:
+            with _opened(folder, name, self.compression) as bag:
                 recording = _Recording(self, bag, messages, captures, ids, episode)
                 for (_, frame), stamp in zip(captures.read(ids), _stamps(captures, ids, episode)):
                     recording.add(frame, stamp)
@@ -110,24 +111,23 @@ class _Recording:
         self.writer, self.bag, self.messages, self.captures = writer, bag, messages, captures
         self._topics: dict[str, Any] = {}
         self._views: list[str] = []
+        self._signals: dict[str, str] = {}  # what its topic is called, by name
         self._told = ""
         self._facts: dict[str, Any] = {"schema": SCHEMA, "cameras": {}, "signals": {}, "samples": ids}
-        if episode is not None:
-            self._facts["episode"] = {
-                "id": episode.id, "times": list(episode.times), "attributes": dict(episode.attributes)
-            }  # fmt: skip
+        episodes = [] if episode is None else [{"id": episode.id, "first": 0, "length": episode.length}]
+        self._facts["episodes"] = [{**one, "attributes": dict(episode.attributes)} for one in episodes]
 
     def add(self, frame: DepthFrame, stamp: int) -> None:
         """Write one capture."""
         if not self._views:
-            self._views = _ros_names(_camera_names(frame), "camera")
             names = _camera_names(frame)
-            self._facts["cameras"] = {name: {"topic": f"/{own}"} for name, own in zip(names, self._views)}
-            self._facts["world_frame"] = frame.frame_id
-        if frame.num_views != len(self._views) or frame.frame_id != self._facts["world_frame"]:
+            self._views = _ros_names(names, "camera")
+            self._facts["cameras"] = {own: {"name": name} for name, own in zip(names, self._views)}
+            self._facts |= {} if frame.frame_id is None else {"frame_id": frame.frame_id}
+        if frame.num_views != len(self._views) or frame.frame_id != self._facts.get("frame_id"):
             raise CaptureError(
                 f"{frame.sample_id}: has {frame.num_views} views with poses to {frame.frame_id!r}, but those before it "
-                f"{len(self._views)} to {self._facts['world_frame']!r}; write these apart (--only, --skip)"
+                f"{len(self._views)} to {self._facts.get('frame_id')!r}; write these apart (--only, --skip)"
             )
         unit = frame.provenance.get("metres_per_unit")
         for own, about in zip(self._views, self._facts["cameras"].values()):
@@ -183,19 +183,20 @@ class _Recording:
     def _add_signal_facts(self, frame: DepthFrame) -> None:
         known = self._facts["signals"]
         for name, signal in frame.recorded_signals.items():
+            if name not in self._signals:
+                (self._signals[name],) = _ros_names([name], "signal", list(self._signals.values()))
+            own = self._signals[name]
             dtype = str(signal.values.dtype).removeprefix("torch.") if isinstance(signal.values, Tensor) else "text"
-            about = {"kind": signal.kind, "frame": signal.frame, "dtype": dtype}
-            if name not in known:
-                (topic,) = _ros_names([name], "signal", [one["topic"].rpartition("/")[2] for one in known.values()])
-                known[name] = {"topic": f"/signals/{topic}", **about}
-            elif about != {key: known[name][key] for key in about}:
+            about = {"name": name, "kind": signal.kind, "frame": signal.frame}
+            about |= {} if dtype == "text" else {"dtype": dtype}
+            if known.setdefault(own, about) != about:
                 raise CaptureError(
-                    f"{frame.sample_id}: signal {name!r} is {about}, but before it was {known[name]}; a recording has "
+                    f"{frame.sample_id}: signal {name!r} is {about}, but before it was {known[own]}; a recording has "
                     "one kind, frame and type of each: write these apart (--only, --skip)"
                 )
 
     def _add_signal(self, name: str, signal: Signal, stamp: int) -> None:
-        topic = self._facts["signals"][name]["topic"]
+        topic = f"/signals/{self._signals[name]}"
         if not isinstance(signal.values, Tensor):
             self._send(topic, self.messages.text(signal.values[0]), stamp)
             return
@@ -222,13 +223,17 @@ class _Recording:
 
 
 @contextmanager
-def _opened(folder: Path, compression: str) -> Iterator[Any]:
+def _opened(folder: Path, name: str, compression: str) -> Iterator[Any]:
+    """Open ``NAME.mcap`` to write; what rosbags writes beside it, ``metadata.yaml``, is in the file too."""
     rosbag2 = importlib.import_module("rosbags.rosbag2")
-    bag = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    bag = rosbag2.Writer(folder / name, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     if compression == "zstd":
         bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
     with bag:
         yield bag
+    os.replace(folder / name / f"{name}.mcap", folder / f"{name}.mcap")
+    os.unlink(folder / name / "metadata.yaml")
+    os.rmdir(folder / name)
 
 
 def _latched_qos() -> Any:

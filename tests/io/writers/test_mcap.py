@@ -37,7 +37,7 @@ def image(message: Any, dtype: Any) -> np.ndarray:
 def test_depth_is_metres_as_ros_tools_expect_it_bit_for_bit(tmp_path: Path) -> None:
     made = cut_to_episodes(made_captures())
     convert(made, "mcap", tmp_path / "out")
-    sent = messages(tmp_path / "out" / "pick 0")["/camera/depth/image_raw"]
+    sent = messages(tmp_path / "out" / "pick 0.mcap")["/camera/depth/image_raw"]
     assert [message.encoding for _, message in sent] == ["32FC1"] * 2  # tenths of a millimetre are no 16UC1
     for name, (_, message) in zip(made.ids, sent):
         expected = made.load(name).depth[0].numpy()
@@ -48,7 +48,7 @@ def test_depth_of_whole_millimetres_is_16UC1(tmp_path: Path) -> None:
     units = torch.randint(300, 900, (1, 12, 16))
     frame = replace(made_frame(), depth=(units.double() * 0.001).float())
     convert(MadeCaptures({"000": frame}), "mcap", tmp_path / "out")
-    ((_, message),) = messages(tmp_path / "out" / "made")["/camera/depth/image_raw"]
+    ((_, message),) = messages(tmp_path / "out" / "made.mcap")["/camera/depth/image_raw"]
     assert message.encoding == "16UC1"
     assert np.array_equal(image(message, "<u2")[..., 0], units[0].numpy())
 
@@ -56,7 +56,7 @@ def test_depth_of_whole_millimetres_is_16UC1(tmp_path: Path) -> None:
 def test_cameras_have_their_intrinsics_lens_frame_and_place_in_the_tree(tmp_path: Path) -> None:
     frame = replace(made_frame(views=2), provenance={"cameras": ["left eye", "right"]})
     convert(MadeCaptures({"000": frame}), "mcap", tmp_path / "out")
-    found = messages(tmp_path / "out" / "made")
+    found = messages(tmp_path / "out" / "made.mcap")
     for view, own in enumerate(["left_eye", "right"]):
         ((_, info),) = found[f"/{own}/depth/camera_info"]
         assert info.distortion_model == "rational_polynomial"
@@ -82,12 +82,12 @@ def test_cameras_have_their_intrinsics_lens_frame_and_place_in_the_tree(tmp_path
 def test_color_is_raw_unless_jpeg_is_asked_for_and_then_the_loss_is_told(tmp_path: Path) -> None:
     made = MadeCaptures({"000": made_frame()})
     assert not convert(made, "mcap", tmp_path / "raw").lost
-    ((_, raw),) = messages(tmp_path / "raw" / "made")["/camera/color/image_raw"]
+    ((_, raw),) = messages(tmp_path / "raw" / "made.mcap")["/camera/color/image_raw"]
     assert np.array_equal(image(raw, "u1"), made.load("000").colors[0])
     loss = convert(made, "mcap", tmp_path / "jpeg", color="jpeg").lost["color"]
     assert loss.levels > 0
     assert f"by {loss.levels} of 255 levels at most" in str(loss)
-    ((_, packed),) = messages(tmp_path / "jpeg" / "made")["/camera/color/image_raw/compressed"]
+    ((_, packed),) = messages(tmp_path / "jpeg" / "made.mcap")["/camera/color/image_raw/compressed"]
     assert packed.format == "jpeg"
     assert not convert(made, "mcap", tmp_path / "png", color="png").lost
 
@@ -95,17 +95,16 @@ def test_color_is_raw_unless_jpeg_is_asked_for_and_then_the_loss_is_told(tmp_pat
 def test_signals_are_arrays_and_texts_and_what_they_are_is_told(tmp_path: Path) -> None:
     made = cut_to_episodes(made_captures())
     convert(made, "mcap", tmp_path / "out")
-    found = messages(tmp_path / "out" / "pick 1")
+    found = messages(tmp_path / "out" / "pick 1.mcap")
     told = json.loads(found["/pcdata"][0][1].data)
     assert [message.data for _, message in found["/signals/task"]] == ["put the cube on the disc: µ"] * 2
     plan = found["/signals/plan"][0][1]
     assert [axis.size for axis in plan.layout.dim] == [3, 3]
     assert np.array_equal(plan.data.reshape(3, 3), made.signals("002")["plan"].values[0].double())
-    assert told["signals"]["plan"] == {
-        "topic": "/signals/plan", "kind": "position", "frame": "base", "dtype": "float32",
-    }  # fmt: skip
-    assert (told["schema"], told["world_frame"], told["samples"]) == (1, "base", ["002", "003"])
-    assert told["episode"] == {"id": "pick 1", "times": [0.0, 0.05], "attributes": {"task": "place", "tries": 2}}
+    assert told["signals"]["plan"] == {"name": "plan", "kind": "position", "frame": "base", "dtype": "float32"}
+    assert (told["schema"], told["frame_id"], told["samples"]) == (1, "base", ["002", "003"])
+    attributes = {"task": "place", "tries": 2}
+    assert told["episodes"] == [{"id": "pick 1", "first": 0, "length": 2, "attributes": attributes}]
 
 
 def test_times_are_those_of_the_episode_on_the_clock_that_it_names(tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_times_are_those_of_the_episode_on_the_clock_that_it_names(tmp_path: Pat
     made = made_captures(4)
     made.episodes = [Episode("a", 0, 3, [5.0, 5.0, 5.1], {"start_ns": start})]
     convert(made, "mcap", tmp_path / "out")
-    sent = messages(tmp_path / "out" / "a")["/camera/depth/image_raw"]
+    sent = messages(tmp_path / "out" / "a.mcap")["/camera/depth/image_raw"]
     assert [time for time, _ in sent] == [start, start + 1, start + 100_000_000]
     stamps = [(message.header.stamp.sec, message.header.stamp.nanosec) for _, message in sent]
     assert stamps == [divmod(time, 10**9) for time, _ in sent]
@@ -123,10 +122,8 @@ def test_a_signal_of_two_kinds_and_topics_of_one_name_are_told_apart(tmp_path: P
     joints = Signal(torch.zeros(1, 2), "invariant")
     frame = replace(made_frame(), recorded_signals={"a b": joints, "a/b": joints, "µ": joints})
     convert(MadeCaptures({"000": frame}), "mcap", tmp_path / "out")
-    told = json.loads(messages(tmp_path / "out" / "made")["/pcdata"][0][1].data)["signals"]
-    assert {name: one["topic"] for name, one in told.items()} == {
-        "a b": "/signals/a_b", "a/b": "/signals/a_b_2", "µ": "/signals/signal",
-    }  # fmt: skip
+    told = json.loads(messages(tmp_path / "out" / "made.mcap")["/pcdata"][0][1].data)["signals"]
+    assert {topic: one["name"] for topic, one in told.items()} == {"a_b": "a b", "a_b_2": "a/b", "signal": "µ"}
     other = replace(frame, recorded_signals={"a b": Signal(torch.zeros(1, 3), "position", "base")})
     with pytest.raises(CaptureError, match="one kind, frame and type of each"):
         convert(MadeCaptures({"000": frame, "001": other}), "mcap", tmp_path / "mixed")
