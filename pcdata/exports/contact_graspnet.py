@@ -5,7 +5,7 @@ Source: NVlabs/contact_graspnet, ``contact_graspnet/data.py`` (load_available_in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -13,11 +13,14 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pcdata.exports.exported_images import Fields, image_fields
 from pcdata.exports.model_contracts import require_depth
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import object_ids, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npz import write_npz
+from pcdata.files.opening import check_inside
+from pcdata.io.arrays.stored_arrays import stored_arrays
 from pcdata.io.store.manifest import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, PointCloud
@@ -38,7 +41,8 @@ class _ContactGraspNet(Target):
     name: ClassVar[str] = "contact_graspnet"
     takes: ClassVar[Literal["captures"]] = "captures"
     model: ClassVar[str] = "contact_graspnet_api"
-    also: ClassVar[tuple[str, ...]] = ("contact_graspnet",)  # what its own code makes of that, 20,000 centered points
+    # The network itself: inference.py turns, centers and samples.
+    also: ClassVar[Mapping[str, frozenset[str]]] = {"contact_graspnet": frozenset({"frame", "normalization"})}
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"crop", "count"})
     layout: ClassVar[str] = "one npz per capture: depth (metres), K, and segmap and rgb where the capture has them"
 
@@ -78,6 +82,14 @@ class _ContactGraspNet(Target):
                 note(f"some captures have no depth within {near}..{far} m, which inference.py crops to; use --z_range")
             with open(folder / item.paths[0], "xb") as file:
                 write_npz(file, arrays)
+
+    @classmethod
+    def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Fields]]:
+        """Read depth and K of every file."""
+        for name in names:
+            check_inside("check", folder / name, [folder])
+            with stored_arrays(folder / name, {"depth", "K"}) as stored:
+                yield name, image_fields(folder / name, stored["depth"][...], stored["K"][...])
 
 
 def _z_range() -> tuple[float, float]:

@@ -31,6 +31,7 @@ class ExportRecord:
     complete: bool
     draws: Mapping[str, Any] = field(default_factory=dict)  # random steps, seed, epoch, copies; {} = nothing was drawn
     left_out: Mapping[str, str] = field(default_factory=dict)  # id of a sample that was left out -> why
+    coordinates: Sequence[Sequence[str]] = ()  # frame and unit of the samples, every pair that there is
     files: Sequence[str] = ()  # all there was when it was completed
     schema: str = SCHEMA
 
@@ -55,6 +56,9 @@ class ExportRecord:
             content = parse_info(read_bytes("export", path, max_bytes=_MAX_BYTES, error=CacheError))
             if content.get("schema") != SCHEMA:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}")
+            pairs = content.get("coordinates", [])
+            if not isinstance(pairs, list) or not all(map(_is_pair, pairs)):
+                raise CacheError(f"coordinates must list frames with their units, got {pairs!r:.100}")
             return cls(**content)
         except (CacheError, OSError, TypeError) as error:
             failed = CacheError(f"{path}: cannot be read: {error}; choose another folder")
@@ -98,6 +102,10 @@ def files_of(folder: Path) -> list[str]:
     """Return the files below an export, without its record and what desktops leave behind."""
     relative = (path.relative_to(folder) for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     return sorted(p.as_posix() for p in relative if p.as_posix() != FILE_NAME and not _LITTER & set(p.parts))
+
+
+def _is_pair(entry: Any) -> bool:
+    return isinstance(entry, list) and len(entry) == 2 and all(isinstance(text, str) for text in entry)
 
 
 def _as_json(value: Any) -> Any:

@@ -29,7 +29,7 @@ from pcdata.files.scratch import scratch_beside
 from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
 from pcdata.io.sources.capture_source import REFUSALS, CaptureSource, episodes_of, inputs_of
 from pcdata.progress import Progress
-from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
 
 # What is wrong with one sample, not with what is asked of all of them.
 UNFIT = (*REFUSALS, ContractError, ShapeError, DTypeError, FrameError)
@@ -130,7 +130,7 @@ def export_dataset(
         for item in run.items:
             run.write(item, partial)
         run.finish(partial)
-        replace(plan, complete=True, files=files_of(partial)).write(partial)
+        replace(plan, complete=True, coordinates=run.coordinates(), files=files_of(partial)).write(partial)
     return report
 
 
@@ -148,6 +148,7 @@ class _Run:
         self.inputs = inputs_of(source)
         self.items: list[Item] = []
         self.total = 0
+        self._coordinates: set[tuple[str, str]] = set()
         self._plan({})
 
     def _plan(self, bad: Mapping[str, str]) -> None:
@@ -229,6 +230,14 @@ class _Run:
         with naming_faults_of(folder):
             self.target.finish(self.items, folder, self._note)
 
+    def coordinates(self) -> list[list[str]]:
+        """Return frame and unit of what was written, every pair once."""
+        return [list(pair) for pair in sorted(self._coordinates)]
+
+    def keep_coordinates(self, found: ExportRecord) -> None:
+        """Take over frames and units of what an export that is continued had written before."""
+        self._coordinates |= {(frame, unit) for frame, unit in found.coordinates}
+
     def keep(self, item: Item) -> None:
         """Count an item that was there."""
         self.report.kept += len(item.ids)
@@ -238,6 +247,8 @@ class _Run:
             self._current = sample_id
             data = self._load(sample_id)
             self.inputs.check_latest("export")
+            # The loaders make points of images in the camera's own frame.
+            self._coordinates.add((data.frame_id, data.unit) if isinstance(data, PointCloud) else (CAMERA_FRAME, METRE))
             yield sample_id, data
             # Only when the writer asks for the next one is this one written.
             self.report.written += 1
@@ -279,15 +290,19 @@ def _continue(run: _Run, plan: ExportRecord, folder: Path) -> None:
                 for item in run.items:
                     run.keep(item)
                 return
+            run.keep_coordinates(found)
         for number, item in enumerate(run.items):
             refuse_links(folder, item.paths)
             if (folder / item.paths[-1]).exists():
                 run.keep(item)
                 continue
             with empty_part(scratch, f"item-{number}") as part:
+                before = run.coordinates()
                 run.write(item, part)
+                if run.coordinates() != before:  # known before the item is there, whatever stops this run
+                    replace(plan, coordinates=run.coordinates()).write(folder)
                 move_into_place(item.paths, part, folder)
         with empty_part(scratch, "finish") as part:
             run.finish(part)
             move_into_place(files_of(part), part, folder)
-        replace(plan, complete=True, files=files_of(folder)).write(folder)
+        replace(plan, complete=True, coordinates=run.coordinates(), files=files_of(folder)).write(folder)

@@ -6,7 +6,7 @@ Source: dougsm/ggcnn, ``utils/data/cornell_data.py``, ``utils/dataset_processing
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import CaptureError, ConfigError
+from pcdata.exports.exported_images import Fields, stored_colors, stored_depth
 from pcdata.exports.model_contracts import require_image
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_size, colors_of, one_view
@@ -51,7 +52,8 @@ class _GGCNN(Target):
     name: ClassVar[str] = "ggcnn"
     takes: ClassVar[Literal["captures"]] = "captures"
     model: ClassVar[str] = "ggcnn"
-    also: ClassVar[tuple[str, ...]] = ("grconvnet",)  # utils/data/cornell_data.py of skumra/robotic-grasping
+    # utils/data/cornell_data.py of skumra/robotic-grasping.
+    also: ClassVar[Mapping[str, frozenset[str]]] = {"grconvnet": frozenset()}
     image_size: ClassVar[tuple[int, int] | None] = (480, 640)  # that the loaders crop from
     layout: ClassVar[str] = "Cornell names: pcdNNNNd.tiff (float32 metres), pcdNNNNr.png, pcdNNNNcpos.txt"
 
@@ -106,6 +108,15 @@ class _GGCNN(Target):
                     "in"
                 )
             Image.fromarray(depth).save(depth_path, format="TIFF")
+
+    @classmethod
+    def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Fields]]:
+        """Read the depth of every image, and its color where it was written."""
+        for name in names:
+            if name.endswith("d.tiff"):
+                color = folder / f"{name.removesuffix('d.tiff')}r.png"
+                fields: Fields = {"depth": stored_depth(folder, folder / name)}
+                yield name, {**fields, "image": stored_colors(folder, color)} if color.is_file() else fields
 
     def _depth(self, where: str, frame: DepthFrame) -> NDArray[np.float32]:  # (H, W) metres
         if self.holes in ("inpainted", "smooth", "nearest"):

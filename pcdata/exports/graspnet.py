@@ -6,7 +6,7 @@ Source: graspnet/graspnet-baseline, ``demo.py`` (get_and_process_data), ``doc/ex
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pcdata.errors import CaptureError, add_note
+from pcdata.exports.exported_images import Fields, image_fields, stored_colors, stored_depth
 from pcdata.exports.model_contracts import require_depth
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_size, colors_of, object_ids, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
+from pcdata.files.opening import check_inside
+from pcdata.io.images.reading import read_mask
 from pcdata.io.images.writing import depth_units, write_color, write_depth
+from pcdata.io.sources.graspnet import read_meta
 from pcdata.io.store.manifest import key_of
 from pcdata.structures import DepthFrame, PointCloud
 
@@ -118,6 +122,33 @@ class _GraspNetFrames(GraspNetImages):
             if frame.labels is not None:
                 self.write_labels(target / "label.png", frame)
             (target / "meta.mat").write_bytes(meta_bytes(frame, factor))
+
+    @classmethod
+    def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Fields]]:
+        """Read the folders of which depth.png is among the files; what the mask leaves out, the demo leaves out."""
+        for name in names:
+            if name.endswith("/depth.png"):
+                place = (folder / name).parent
+                inside = place / "workspace_mask.png"
+                check_inside("check", inside, [folder])
+                yield (
+                    name.removesuffix("/depth.png"),
+                    stored_frame(
+                        folder, place / "depth.png", place / "color.png", place / "meta.mat", read_mask(inside).numpy()
+                    ),
+                )
+
+
+def stored_frame(folder: Path, depth: Path, color: Path, meta: Path, inside: NDArray[np.bool_] | None = None) -> Fields:
+    """Read the files of one view of an export.
+
+    Raises:
+        CaptureError, UnitError: one is missing or damaged, or a link leads out of the export.
+    """
+    check_inside("check", meta, [folder])
+    facts = read_meta(meta)
+    pixels = stored_depth(folder, depth, 1 / facts["metres_per_unit"])
+    return image_fields(depth, pixels, facts["intrinsic_matrix"], stored_colors(folder, color), inside)
 
 
 def meta_bytes(frame: DepthFrame, factor_depth: float) -> bytes:

@@ -6,16 +6,17 @@ Source: graspnet/graspnet-baseline, ``dataset/graspnet_dataset.py``; graspnet/gr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, ClassVar, Literal
 
 import annotated_types
 import torch
 
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError
-from pcdata.exports.graspnet import GraspNetImages, meta_bytes
+from pcdata.exports.exported_images import Fields
+from pcdata.exports.graspnet import GraspNetImages, meta_bytes, stored_frame
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import colors_of
 from pcdata.exports.target import Item, Note, Samples
@@ -45,7 +46,8 @@ class _GraspNetScenes(GraspNetImages):
     """
 
     name: ClassVar[str] = "graspnet_scene"
-    also: ClassVar[tuple[str, ...]] = ("gsnet",)  # dataset/graspnet_dataset.py of rhett-chen/graspness_implementation
+    # dataset/graspnet_dataset.py of rhett-chen/graspness_implementation.
+    also: ClassVar[Mapping[str, frozenset[str]]] = {"gsnet": frozenset()}
     layout: ClassVar[str] = (
         "scenes/scene_XXXX/CAMERA/: rgb, depth, label, meta, camK.npy, camera_poses.npy, cam0_wrt_table.npy"
     )
@@ -126,6 +128,16 @@ class _GraspNetScenes(GraspNetImages):
         write_npy(scene / "camera_poses.npy", (first_from_table @ table_from_camera).numpy())
         write_npy(scene / "cam0_wrt_table.npy", table_from_camera[0].numpy())
         (folder / item.paths[0] / _OBJECTS).write_text("".join(f"{number}\n" for number in sorted(objects)), "utf-8")
+
+    @classmethod
+    def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Fields]]:
+        """Read the views of which the depth is among the files; the loader crops by itself, around the labels."""
+        for name in names:
+            if PurePath(name).match("scenes/*/*/depth/*.png"):
+                depth = folder / name
+                camera, stem = depth.parents[1], depth.stem
+                color, meta = camera / f"rgb/{stem}.png", camera / f"meta/{stem}.mat"
+                yield f"{depth.parents[2].name}/{camera.name}/{stem}", stored_frame(folder, depth, color, meta)
 
     def finish(self, items: Sequence[Item], folder: Path, note: Note) -> None:
         """Write empty lists of objects for the other scenes of the split: ``GraspNet()`` opens those of all."""

@@ -8,14 +8,13 @@ from typing import Any
 import torch
 
 from pcdata.errors import ContractError, PcdataError
+from pcdata.exports.exported_images import MANY
 from pcdata.exports.target import Target
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.models import ModelBatch, contract, preset, require
 from pcdata.models.batching import batch_of
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Deproject
-
-_MANY = 20_000  # points of a depth image that a verdict is reached on: every rule left is one of means and extents
 
 
 def require_cloud(where: str, target: Target, cloud: PointCloud, **choices: Any) -> None:
@@ -43,7 +42,7 @@ def require_depth(where: str, target: Target, frame: DepthFrame) -> None:
         ContractError: every rule that failed, with what to do.
     """
     cloud = Deproject()(frame)
-    step = -(-cloud.num_points // _MANY) or 1
+    step = -(-cloud.num_points // MANY) or 1
     index = torch.arange(0, cloud.num_points, step, dtype=torch.int64, device="cpu")
     thin = cloud.select(index, ptr_from_counts([len(index)]))
     require_cloud(where, target, thin)

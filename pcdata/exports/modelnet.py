@@ -7,7 +7,7 @@ Source: charlesq34/pointnet2, ``modelnet_dataset.py``; yanx27/Pointnet_Pointnet2
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -42,7 +42,7 @@ class ModelNet(Target):
     name: ClassVar[str] = "modelnet"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointnet2_cls"
-    also: ClassVar[tuple[str, ...]] = ("pointnet2_cls_tf",)
+    also: ClassVar[Mapping[str, frozenset[str]]] = {"pointnet2_cls_tf": frozenset()}
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"count", "unit", "scale", "normalization"})
     layout: ClassVar[str] = "a text per shape: x,y,z,nx,ny,nz; modelnet40_train.txt, modelnet40_test.txt, shape names"
 

@@ -5,7 +5,7 @@ Source: Pointcept/Pointcept, ``pointcept/datasets/defaults.py`` (DefaultDataset)
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -41,7 +41,8 @@ class Pointcept(Target):
     name: ClassVar[str] = "pointcept"
     takes: ClassVar[Literal["clouds"]] = "clouds"
     model: ClassVar[str] = "pointcept"
-    also: ClassVar[tuple[str, ...]] = ("sonata", "concerto", "utonia")  # Pointcept's own configurations of them
+    # Pointcept's own configurations of them. That of Utonia scales what it reads, so clouds of its preset are no input.
+    also: ClassVar[Mapping[str, frozenset[str]]] = {"sonata": frozenset(), "concerto": frozenset()}
     left_to_loader: ClassVar[frozenset[str]] = frozenset({"normalization", "duplicates"})
     layout: ClassVar[str] = "a folder per scene: coord, color, normal, segment, instance .npy"
 

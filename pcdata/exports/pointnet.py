@@ -44,6 +44,7 @@ class PointNet(Target):
     model: ClassVar[str] = "pointnet_cls"
     layout: ClassVar[str] = "HDF5: data (B, N, 3), label (B, 1); train_files.txt, test_files.txt, shape_names.txt"
     splits: ClassVar[tuple[str, ...]] = ("train", "test")
+    category: ClassVar[str] = ""  # the array that the network takes besides
     loaded: ClassVar[int] = 1024  # points of a shape that the training script takes unless it is told otherwise
 
     table: Given | None = None
@@ -58,7 +59,7 @@ class PointNet(Target):
     def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
         """The files with shapes."""
         files = sorted(file for file in folder.glob("ply_data_*.h5") if not file.is_symlink())
-        return dict.fromkeys(files, CloudArray("data", ("xyz",)))
+        return dict.fromkeys(files, CloudArray("data", ("xyz",), cls.category))
 
     def rows(self, ids: Sequence[str]) -> dict[str, Row]:
         """Return class and split of every sample."""

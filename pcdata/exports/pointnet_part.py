@@ -38,6 +38,8 @@ class _PointNetPart(PointNet):
     splits: ClassVar[tuple[str, ...]] = ("train", "val")
     loaded: ClassVar[int] = 2048
 
+    category: ClassVar[str] = "label"
+
     prefix: str = ""
 
     def rows(self, ids: Sequence[str]) -> dict[str, Row]:

@@ -27,6 +27,7 @@ from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
+from pcdata.models import contract
 from pcdata.structures import DepthFrame, Episode, PointCloud
 
 _CHUNK = 100  # timesteps, as the original converters have it
@@ -60,6 +61,7 @@ class _ReplayBuffer(Target):
 
     takes: ClassVar[Literal["clouds"]] = "clouds"
     of_episodes: ClassVar[bool] = True
+    any_crop: ClassVar[bool] = True
     color: ClassVar[str] = ""  # what its contract calls colors; "" = the layout has none
     state_arrays: ClassVar[tuple[str, ...]] = ("state",)
     signal_arrays: ClassVar[tuple[str, ...]] = ()  # further arrays, each a signal of its name
@@ -152,7 +154,9 @@ class _ReplayBuffer(Target):
             points = np.concatenate([points, cloud.colors.numpy() * scale], axis=1)
         # The policy is fed one frame: that of the first.
         frame = self.frame or seen.get("frame", cloud.frame_id)
-        stated: dict[str, Any] = {"frame": frame, "crop": None, "channels": self.channels}
+        stated: dict[str, Any] = {"crop": None, "channels": self.channels}
+        if not contract(self.model).frame:
+            stated["frame"] = frame
         if self.num_points is not None:
             stated["num_points"] = self.num_points
         require_cloud(where, self, cloud, **stated)
@@ -319,7 +323,9 @@ def _buffer(name: str, model: str, arrays: str, *, colors: bool = True, image: b
 
 
 REPLAY_BUFFERS: tuple[type[Target], ...] = (
-    _buffer("dp3", "dp3_sim", "point_cloud state action img", image=True, color="rgb_255", also=("dp3_real",)),
+    _buffer(
+        "dp3", "dp3_sim", "point_cloud state action img", image=True, color="rgb_255", also={"dp3_real": frozenset()}
+    ),
     _buffer(
         "dexart",
         "dexart",

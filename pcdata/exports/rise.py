@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -21,11 +21,13 @@ from torch import Tensor
 from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.exports.class_table import Given, in_splits, read_table
 from pcdata.exports.episode_signals import signal_row
+from pcdata.exports.exported_images import Fields, image_fields, stored_colors, stored_depth
 from pcdata.exports.model_contracts import require_depth
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import colors_of, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npy import write_npy
+from pcdata.files.opening import read_text
 from pcdata.geometry import rigid, rotations
 from pcdata.io.images.writing import depth_units, write_color, write_depth
 from pcdata.io.store.manifest import key_of
@@ -37,6 +39,8 @@ _TOOL_FROM_INHAND = ((0.0, -1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.077), (0.0, 0.0, 1
 _OPEN = 0.095  # metres at a gripper command of 1000
 _FIRST_STAMP = 10**12  # milliseconds: names are sorted as texts, so all have as many digits
 _STEP = 100  # milliseconds between steps whose times are not known
+_STAMP = "timestamp.txt"
+_INTRINSICS = "intrinsics.txt"
 _SAME = 1e-9  # a pose that differs by less is the same
 
 
@@ -83,7 +87,7 @@ class _Rise(Target):
     @property
     def units_per_metre(self) -> int:
         """Return how the loader reads the depth of this camera."""
-        return 4000 if "f" in self.camera else 1000
+        return _units_per_metre(self.camera)
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One item per episode, of which the ids alone tell nothing."""
@@ -184,7 +188,7 @@ class _Rise(Target):
             write_npy(camera / f"gripper_command/{stamp}.npy", step.gripper)
         next(samples, None)  # at its end the last sample is counted
         (path / "metadata.json").write_text(json.dumps({"finish_time": stamps[-1]}) + "\n", "utf-8")
-        (path / "timestamp.txt").write_text(f"{calibration.name}\n", "utf-8")
+        (path / _STAMP).write_text(f"{calibration.name}\n", "utf-8")
         self._write_calibration(calibration, seen["pose"], seen["intrinsics"])
         (fx, _, cx), (_, fy, cy), _ = seen["intrinsics"].tolist()
         note(
@@ -207,7 +211,29 @@ class _Rise(Target):
         _write_mapping(folder / "extrinsics.npy", matrices)
         wide = torch.cat([intrinsics.double(), torch.zeros(3, 1, dtype=torch.float64, device="cpu")], dim=1)
         _write_mapping(folder / "intrinsics.npy", {self.camera: wide.numpy()})
+        # For people and for check: the loader opens none, and what is pickled beside it nobody should have to.
+        np.savetxt(folder / _INTRINSICS, intrinsics.double().numpy(), fmt="%.17g")
         write_npy(folder / "tcp.npy", np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+
+    @classmethod
+    def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Fields]]:
+        """Read the views of which the depth is among the files."""
+        for name in names:
+            if PurePath(name).match("*/*/cam_*/depth/*.png"):
+                depth = folder / name
+                camera, episode = depth.parents[1], depth.parents[2]
+                stamp = read_text("check", episode / _STAMP, inside=[folder]).strip()
+                serial = camera.name.removeprefix("cam_")
+                text = read_text("check", folder / f"calib/{stamp}/{_INTRINSICS}", inside=[folder])
+                matrix = np.array([line.split() for line in text.splitlines()], dtype=np.float64)
+                pixels = stored_depth(folder, depth, _units_per_metre(serial))
+                colors = stored_colors(folder, camera / f"color/{depth.name}")
+                yield f"{episode.name}/{depth.stem}", image_fields(depth, pixels, matrix, colors)
+
+
+def _units_per_metre(camera: str) -> int:
+    """Return how the loader reads the depth of a camera."""
+    return 4000 if "f" in camera else 1000
 
 
 def _position_and_quaternion(layout: str, values: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,6 +33,7 @@ class CloudArray(NamedTuple):
 
     name: str
     channels: tuple[str, ...]  # as the model's contract calls them
+    category: str = ""  # the array with the number of every cloud's class, where the model takes it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +46,20 @@ class Target(ABC):
     model: ClassVar[str]  # the contract in pcdata.models of what its loader feeds; samples are held to it
     left_to_loader: ClassVar[frozenset[str]] = frozenset()  # rules of the contract that the loader itself makes true
     of_episodes: ClassVar[bool] = False  # its samples are steps: those of one episode share their random draws
-    also: ClassVar[tuple[str, ...]] = ()  # further contracts: their loaders read the same files
+    # Further contracts whose loaders read the same files -> what those make true besides left_to_loader.
+    also: ClassVar[Mapping[str, frozenset[str]]] = {}
+    any_crop: ClassVar[bool] = False  # its clouds need not be cropped as the contract says
     image_size: ClassVar[tuple[int, int] | None] = None  # (height, width) that the loader asserts; None = any
 
     @classmethod
     def models(cls) -> tuple[str, ...]:
         """Return the contracts whose presets' data it exports."""
         return (cls.model, *cls.also)
+
+    @classmethod
+    def left_for(cls, model: str) -> frozenset[str]:
+        """Return the rules of a contract that its loader of these files makes true; none where it has none."""
+        return cls.left_to_loader | cls.also.get(model, frozenset()) if model in cls.models() else frozenset()
 
     @classmethod
     def example(cls, ids: Sequence[str]) -> dict[str, Any]:
@@ -108,12 +116,14 @@ class Target(ABC):
 
     @classmethod
     def cloud_arrays(cls, folder: Path, options: Mapping[str, Any]) -> dict[Path, CloudArray]:
-        """Return the files of an export with these options that ``pcdata check`` reads; here none."""
+        """Return the files of an export with these options whose arrays are clouds; here none."""
         return {}
 
     @classmethod
     def cloud_fields(cls, folder: Path, names: Sequence[str]) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
-        """Read the clouds in these files of an export whose clouds are no arrays of one file: points, colors, normals.
+        """Read the samples in these files of an export whose clouds are no arrays of one file.
+
+        They are points, colors and normals, and of images depth (H, W) in metres and image (H, W, 3).
 
         Raises:
             OSError, ValueError: a file cannot be read.

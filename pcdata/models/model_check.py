@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -114,15 +114,20 @@ def reports_of_file(
     unit: str,
     choices: Mapping[str, Any],
     columns: tuple[str, ...] = (),
+    categories: Sequence[int] | None = None,
 ) -> Iterator[SampleReport]:
     """Judge one sample after another; see :func:`check_files`.
 
-    ``columns`` are the names of the channels of the first tensor, where somebody knows them.
+    ``columns`` are the names of the channels of the first tensor, and ``categories`` the class of every sample, where
+    somebody knows them.
     """
     contract = contract_named(model, **choices)
     made = _category_tensors(contract, choices)
-    for name, stored, channels in read_samples(path, contract, keys):
+    for number, (name, stored, channels) in enumerate(read_samples(path, contract, keys)):
+        if categories is not None:
+            made = _category_tensors(contract, {"category": categories[number]})
         channels = {**channels, contract.main.key: columns} if columns else channels
+        channels = {**{spec.key: spec.channel_names for spec in contract.tensors if spec.key in made}, **channels}
         declared = {"frame_id": frame_id, "unit": unit, "channels": channels}
         yield SampleReport(name, tuple(_checks({**made, **stored}, model, choices, declared, False)))
 

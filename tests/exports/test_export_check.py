@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pcdata.cli.main import main
-from pcdata.errors import CacheError, ConfigError
+from pcdata.errors import CacheError, ConfigError, PcdataError, TooFewPointsError
 from pcdata.exports import TARGETS, check_export, export_dataset
-from pcdata.exports.export_record import FILE_NAME
-from pcdata.exports.replay_buffer import REPLAY_BUFFERS
+from pcdata.exports.export_record import FILE_NAME, ExportRecord
+from pcdata.exports.target import Target
 from tests.exports import test_dp3
 from tests.exports.samples import Samples, cloud, frame, shape
 
@@ -29,16 +29,51 @@ def dp3(folder: Path, **options: object) -> Path:
 @pytest.mark.parametrize("options", [{}, {"colors": False}, {"frame": "base"}, {"compression": "none"}])
 def test_an_export_for_dp3_needs_no_keys(capsys, tmp_path, options):
     folder = dp3(tmp_path / "out.zarr", **options)
-    frame = [] if "frame" in options else ["--frame", "base"]
-    assert main(["check", str(folder), "--model", "dp3_sim", *frame]) == 0
+    assert main(["check", str(folder), "--model", "dp3_sim"]) == 0
     assert "PASS: of 5 captures 5 pass" in capsys.readouterr().out
-    assert main(["check", str(folder), "--model", "dp3_sim", *frame, "--limit", "2"]) == 0
+    assert main(["check", str(folder), "--model", "dp3_sim", "--limit", "2"]) == 0
     assert "of 2 captures" in capsys.readouterr().out
     # The same by keys; for a model of other counts it is as wrong as it is.
     keys = ["--keys", "points=data/point_cloud", "--frame", "base", "--unit", "m"]
     keys += [] if options.get("colors", True) else ["--set", "channels=xyz"]
     assert main(["check", str(folder), "--model", "dp3_sim", *keys]) == 0
     assert main(["check", str(folder), "--model", "graspnet_baseline"]) == 1
+
+
+def test_the_record_knows_the_frame_and_no_argument_changes_it(capsys, tmp_path):
+    folder = dp3(tmp_path / "out.zarr")
+    assert ExportRecord.read(folder).coordinates == [["base", "m"]]
+    assert main(["check", str(folder), "--model", "dp3_sim", "--frame", "world"]) == 1
+    assert "the data are in 'base', the model works in 'world'" in capsys.readouterr().out
+    mixed = Samples({"a": cloud(1100), "b": replace(cloud(1100), frame_id="table")})
+    export_dataset(mixed, "pointcept", tmp_path / "mixed")
+    checks = check_export(tmp_path / "mixed", "pointcept").checks.items()
+    assert [one.worst.verdict.value for (rule, _), one in checks if rule == "frame"] == ["unknown"]
+    assert check_export(tmp_path / "mixed", "pointcept", frame_id="base", frame="base").verdict.value == "pass"
+
+
+def test_a_continued_export_knows_the_frames_of_what_it_kept(tmp_path):
+    broken = Samples({"a": cloud(1100), "b": cloud(1100, frame_id="table"), "c": cloud(0)})
+    with pytest.raises(TooFewPointsError):
+        export_dataset(broken, "pointcept", tmp_path / "out", resume=True)
+    whole = Samples({**broken.samples, "c": cloud(1100)})
+    assert export_dataset(whole, "pointcept", tmp_path / "out", resume=True).kept == 2
+    assert ExportRecord.read(tmp_path / "out").coordinates == [["base", "m"], ["table", "m"]]
+
+
+def test_arrays_that_somebody_turned_or_renamed_are_found(tmp_path):
+    source = Samples({name: shape(seed=number) for number, name in enumerate(TABLE)})
+    export_dataset(source, "pointnet", tmp_path / "out", table=TABLE)
+    with h5py.File(tmp_path / "out" / "ply_data_test0.h5", "a") as file:
+        turned = file["data"][...].transpose(0, 2, 1)
+        del file["data"]
+        file["data"] = turned
+    summary = check_export(tmp_path / "out", "pointnet_cls")
+    assert {rule for (rule, _), entry in summary.checks.items() if entry.worst.verdict.value == "fail"} >= {"layout"}
+    with h5py.File(tmp_path / "out" / "ply_data_test0.h5", "a") as file:
+        file.move("data", "points")
+    with pytest.raises(PcdataError, match=r"no array 'data'.*points"):
+        check_export(tmp_path / "out", "pointnet_cls")
 
 
 def test_a_stated_number_of_points_is_that_of_the_export(tmp_path):
@@ -91,7 +126,7 @@ def test_what_is_said_of_every_sample_is_said_once(capsys, tmp_path):
     folder = dp3(tmp_path / "out")
     assert main(["check", str(folder), "--model", "m2t2"]) == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("FAIL ", "UNKNOWN "))]
-    assert [line.split()[1] for line in lines] == ["layout", "frame", "count", "channels", "range"]
+    assert [line.split()[1] for line in lines] == ["layout", "count", "channels", "range"]
     assert all("(0, 1, 2, 3, 4)" in line for line in lines)
 
 
@@ -111,7 +146,7 @@ def test_exports_of_files_for_every_sample_are_judged_as_they_were_exported(caps
         (folder / broken).write_bytes(b"nothing")
         with pytest.raises(CacheError, match=f"{broken}: "):
             check_export(folder, model)
-    with pytest.raises(ConfigError, match="holds no clouds"):
+    with pytest.raises(ConfigError, match="holds no samples"):
         check_export(tmp_path / "modelnet" / "shape_names.txt", "pointnet2_cls")
 
 
@@ -123,19 +158,17 @@ def test_a_pointcept_scene_without_colors_is_judged_by_what_it_has(tmp_path):
     assert check_export(tmp_path / "out", "pointcept", frame="base").verdict.value == "fail"
 
 
-def test_an_export_without_clouds_that_check_reads_says_so(tmp_path):
+def test_an_export_that_check_does_not_read_says_so(tmp_path, monkeypatch):
     export_dataset(Samples({"a": frame()}), "contact_graspnet", tmp_path / "out")
+    monkeypatch.setattr(TARGETS["contact_graspnet"], "cloud_fields", Target.cloud_fields)
     with pytest.raises(ConfigError, match=r"writes one npz per capture.* passed the rules of contact_graspnet_api"):
         check_export(tmp_path / "out", "contact_graspnet_api")
-    readable = {name for name, target in TARGETS.items() if target.cloud_arrays(tmp_path, {})}
-    assert readable == {target.name for target in REPLAY_BUFFERS}, (
-        "pointnet and pointnet_part have files, which are not here"
-    )
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"coordinates": [["base"]]}, "coordinates must list frames with their units"),
         ({"complete": False}, "unfinished export"),
         ({"target": "nothing"}, "no target 'nothing'"),
         ({"schema": 3}, "sch"),

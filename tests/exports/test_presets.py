@@ -16,11 +16,12 @@ from pcdata.build.model_section import stored_preset
 from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset, CloudDataset
 from pcdata.errors import CacheError, CaptureError, ConfigError
-from pcdata.exports import TARGETS, export_dataset, targets_of
+from pcdata.exports import TARGETS, check_export, export_dataset, targets_of
 from pcdata.exports.export_record import FILE_NAME
 from pcdata.models import CONTRACTS, Preset, preset
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import RandomSample
+from pcdata.verdicts import Verdict
 from tests.exports.samples import Samples, cloud, tree
 from tests.exports.scenes import Episodes
 from tests.exports.test_dp3 import replay_buffer
@@ -60,6 +61,9 @@ def test_what_a_preset_makes_of_captures_is_exported_and_its_own_check_takes_it(
     draws = json.loads((tmp_path / "out" / FILE_NAME).read_text())["draws"]
     assert bool(draws) == random
     assert any("seed 0, epoch 0" in note for note in report.notes) == random
+    summary = check_export(tmp_path / "out", model)
+    told = [entry.worst for entry in summary.checks.values()]
+    assert [one for one in told if one.verdict in (Verdict.FAIL, Verdict.UNKNOWN)] == []
 
 
 def test_every_model_is_exported_or_has_no_target():

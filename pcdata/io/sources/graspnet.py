@@ -86,7 +86,7 @@ class _GraspNetSource(Source):
 
     def _load(self, sample_id: str) -> DepthFrame:
         files = self.files(sample_id)
-        meta = _read_meta(files["meta"])
+        meta = read_meta(files["meta"])
         depth = read_depth(files["depth"], metres_per_unit=meta["metres_per_unit"])
         (fx, _, cx), (_, fy, cy), _ = meta.pop("intrinsic_matrix").tolist()
         return make_frame(
@@ -126,7 +126,7 @@ def _known_files(folder: Path) -> dict[str, Path]:
     return {role: folder / name for role, name in (_REQUIRED | _OPTIONAL).items() if has_file(folder / name)}
 
 
-def _read_meta(path: Path) -> dict[str, Any]:
+def read_meta(path: Path) -> dict[str, Any]:
     """Return intrinsics, unit, object ids and object poses of a MATLAB 5 file; the last two are optional."""
     where = str(path)
     names = ["intrinsic_matrix", "factor_depth", "cls_indexes", "poses"]
