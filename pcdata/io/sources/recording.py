@@ -23,9 +23,9 @@ from pcdata.files.sample_names import name_some
 from pcdata.functional.depth.stored_depth import check_plausible, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
-from pcdata.io.sources.nearest_in_time import nearest
 from pcdata.io.sources.option_checks import check_seconds, check_switch
 from pcdata.io.sources.source import Source
+from pcdata.io.sources.synchronized import nearest
 from pcdata.structures import Camera, DepthFrame, register_to_color
 
 READ_COLOR = "registered=True (--registered) reads it"  # what to do about a color stream that is not read

@@ -18,9 +18,9 @@ from pcdata.io.calibration.foreign_cameras import matrix_of, numbers_of, read_fo
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, files_by_id
 from pcdata.io.sources.listing import LinkTargets, has_folder, is_file, is_folder, link_targets, visible_files
-from pcdata.io.sources.nearest_in_time import nearest
 from pcdata.io.sources.option_checks import check_seconds
 from pcdata.io.sources.registry import register_layout
+from pcdata.io.sources.synchronized import nearest
 
 _NAME = r"(?P<id>[0-9]+-[0-9]+)\.(png|jpg|jpeg)"
 _MAX_BYTES = 1 << 27

@@ -20,9 +20,9 @@ from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.folder_roles import is_within
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, stated_intrinsics
 from pcdata.io.sources.listing import LinkTargets, has_file, is_file, link_targets
-from pcdata.io.sources.nearest_in_time import Trajectory, nearest
 from pcdata.io.sources.option_checks import check_seconds
 from pcdata.io.sources.registry import register_layout
+from pcdata.io.sources.synchronized import Trajectory, nearest
 from pcdata.io.sources.timestamps import LONGEST
 
 _LISTS = {"depth": "depth.txt", "color": "rgb.txt"}

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pcdata import Deproject, ToFrame, open_source, validate_source
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, UnitError
-from pcdata.io.sources.nearest_in_time import Trajectory, nearest
+from pcdata.io.sources.synchronized import Trajectory, nearest
 from pcdata.verdicts import Verdict
 from tests import published_captures as made
 from tests.published_captures import COLOR_FROM_DEPTH, FAR, INTRINSICS, NEAR, depth_mm, turned
