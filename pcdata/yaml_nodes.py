@@ -64,6 +64,21 @@ _Loader.add_implicit_resolver(
 )
 
 
+def parse_yaml(text: str) -> Any:
+    """Return the plain data of a YAML text of any origin.
+
+    Raises:
+        ValueError: no YAML, or more than any file of plain facts needs: aliases, tags, deep nesting, many values.
+    """
+    loader = _Loader(text)
+    try:
+        return loader.get_single_data()
+    except (yaml.YAMLError, RecursionError, AttributeError, TypeError, OverflowError) as error:
+        raise ValueError(str(error)[:300]) from error
+    finally:
+        loader.dispose()
+
+
 class _Dumper(yaml.SafeDumper):
     """Writes a value used twice out twice: aliases are refused when read."""
 

@@ -115,12 +115,21 @@ def bag_capture(root: Path) -> Path:
     return written(root / "a.bag", recording())
 
 
+def ros_capture(root: Path) -> Path:
+    pytest.importorskip("rosbags")
+    from tests.ros_recordings import Types, recording, written
+
+    make = Types(2)
+    return written(root / "a.mcap", recording(make), make)
+
+
 CAPTURES: dict[str, Callable[[Path], Path]] = {  # by layout; a test holds the table to the registry
     "folder": folder_capture,
     "rig": rig_capture,
     "graspnet": graspnet_capture,
     "seven_scenes": seven_scenes_capture,
     "realsense_bag": bag_capture,
+    "ros": ros_capture,
     "clouds": cloud_files,
     **published_captures.CAPTURES,
     **simulated_captures.CAPTURES,

@@ -15,7 +15,7 @@ MODULES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py"
 # Methods and functions that open a path for reading, whatever they are called on.
 OPENS = {
     "open", "read_bytes", "read_text", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "open_memmap", "loadmat",
-    "imread", "File", "ZipFile", "Reader",
+    "imread", "File", "ZipFile", "Reader", "connect",
 }  # fmt: skip
 # What looks like it and is none: the call, and why.
 ALLOWED = {
@@ -28,7 +28,7 @@ ALLOWED = {
     "io/images/writing.py": {"Image.open": "of bytes that it has made"},
     "io/images/exr.py": {"library.File": "after the door, when its structure was checked"},
     "io/sources/matroska.py": {"av.open": "of a stream that the door has opened"},
-    "io/sources/rosbag.py": {"rosbag1.Reader": "after open_input"},
+    "io/messages/sqlite_file.py": {"sqlite3.connect": "after the door, to read alone"},
     "io/arrays/hdf5_arrays.py": {"h5py.File": "after the door", "h5o.open": "within a file that is open"},
     "io/store/hdf5_store.py": {"h5py.File": "to write"},
     "files/inputs.py": {"open": "what the door has opened, once more: has it changed?"},

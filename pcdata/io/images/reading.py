@@ -212,7 +212,15 @@ def _decode(where: str, path: Path, formats: tuple[str, ...]) -> tuple[str, NDAr
 
     Pillow gets a file whose structure was checked first: it shows what it can of a damaged one.
     """
-    data = read_bytes(where, path, max_bytes=_MAX_BYTES)
+    return decoded_image(where, read_bytes(where, path, max_bytes=_MAX_BYTES), formats)
+
+
+def decoded_image(where: str, data: bytes, formats: tuple[str, ...]) -> tuple[str, NDArray[Any], tuple[int, int]]:
+    """Return what :func:`_decode` does of the content of a file, of one of some formats: "PNG", "TIFF", "JPEG".
+
+    Raises:
+        CaptureError: it is damaged, or of another format.
+    """
     try:
         # Pillow opens 16-bit color as 8-bit without a word, so the depth is read from the header.
         depth = (0, 0)

@@ -12,7 +12,7 @@ from pcdata.io.sources.source import Source
 
 # Signs that other layouts may have too, where they have more: a recording that lies beside a capture is not the
 # capture, and any folder may have an image with the word depth in its name.
-_LESS_EXACT = ("realsense_bag", "azure_kinect", "pairs")
+_LESS_EXACT = ("realsense_bag", "azure_kinect", "ros", "pairs")
 
 
 def detect_layout(path: Path) -> type[Source]:

@@ -18,6 +18,7 @@ from pcdata.io.sources import (  # noqa: F401
     maniskill,
     pairs,
     realsense_bag,
+    ros,
     azure_kinect,
     cloud_files,
     averaged,

@@ -7,7 +7,10 @@ option of the depth sensor. The transform of the color stream is taken as color 
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,16 +20,49 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
+from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError, add_note
+from pcdata.extras import require
 from pcdata.geometry import rigid
-from pcdata.io.sources.bag_index import MAGIC
+from pcdata.io.messages.bag_file import BagFile, bag_topics
+from pcdata.io.messages.cameras import lens_of
+from pcdata.io.messages.decoding import decoded
+from pcdata.io.messages.images import color_pixels, depth_numbers
+from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.sources.recording import READ_COLOR, Recorded, RecordingSource, Taken
 from pcdata.io.sources.registry import register_layout
-from pcdata.io.sources.rosbag import Bag, depth_units, opened_bag, rgb_pixels
 from pcdata.structures import Camera
 
 _DATA = re.compile(r".*/(?P<kind>[^/]+?)(_\d+)?/(image|imu|points|pose|transform)/data")
 _IMAGES = re.compile(r"(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>Depth|Color)_\d+/image/data")
+_DEVICE = re.compile(r"/device_\d+/")
+
+
+def is_realsense(path: Path) -> bool:
+    """Say whether a file is the recording of a RealSense's viewer or SDK: its topics are called as no robot's are."""
+    return _RealSenseBagSource._is_recording(path)
+
+
+class _Bag:
+    """The messages of a bag; times are nanoseconds on the recorder's clock."""
+
+    def __init__(self, log: MessageLog) -> None:
+        self.log = log
+
+    @property
+    def topics(self) -> list[str]:
+        """The names of all topics, sorted."""
+        return list(self.log.topics)
+
+    def times(self, topic: str) -> list[int]:
+        """Return when each message of a topic was recorded, in order."""
+        return self.log.topics[topic].times.tolist() if topic in self.log.topics else []
+
+    def message(self, topic: str, number: int = 0) -> Any:
+        """Return one message of a topic, counted in the order of time."""
+        if topic not in self.log.topics:
+            raise CaptureError(f"topic {topic} has 0 messages, there is no number {number}")
+        with self.log.opened() as read:
+            return decoded(self.log.topics[topic], read(self.log.topics[topic], number))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,34 +84,50 @@ class _RealSenseBagSource(RecordingSource):
 
     @classmethod
     def _begins_so(cls, stream: BinaryIO) -> bool:
-        return stream.read(len(MAGIC)) == MAGIC
+        topics = bag_topics(stream, os.fstat(stream.fileno()).st_size)
+        return any(_DEVICE.match(topic) for topic in topics)
 
     def _open(self, where: str, path: Path, registered: bool) -> Recorded:
+        require("rosbags")
         if not self._is_recording(path):
-            raise CaptureError(f"{where}: is no ROS 1 bag; this layout needs {self.needs}")
-        with opened_bag(where, path) as bag:
+            raise CaptureError(f"{where}: is no bag of a RealSense; this layout needs {self.needs}")
+        with _said_of(where):
+            bag = _Bag(MessageLog([BagFile(path)]))
             self._depth = _one_stream(bag, "Depth")
             self._color = _one_stream(bag, "Color") if registered else None
             sensor = self._depth.topic.rsplit("/", 3)[0]
+            read = [stream.topic for stream in (self._depth, self._color) if stream]
+            self._bag = _Bag(bag.log.only(read))
             return Recorded(
                 depth_times=bag.times(self._depth.topic),
                 color_times=bag.times(self._color.topic) if self._color else [],
                 metres_per_unit=_unit(where, bag, sensor),
                 sensor=_device(bag, sensor.rsplit("/", 1)[0]),
-                unread=_unread(bag, {stream.topic for stream in (self._depth, self._color) if stream}),
+                unread=[*bag.log.damage, *_unread(bag, set(read))],
             )
 
     def _take(self, depth: int, color: int | None) -> Taken:
         colors = None
-        with opened_bag(str(self), self.path) as bag:
-            units = depth_units(bag.message(self._depth.topic, depth))
+        with _said_of(str(self)):
+            units = depth_numbers(self._bag.message(self._depth.topic, depth))
+            if units.dtype != np.uint16:
+                raise CaptureError("depth must be encoded as 16UC1 or mono16, not 32FC1")
             if self._color is not None and color is not None:
                 color_from_depth = self._color.pose @ rigid.invert_rigid(self._depth.pose)
-                colors = rgb_pixels(bag.message(self._color.topic, color)), self._color.camera, color_from_depth
+                colors = color_pixels(self._bag.message(self._color.topic, color)), self._color.camera, color_from_depth
         return Taken(units, self._depth.camera, colors)
 
 
-def _unread(bag: Bag, read: set[str]) -> list[str]:
+@contextmanager
+def _said_of(where: str) -> Iterator[None]:
+    try:
+        yield
+    except PcdataError as error:
+        add_note(error, f"while reading {where}")
+        raise
+
+
+def _unread(bag: _Bag, read: set[str]) -> list[str]:
     """Say which streams a recording has besides those that are read; settings and infos of streams are not told."""
     told = []
     for topic in bag.topics:
@@ -87,7 +139,7 @@ def _unread(bag: Bag, read: set[str]) -> list[str]:
     return told
 
 
-def _one_stream(bag: Bag, kind: str) -> _Stream:
+def _one_stream(bag: _Bag, kind: str) -> _Stream:
     found = [topic for topic in bag.topics if (match := _IMAGES.fullmatch(topic)) and match["kind"] == kind]
     if len(found) != 1:
         some = ", ".join(found or bag.topics[:8]) or "none"
@@ -105,21 +157,16 @@ def _one_stream(bag: Bag, kind: str) -> _Stream:
 
 def _camera(kind: str, info: Any) -> Camera:
     fx, skew, cx, _, fy, cy, *_ = (float(value) for value in info.K)
-    lens = [float(value) for value in info.D]
-    if skew != 0 or (any(lens) and info.distortion_model != "Brown Conrady"):
-        raise IntrinsicsError(
-            f"the {kind} camera has skew {skew} and the lens model {info.distortion_model!r} {lens}, which is not "
-            "OpenCV's; undistort the recording first"
-        )
+    lens = lens_of(f"the {kind} camera", str(info.distortion_model), info.D)
+    if skew != 0:
+        raise IntrinsicsError(f"the {kind} camera has skew {skew}; undistort the recording first")
     try:
-        return Camera.pinhole(
-            fx=fx, fy=fy, cx=cx, cy=cy, size=(int(info.height), int(info.width)), distortion=lens if any(lens) else None
-        )
+        return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=(int(info.height), int(info.width)), distortion=lens)
     except PcdataError as error:
         raise IntrinsicsError(f"the {kind} camera: {error}") from error
 
 
-def _unit(where: str, bag: Bag, sensor: str) -> float:
+def _unit(where: str, bag: _Bag, sensor: str) -> float:
     topic = f"{sensor}/option/Depth Units/value"
     if topic not in bag.topics:
         raise UnitError(f"{where}: the recording does not state its depth unit; there is no topic {topic}")
@@ -127,7 +174,7 @@ def _unit(where: str, bag: Bag, sensor: str) -> float:
     return check_metres_per_unit(where, float(str(stored)))  # 0.001 is stored as the float32 nearest to it
 
 
-def _device(bag: Bag, device: str) -> dict[str, str]:
+def _device(bag: _Bag, device: str) -> dict[str, str]:
     """Return name and serial number where they are stated."""
     topic = f"{device}/info"
     facts = [bag.message(topic, number) for number in range(len(bag.times(topic)))]

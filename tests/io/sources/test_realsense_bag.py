@@ -134,14 +134,26 @@ def test_images_that_cannot_be_right_are_refused(tmp_path):
     huge = image(units, "mono16")
     huge.height = huge.width = 1 << 20
     bad = {"coded": image(units.view(np.uint8), "8UC1"), "short": short, "huge": huge}
-    words = {"coded": "mono16 or 16UC1, not '8UC1'", "short": "it is damaged", "huge": "an image must have 1 .. "}
+    words = {
+        "coded": "16UC1, mono16 or 32FC1, not '8UC1'",
+        "short": "it is damaged",
+        "huge": "an image must have 1 .. ",
+    }
     for name, message in bad.items():
         source = open_source(written(tmp_path / f"{name}.bag", with_other(f"{DEPTH}/image/data", message)))
         with pytest.raises(CaptureError, match=words[name]):
             source.load("000000")
 
 
-@pytest.mark.parametrize("keep", [13, 200, 5000, -100])
+def test_a_bag_without_its_index_is_read_through_and_says_so(tmp_path):
+    whole = written(tmp_path / "a.bag", recording())
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    assert all(torch.equal(one.depth, other.depth) for one, other in zip(load_all(cut), load_all(whole), strict=True))
+    assert open_source(cut).unread()[0].startswith("cut.bag: its index cannot be read")
+
+
+@pytest.mark.parametrize("keep", [13, 200, 5000])
 def test_a_bag_that_ends_early_is_a_capture_error(tmp_path, keep):
     whole = written(tmp_path / "a.bag", recording()).read_bytes()
     (tmp_path / "cut.bag").write_bytes(whole[:keep])

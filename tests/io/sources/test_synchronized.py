@@ -10,7 +10,7 @@ from pcdata.errors import CaptureError, ConfigError
 from pcdata.geometry import rigid
 from pcdata.io.sources.synchronized import RULES, Trajectory, joined, mixed, nearest, slerp
 
-EPOCH = 1_700_000_000_000_000_000  # ns: neighbours here are 256 apart as float64
+EPOCH = 1_700_000_000_000_000_000  # ns: neighbors here are 256 apart as float64
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -1,0 +1,1 @@
+"""Messages of robots' recordings: the files they lie in, and what they mean."""

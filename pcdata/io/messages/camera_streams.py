@@ -1,0 +1,353 @@
+"""The cameras of a recording: which topics hold depth, what describes them, and which color belongs to which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pcdata.contracts.lengths import check_metres_per_unit
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note, near_matches
+from pcdata.io.messages.cameras import camera_of
+from pcdata.io.messages.clock import Clock, on_clock
+from pcdata.io.messages.decoding import decoded, is_known, plain_type
+from pcdata.io.messages.images import ImageForm, form_of
+from pcdata.io.messages.log_file import Topic
+from pcdata.io.messages.message_log import MessageLog
+from pcdata.io.messages.statement import Statement
+from pcdata.io.messages.transforms import plain_frame
+from pcdata.structures import Camera
+
+_IMAGES = (
+    "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"
+)  # fmt: skip
+_INFOS = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+_TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
+RECORDED = "stated in the recording"
+_REP_118 = "REP 118: 16-bit depth is in millimetres"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTopic:
+    """A topic of images, and what its first message shows."""
+
+    topic: Topic
+    form: ImageForm
+    frame: str
+
+    @property
+    def base(self) -> str:
+        """The name without what only says how images are packed."""
+        start, _, end = self.topic.name.rpartition("/")
+        return start if end in _TRANSPORTS and start else self.topic.name
+
+
+@dataclass(frozen=True, eq=False)
+class CameraStream:
+    """One depth camera: its images on the clock, how they are measured, and its color.
+
+    Args:
+        name: of the camera.
+        images: the depth images.
+        unit: metres of one stored number.
+        unit_source: who says so.
+        camera: of every depth image; None = ``infos`` describe each.
+        infos: what describes the images, where it changes.
+        color: images of the same pixels, or of another camera that depth is to be registered to.
+        color_camera: of the color images; None = of the same pixels as the depth.
+    """
+
+    name: str
+    images: ImageTopic
+    unit: float
+    unit_source: str
+    camera: Camera | None
+    infos: Topic | None
+    rectified: bool
+    color: ImageTopic | None
+    color_camera: Camera | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """What is said of the topics: names of depth, of color, of what describes them."""
+
+    depth: Sequence[str] = ()
+    color: Sequence[str] | None = None  # () = none is wanted
+    camera_info: Mapping[str, str] | None = None
+    registered: bool = False
+    metres_per_unit: float | None = None
+    intrinsics: tuple[float, float, float, float] | None = None
+    clock: Clock = "header"
+
+
+def image_topics(log: MessageLog) -> dict[str, ImageTopic]:
+    """Return the topics of images by name, each with what its first message shows; damaged ones are left out."""
+    found = {}
+    with log.opened() as read:
+        for topic in log.topics.values():
+            if plain_type(topic.type) in _IMAGES and len(topic) and is_known(topic):
+                try:
+                    message = decoded(topic, read(topic, 0))
+                    form = form_of(message, topic.name)
+                except CaptureError:
+                    continue
+                found[topic.name] = ImageTopic(topic, form, plain_frame(message.header.frame_id))
+    return found
+
+
+def topics_in_words(log: MessageLog, kinds: Sequence[str] | None = None) -> str:
+    """Return the topics with type, number of messages and rate, one to a line."""
+    shown = [one for one in log.topics.values() if kinds is None or plain_type(one.type) in kinds]
+    return "".join(f"\n  {told(one)}" for one in shown) or " none"
+
+
+def told(topic: Topic) -> str:
+    """Return what a topic is in a few words."""
+    rate = f", {topic.rate():.3g} Hz" if topic.rate() else ""
+    return f"{topic.name} ({topic.type}, {len(topic)} message{'s' * (len(topic) != 1)}{rate})"
+
+
+def chosen_cameras(where: str, log: MessageLog, said: Statement, choice: Choice) -> list[CameraStream]:
+    """Return the depth cameras that are named, else all that the recording states, else the only one there is.
+
+    Raises:
+        CaptureError: there is none, or one of several would have to be guessed.
+        ConfigError: no topic is called so.
+        UnitError, IntrinsicsError: what an image needs is stated nowhere.
+    """
+    images = image_topics(log)
+    depths = _depths(where, log, images, said, choice.depth)
+    if choice.intrinsics is not None and len(depths) > 1:
+        raise ConfigError(f"{where}: intrinsics are of one camera, and {len(depths)} are read")
+    found = []
+    for number, (name, image) in enumerate(depths):
+        try:
+            found.append(_stream(where, log, images, said, choice, name, image, number))
+        except PcdataError as error:
+            add_note(error, f"camera {name!r}: depth topic {image.topic.name}")
+            raise
+    return found
+
+
+def _depths(
+    where: str, log: MessageLog, images: Mapping[str, ImageTopic], said: Statement, named: Sequence[str]
+) -> list[tuple[str, ImageTopic]]:
+    if named:
+        return [(_camera_name(name, named), _named_image(where, log, images, name)) for name in named]
+    depths = [image for image in images.values() if image.form.role == "depth"]
+    if said.cameras:
+        found = []
+        for camera in said.cameras:
+            fitting = _preferred([image for image in depths if image.base.startswith(f"/{camera}/")])
+            if len(fitting) != 1:
+                raise CaptureError(
+                    f"{where}: it states a camera {camera!r:.100}, but {len(fitting)} topics of depth begin with "
+                    f"/{camera:.100}/"
+                )
+            found.append((camera, fitting[0]))
+        return found
+    fitting = _preferred(depths)
+    if len(fitting) == 1:
+        return [(_camera_name(fitting[0].topic.name, ()), fitting[0])]
+    how = "depth=TOPIC (--option depth=TOPIC), or a list of topics for views of one frame"
+    if fitting:
+        raise CaptureError(
+            f"{where}: holds {len(fitting)} topics of depth; say which by {how}:"
+            + "".join(f"\n  {told(one.topic)}" for one in fitting)
+        )
+    raise CaptureError(
+        f"{where}: no topic holds depth images (16UC1, 32FC1, compressedDepth) that say so; name one by {how}. "
+        f"Topics:{topics_in_words(log)}"
+    )
+
+
+def _preferred(images: Sequence[ImageTopic]) -> list[ImageTopic]:
+    """Return one for each image that is there both raw and packed: the raw one, which nothing was taken from."""
+    best: dict[str, ImageTopic] = {}
+    for image in sorted(images, key=lambda one: (one.topic.name != one.base, one.topic.name)):
+        best.setdefault(image.base, image)
+    return list(best.values())
+
+
+def _named_image(where: str, log: MessageLog, images: Mapping[str, ImageTopic], name: str) -> ImageTopic:
+    if name in images:
+        return images[name]
+    if name in log.topics:
+        topic = log.topics[name]
+        why = "has no messages" if not len(topic) else "is none of images, or its first message is damaged"
+        raise CaptureError(f"{where}: topic {told(topic)} {why}")
+    raise ConfigError(
+        f"{where}: there is no topic {name!r:.200}{near_matches(name, log.topics)}; topics of images:"
+        f"{topics_in_words(log, _IMAGES)}"
+    )
+
+
+def _camera_name(name: str, all_names: Sequence[str]) -> str:
+    """Return what a depth topic's camera is called: what its name begins with, before what is said of the image."""
+    words = [word for word in name.split("/") if word]
+    start = next((place for place, word in enumerate(words) if "depth" in word.lower()), 1)
+    short = "/".join(words[:start]) or words[0]
+    others = [other for other in all_names if other != name]
+    return name.strip("/") if any(other.strip("/").startswith(f"{short}/") for other in others) else short
+
+
+def _stream(
+    where: str,
+    log: MessageLog,
+    images: Mapping[str, ImageTopic],
+    said: Statement,
+    choice: Choice,
+    name: str,
+    image: ImageTopic,
+    number: int,
+) -> CameraStream:
+    unit, unit_source = _unit(where, image, said.cameras.get(name, {}), choice.metres_per_unit)
+    camera, infos, rectified = _described(where, log, choice, image, choice.intrinsics)
+    color = _color(where, log, images, choice, image, number)
+    color_camera = None
+    if color is not None and not _same_pixels(color, image):
+        if not choice.registered:
+            raise CaptureError(
+                f"{where}: the images of {color.topic.name} ({_pixels(color)}, frame {color.frame!r}) are of other "
+                f"pixels than the depth ({_pixels(image)}, frame {image.frame!r}); registered=True (--registered) "
+                "registers the depth to them"
+            )
+        color_camera, color_infos, _ = _described(where, log, choice, color, None)
+        if color_camera is None:
+            assert color_infos is not None
+            raise IntrinsicsError(
+                f"{where}: the color camera of {color_infos.name} changes; it cannot be registered to"
+            )
+        color = _clocked(log, color, choice.clock)
+    elif color is not None:
+        color = _clocked(log, color, choice.clock)
+    return CameraStream(
+        name, _clocked(log, image, choice.clock), unit, unit_source, camera, infos, rectified, color, color_camera
+    )
+
+
+def _clocked(log: MessageLog, image: ImageTopic, clock: Clock) -> ImageTopic:
+    return ImageTopic(on_clock(log, image.topic, clock), image.form, image.frame)
+
+
+def _pixels(image: ImageTopic) -> str:
+    return f"{image.form.size[1]}x{image.form.size[0]}"
+
+
+def _same_pixels(one: ImageTopic, other: ImageTopic) -> bool:
+    return one.form.size == other.form.size and one.frame == other.frame
+
+
+def _unit(where: str, image: ImageTopic, said: Mapping[str, Any], given: float | None) -> tuple[float, str]:
+    stated = said.get("metres_per_unit")
+    if given is not None:
+        return check_metres_per_unit(where, given), "stated by metres_per_unit"
+    if stated is not None:
+        return check_metres_per_unit(f"{where}: topic /pcdata", stated), RECORDED
+    if image.form.encoding == "32FC1":
+        return 1.0, "REP 118: depth of floats is in metres"
+    if image.form.encoding == "16UC1":
+        return 0.001, _REP_118
+    raise UnitError(
+        f"{where}: images of {image.topic.name} are encoded as {image.form.encoding!r}, which says nothing of a unit "
+        "(16UC1 would be millimetres); say metres_per_unit=0.001 (--metres-per-unit) if they are millimetres"
+    )
+
+
+# -- what describes the images -----------------------------------------------------------------------------------------
+
+
+def _described(
+    where: str,
+    log: MessageLog,
+    choice: Choice,
+    image: ImageTopic,
+    intrinsics: tuple[float, float, float, float] | None,
+) -> tuple[Camera | None, Topic | None, bool]:
+    """Return the camera of all images, or the topic that describes each, and whether its projection is theirs."""
+    size = image.form.size
+    if intrinsics is not None:
+        fx, fy, cx, cy = intrinsics
+        return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=size), None, False
+    topic = on_clock(log, _info_topic(where, log, choice, image), choice.clock)
+    told_by = f"{where}: {topic.name}"
+    with log.opened() as read:
+        first, last = (decoded(topic, read(topic, place)) for place in (0, len(topic) - 1))
+    rectified = "rect" in image.base.rpartition("/")[2] and any(first.d if hasattr(first, "d") else first.D)
+    camera = camera_of(told_by, first, size, rectified=rectified)
+    if camera.to_dict() == camera_of(told_by, last, size, rectified=rectified).to_dict():
+        return camera, None, rectified
+    return None, topic, rectified
+
+
+def _info_topic(where: str, log: MessageLog, choice: Choice, image: ImageTopic) -> Topic:
+    infos = {name: one for name, one in log.topics.items() if plain_type(one.type) in _INFOS and len(one)}
+    named = (choice.camera_info or {}).get(image.topic.name)
+    if named is not None:
+        if named not in infos:
+            raise ConfigError(f"{where}: camera_info {named!r:.200} is no topic of them; it has {', '.join(infos)}")
+        return infos[named]
+    beside = [
+        f"{image.base.rpartition('/')[0]}/{word}" for word in ("camera_info", "calibration", "camera_calibration")
+    ]
+    for name in beside:
+        if name in infos:
+            return infos[name]
+    fitting = [one for one in infos.values() if _frame_of(log, one) == image.frame and image.frame]
+    if len(fitting) == 1:
+        return fitting[0]
+    have = f"topics that describe cameras: {', '.join(infos)}" if infos else "no topic describes a camera"
+    raise IntrinsicsError(
+        f"{where}: nothing describes the camera of {image.topic.name}: there is no {beside[0]}; {have}. Name it by "
+        f'camera_info={{"{image.topic.name}": TOPIC}}, or say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX '
+        "FY CX CY)"
+    )
+
+
+def _frame_of(log: MessageLog, topic: Topic) -> str:
+    with log.opened() as read:
+        return plain_frame(decoded(topic, read(topic, 0)).header.frame_id)
+
+
+# -- color -------------------------------------------------------------------------------------------------------------
+
+
+def _color(
+    where: str, log: MessageLog, images: Mapping[str, ImageTopic], choice: Choice, depth: ImageTopic, number: int
+) -> ImageTopic | None:
+    if choice.color is not None:
+        if not choice.color:
+            return None
+        if len(choice.color) not in (1, len(choice.depth) or 1):
+            raise ConfigError(f"{where}: color names {len(choice.color)} topics for {len(choice.depth)} of depth")
+        return _named_image(where, log, images, choice.color[number % len(choice.color)])
+    colors = _preferred([image for image in images.values() if image.form.role == "color"])
+    same = [image for image in colors if _same_pixels(image, depth)]
+    fitting = same or (colors if choice.registered else [])
+    if len(fitting) > 1:
+        fitting = _beside(fitting, depth)
+    if len(fitting) == 1:
+        return fitting[0]
+    if choice.registered or same:
+        raise CaptureError(
+            f"{where}: {len(fitting)} topics of color may belong to {depth.topic.name}; say which by color=TOPIC "
+            "(--option color=TOPIC), or color=[] for none:" + "".join(f"\n  {told(one.topic)}" for one in fitting)
+        )
+    return None
+
+
+def _beside(images: Sequence[ImageTopic], depth: ImageTopic) -> list[ImageTopic]:
+    """Return those whose names begin with the most words that the depth's name begins with."""
+
+    def shared(image: ImageTopic) -> int:
+        pairs: Callable[[str], list[str]] = lambda name: name.strip("/").split("/")  # noqa: E731
+        count = 0
+        for one, other in zip(pairs(image.base), pairs(depth.base)):
+            if one != other:
+                break
+            count += 1
+        return count
+
+    most = max(map(shared, images))
+    return [image for image in images if shared(image) == most]

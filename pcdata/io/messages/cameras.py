@@ -1,0 +1,89 @@
+"""The camera that a CameraInfo describes: its lens, and the part of the sensor that the image shows.
+
+Source: sensor_msgs/CameraInfo: matrices are of the whole sensor; a region of interest is cut from it, then binned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pcdata.errors import IntrinsicsError, PcdataError
+from pcdata.geometry.lens import COEFFICIENT_COUNTS
+from pcdata.structures import Camera
+
+# By model: how many coefficients it has, in OpenCV's order.
+_POLYNOMIALS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "Brown Conrady": (4, 5)}
+
+
+def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float] | None:
+    """Return the coefficients of a lens in OpenCV's order; None where nothing is bent.
+
+    Raises:
+        IntrinsicsError: the model is another one than OpenCV's polynomial.
+    """
+    numbers = [float(value) for value in coefficients]
+    if not all(map(math.isfinite, numbers)):
+        raise IntrinsicsError(f"{where} has a lens with coefficients that are not finite: {numbers}")
+    if model in ("equidistant", "kannala_brandt", "fisheye"):
+        raise IntrinsicsError(
+            f"{where} has the fisheye lens {model!r}, which no pinhole camera has; undistort the recording first"
+        )
+    if not any(numbers):
+        return None
+    if model not in _POLYNOMIALS or len(numbers) not in (*_POLYNOMIALS[model], *COEFFICIENT_COUNTS):
+        raise IntrinsicsError(
+            f"{where} has the lens model {model!r:.60} with {len(numbers)} coefficients {numbers}, which is not "
+            "OpenCV's; undistort the recording first"
+        )
+    return numbers
+
+
+def camera_of(where: str, info: Any, size: tuple[int, int], *, rectified: bool = False) -> Camera:
+    """Return the camera of an image.
+
+    Args:
+        where: for messages.
+        info: a CameraInfo, or Foxglove's CameraCalibration.
+        size: of the image, (height, width).
+        rectified: the image is undistorted already, so the projection matrix is of it and no lens.
+
+    Raises:
+        IntrinsicsError: it is not calibrated, of another size, has skew, or a lens that is not OpenCV's.
+    """
+    matrix = [float(value) for value in (info.p if hasattr(info, "p") else info.P)] if rectified else _k(info)
+    k = [matrix[0], matrix[1], matrix[2], *matrix[3 + rectified : 6 + rectified]]  # a projection has four columns
+    fx, skew, cx, below, fy, cy = k
+    if fx == 0 or fy == 0:
+        raise IntrinsicsError(f"{where} states no focal length: the camera was not calibrated; say intrinsics=")
+    lens = None if rectified else lens_of(where, str(info.distortion_model), info.d if hasattr(info, "d") else info.D)
+    if skew != 0 or below != 0:
+        raise IntrinsicsError(f"{where} has skew {skew or below}; undistort the recording first")
+    try:
+        full = (int(info.height), int(info.width))
+        camera = Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=full, distortion=lens)
+        camera = _of_region(camera, info)
+    except PcdataError as error:
+        raise IntrinsicsError(f"{where}: {error}") from error
+    if camera.size != size:
+        raise IntrinsicsError(
+            f"{where} describes an image of {camera.size[1]}x{camera.size[0]} pixels, the image has "
+            f"{size[1]}x{size[0]}; name the right topic by camera_info"
+        )
+    return camera
+
+
+def _k(info: Any) -> list[float]:
+    return [float(value) for value in (info.k if hasattr(info, "k") else info.K)]
+
+
+def _of_region(camera: Camera, info: Any) -> Camera:
+    roi = getattr(info, "roi", None)
+    if roi is not None and roi.width and roi.height:
+        camera = camera.cropped(int(roi.y_offset), int(roi.x_offset), (int(roi.height), int(roi.width)))
+    across, down = (max(1, int(getattr(info, f"binning_{axis}", 0))) for axis in "xy")
+    if (across, down) == (1, 1):
+        return camera
+    # A pixel is the mean of a block, so its center is the block's; a full-sized region is no window of the sensor.
+    return camera.resized((max(1, camera.size[0] // down), max(1, camera.size[1] // across)))

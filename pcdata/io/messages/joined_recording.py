@@ -1,0 +1,397 @@
+"""A recording on the clock of its first depth camera: what belongs to each depth image, and what had to be left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.errors import CaptureError, FrameError, PcdataError, add_note
+from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
+from pcdata.functional.depth.unit_fit import DepthUnit
+from pcdata.io.messages.camera_streams import RECORDED, CameraStream, Choice, chosen_cameras, told
+from pcdata.io.messages.cameras import camera_of
+from pcdata.io.messages.decoding import decoded, plain_type
+from pcdata.io.messages.images import color_pixels, depth_numbers
+from pcdata.io.messages.log_file import Topic
+from pcdata.io.messages.message_log import MessageLog
+from pcdata.io.messages.signal_streams import SignalStream, chosen_signals
+from pcdata.io.messages.statement import TOPIC, Statement, read_statement
+from pcdata.io.messages.transforms import FrameTree, TreeBuilder
+from pcdata.io.sources.joined_views import join_views
+from pcdata.io.sources.synchronized import Joined, joined
+from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
+
+_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
+_STATIC = "tf_static"
+Read = Callable[..., bytes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joining:
+    """How streams are joined.
+
+    Args:
+        frame_id: where poses lead to; None = that of the recording's own statement, or none.
+        poses: names of signals, and the frames of tf whose poses they are.
+        signals: what is said of streams by their names.
+        max_time_apart: seconds between images.
+        max_gap: seconds to the farther of two messages that are interpolated.
+    """
+
+    frame_id: str | None
+    poses: Mapping[str, str]
+    signals: Mapping[str, Any] | None
+    max_time_apart: float
+    max_gap: float
+
+
+class JoinedRecording:
+    """What of a recording belongs to each image of its first depth camera, counted from 0 in the order of time."""
+
+    def __init__(self, where: str, log: MessageLog, choice: Choice, joining: Joining) -> None:
+        """Find the streams and join them; no image but the first of each topic is read.
+
+        Raises:
+            CaptureError: the recording lacks something, or no depth image has all its partners.
+            ConfigError: something that is not there was asked for.
+            UnitError, IntrinsicsError, FrameError: what an image needs is stated nowhere, or cannot be right.
+        """
+        self._where = self.where = where
+        self.file = log.files[0].path
+        self._joining = joining
+        self.said = _statement(where, log, choice)
+        self.cameras = chosen_cameras(where, log, self.said, choice)
+        self.frame_id = joining.frame_id if joining.frame_id is not None else self.said.frame_id
+        max_gap = joining.max_gap * 1e9
+        self.signals, left = chosen_signals(where, log, self.said, joining.signals, choice.clock, max_gap)
+        self._check_sizes()
+        self.times = self.cameras[0].images.topic.times  # (N,) int64 nanoseconds
+        self._tree = self._frames(log)
+        self.skipped: dict[int, str] = {}
+        self.streams: list[dict[str, Any]] = []
+        self._joins: dict[str, Joined] = {}
+        self._join()
+        self._check_poses()
+        if len(self.skipped) == len(self.times):
+            raise CaptureError(
+                f"{where}: no depth image of {len(self.times)} has all its partners: "
+                f"{next(iter(self.skipped.values()))}; "
+                "allow more by max_time_apart (images) or max_gap (what is interpolated), or leave the stream out"
+            )
+        used = self._used()
+        self.unread = [*log.damage, *left, *self._unread(log, used), *self._counted()]
+        self._log = log.only(sorted(used))
+
+    # -- what belongs together -----------------------------------------------------------------------------------------
+
+    def _check_sizes(self) -> None:
+        sizes = {camera.name: _seen_size(camera) for camera in self.cameras}
+        if len(set(sizes.values())) > 1:
+            named = ", ".join(f"{name} {size[1]}x{size[0]}" for name, size in sizes.items())
+            raise CaptureError(
+                f"{self._where}: views of one frame must have one size, but: {named}; read one camera at a time"
+            )
+
+    def _join(self) -> None:
+        limit = self._joining.max_time_apart * 1e9
+        for number, camera in enumerate(self.cameras):
+            if number:
+                self._add("depth", camera.images.topic, "nearest", limit)
+            else:
+                count = len(self.times)
+                self.streams.append(_stream("depth", camera.images.topic, "clock", {"messages": count}, 0.0))
+            if camera.color is not None:
+                self._add("color", camera.color.topic, "nearest", limit)
+        for signal in self.signals:
+            self._add(f"signal {signal.name}", signal.topic, signal.rule, signal.max_gap)
+
+    def _add(self, role: str, topic: Topic, rule: Any, limit: float) -> None:
+        found = joined(self.times, topic.times, rule, limit)
+        key = f"{role} {topic.name}"
+        self._joins[key] = found
+        reached = found.gap[found.found]
+        largest = float(reached.max()) / 1e9 if len(reached) else 0.0
+        self.streams.append(_stream(role, topic, rule, found.counts(), largest))
+        what = {"depth": "depth image", "color": "color image"}.get(role, "value")
+        within = "" if math.isinf(limit) else f" within {limit / 1e9:g} s"
+        for number in np.flatnonzero(~found.found).tolist():
+            gap = found.gap[number] / 1e9
+            if rule == "step":
+                reason = f"no {what} of {topic.name} at or before it{within}"
+            elif math.isinf(gap):
+                reason = f"no {what} of {topic.name} before and after it"
+            else:
+                which = "nearest" if rule == "nearest" else "farther of the two around it"
+                reason = f"no {what} of {topic.name}{within}, the {which} is {gap:.3g} s off"
+            self.skipped.setdefault(number, reason)
+
+    def partner(self, role: str, topic: Topic, number: int) -> tuple[int, int, float]:
+        """Return which messages of a joined topic belong to a depth image, and the share of the second."""
+        found = self._joins[f"{role} {topic.name}"]
+        return int(found.before[number]), int(found.after[number]), float(found.share[number])
+
+    def _counted(self) -> list[str]:
+        """Say in words what of the joined streams was dropped, doubled or interpolated."""
+        lines = []
+        for stream in self.streams[1:]:
+            parts = [
+                f"{stream[word]} {text}"
+                for word, text in (
+                    ("dropped", "belong to no depth image"),
+                    ("doubled", "serve a second one"),
+                    ("interpolated", "values were interpolated"),
+                    ("missing", "depth images have none"),
+                )
+                if stream[word] and word in ("dropped", "missing")
+            ]
+            if parts:
+                lines.append(
+                    f"{stream['role']} {stream['topic']}: of {stream['messages']} messages " + ", ".join(parts)
+                )
+        return lines
+
+    # -- frames --------------------------------------------------------------------------------------------------------
+
+    def _ways(self) -> list[tuple[str, str]]:
+        """Return the pairs of frames between which poses are needed."""
+        ways = []
+        for camera in self.cameras:
+            if self.frame_id is not None:
+                ways.append((self.frame_id, camera.images.frame))
+            if camera.color_camera is not None and camera.color is not None:
+                ways.append((camera.color.frame, camera.images.frame))
+        ways += [(self.frame_id or "", frame) for frame in self._joining.poses.values()]
+        ways += [
+            (self.frame_id or "", one.frame) for one in self.signals if one.frame not in (None, self.frame_id, "camera")
+        ]
+        return [way for way in ways if way[0] != way[1]]
+
+    def _frames(self, log: MessageLog) -> FrameTree | None:
+        spatial = [one.name for one in self.signals if one.frame not in (None, "camera")]
+        if self.frame_id is None and (spatial or self._joining.poses):
+            name = next(iter(spatial or self._joining.poses))
+            raise FrameError(
+                f"{self._where}: the signal {name!r} is in a frame of its own; say frame_id=FRAME (--option "
+                "frame_id=FRAME), where poses lead to"
+            )
+        ways = self._ways()
+        if not ways:
+            return None
+        builder = TreeBuilder(self._where)
+        topics = [topic for topic in log.topics.values() if plain_type(topic.type) in _TF]
+        with log.opened() as read:
+            for topic in topics:
+                static = topic.name.rpartition("/")[2] == _STATIC
+                for number in range(len(topic)):
+                    builder.add(decoded(topic, read(topic, number)), static=static)
+        return builder.tree().only(ways)
+
+    def _check_poses(self) -> None:
+        """Leave out the depth images of whose time tf tells nothing."""
+        if self._tree is None:
+            return
+        ways, gap = self._ways(), int(self._joining.max_gap * 1e9)
+        for number, time in enumerate(self.times.tolist()):
+            for target, source in ways if number not in self.skipped else ():
+                if why := self._tree.why_none(target, source, time, gap):
+                    self.skipped[number] = why
+                    break
+        self.streams += self._tree.streams(self.times, gap)
+
+    def pose(self, target: str, source: str, time: int) -> Tensor:
+        """Return (4, 4) float64 target_from_source at a time.
+
+        Raises:
+            CaptureError: tf tells none.
+        """
+        if target == source:
+            return torch.eye(4, dtype=torch.float64, device="cpu")
+        assert self._tree is not None
+        return self._tree.pose(target, source, time, int(self._joining.max_gap * 1e9))
+
+    # -- what is read --------------------------------------------------------------------------------------------------
+
+    def _used(self) -> set[str]:
+        used = {TOPIC}
+        for camera in self.cameras:
+            parts = (camera.images.topic, camera.infos, camera.color.topic if camera.color else None)
+            used |= {topic.name for topic in parts if topic is not None}
+        return used | {one.topic.name for one in self.signals}
+
+    def _unread(self, log: MessageLog, used: set[str]) -> list[str]:
+        lines = []
+        for topic in log.topics.values():
+            kind = plain_type(topic.type)
+            if topic.name in used or not len(topic) or kind.endswith(("/CameraInfo", ".CameraCalibration")):
+                continue
+            if kind in _TF:
+                if self._tree is None:
+                    lines.append(f"{told(topic)}; frame_id=FRAME (--option frame_id=FRAME) gives poses of it")
+                continue
+            lines.append(told(topic))
+        return lines
+
+    def signals_at(self, number: int) -> dict[str, Signal]:
+        """Return the signals of a depth image, without reading it.
+
+        Raises:
+            PcdataError: a message is damaged, or not of its kind.
+        """
+        with self._log.opened() as read:
+            return self._signals(read, number)
+
+    def _signals(self, read: Read, number: int) -> dict[str, Signal]:
+        found: dict[str, Signal] = {}
+        time = int(self.times[number])
+        for one in self.signals:
+            try:
+                found[one.name] = self._signal(read, one, number, time)
+            except PcdataError as error:
+                add_note(error, f"signal {one.name!r} at depth image {number}")
+                raise
+        for name, frame in self._joining.poses.items():
+            assert self.frame_id is not None
+            found[name] = Signal(self.pose(self.frame_id, frame, time)[None], "pose matrix", self.frame_id)
+        return found
+
+    def _signal(self, read: Read, one: SignalStream, number: int, time: int) -> Signal:
+        before, after, share = self.partner(f"signal {one.name}", one.topic, number)
+        message = decoded(one.topic, read(one.topic, before))
+        one.check_frame(message)
+        other = message if after == before else decoded(one.topic, read(one.topic, after))
+        value = one.between(message, other, share)
+        if isinstance(value, str):
+            return Signal((value,), "text")
+        signal = Signal(one.tensor(value), one.kind, one.frame)
+        if one.frame in (None, self.frame_id, "camera"):
+            return signal
+        assert self.frame_id is not None
+        assert one.frame is not None
+        moved = signal.moved(self.pose(self.frame_id, one.frame, time)[None])
+        return Signal(moved, one.kind, self.frame_id)
+
+    def frame(self, number: int, sample_id: str, provenance: Mapping[str, Any], invalid: tuple[int, ...]) -> DepthFrame:
+        """Read a depth image with all that belongs to it.
+
+        Raises:
+            PcdataError: a message is damaged, or cannot be right.
+        """
+        with self._log.opened() as read:
+            views = [self._view(read, camera, number, sample_id, provenance, invalid) for camera in self.cameras]
+            signals = self._signals(read, number)
+        frame = views[0]
+        if len(views) > 1:
+            facts = [view.provenance for view in views]
+            shared = {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
+            each = {key: [one[key] for one in facts] for key in ("topics", "stamp_ns")}
+            times = [time for one in facts for time in one["timestamps"]]
+            names = [camera.name for camera in self.cameras]
+            frame = join_views(views, {**shared, **each, "timestamps": times, "cameras": names})
+        for name, signal in signals.items():
+            frame = frame.with_signal(name, signal.values, signal.kind, signal.frame)
+        return frame
+
+    def _view(
+        self,
+        read: Read,
+        camera: CameraStream,
+        number: int,
+        sample_id: str,
+        provenance: Mapping[str, Any],
+        invalid: tuple[int, ...],
+    ) -> DepthFrame:
+        topic = camera.images.topic
+        place = number if camera is self.cameras[0] else self.partner("depth", topic, number)[0]
+        time = int(topic.times[place])
+        where = f"{self._where}: {topic.name}, image {place}"
+        numbers = depth_numbers(decoded(topic, read(topic, place)))
+        depth = _in_metres(where, numbers, camera.unit, invalid)
+        topics = {"depth": topic.name}
+        facts = {
+            **provenance,
+            **({"metres_per_unit": camera.unit} if numbers.dtype == np.uint16 else {}),
+            **({"unit_is_recorded": True} if camera.unit_source == RECORDED else {}),
+            "unit_source": camera.unit_source,
+            "timestamps": [(time - int(self.times[0])) / 1e9],
+            "stamp_ns": time,
+        }
+        colors = None
+        if camera.color is not None:
+            color = camera.color.topic
+            partner = self.partner("color", color, number)[0]
+            colors = color_pixels(decoded(color, read(color, partner)))
+            topics["color"] = color.name
+            facts["color_seconds_later"] = (int(color.times[partner]) - time) / 1e9
+        aligned = colors is not None and camera.color_camera is None
+        if aligned and colors is not None and colors.shape[:2] != depth.shape:
+            raise CaptureError(f"{where}: the color image has {colors.shape[1]}x{colors.shape[0]} pixels, not its own")
+        frame = DepthFrame(
+            depth=torch.from_numpy(depth)[None],
+            camera=self._camera(read, camera, time, (depth.shape[0], depth.shape[1])),
+            colors=torch.from_numpy(colors)[None] if aligned and colors is not None else None,
+            sample_id=sample_id,
+            capture_index=number,
+            provenance={**facts, "topics": topics},
+        )
+        if self.frame_id is not None:
+            pose = self.pose(self.frame_id, camera.images.frame, time)
+            frame = replace(frame, world_from_camera=pose[None], frame_id=self.frame_id)
+        if colors is None or camera.color_camera is None or camera.color is None:
+            return frame
+        color_from_depth = self.pose(camera.color.frame, camera.images.frame, time)
+        return register_to_color(frame, torch.from_numpy(colors)[None], camera.color_camera, color_from_depth)
+
+    def _camera(self, read: Read, camera: CameraStream, time: int, size: tuple[int, int]) -> Camera:
+        if camera.infos is None:
+            assert camera.camera is not None
+            if camera.camera.size != size:
+                raise CaptureError(
+                    f"{self._where}: {camera.images.topic.name}: an image has {size[1]}x{size[0]} pixels, the first "
+                    f"has {camera.camera.size[1]}x{camera.camera.size[0]}"
+                )
+            return camera.camera
+        place = max(0, int(joined([time], camera.infos.times, "step").before[0]))
+        info = decoded(camera.infos, read(camera.infos, place))
+        return camera_of(f"{self._where}: {camera.infos.name}", info, size, rectified=camera.rectified)
+
+
+def _seen_size(camera: CameraStream) -> tuple[int, int]:
+    return camera.images.form.size if camera.color_camera is None else camera.color_camera.size
+
+
+def _stream(role: str, topic: Topic, rule: str, counts: Mapping[str, int], largest_gap: float) -> dict[str, Any]:
+    return {
+        "topic": topic.name,
+        "type": topic.type,
+        "role": role,
+        "rule": rule,
+        "rate_hz": topic.rate(),
+        **counts,
+        "largest_gap_s": largest_gap,
+    }
+
+
+def _in_metres(where: str, numbers: NDArray[Any], unit: float, invalid: Sequence[int]) -> NDArray[np.float32]:
+    if numbers.dtype == np.uint16:
+        table = metres_of_value(unit)
+        table[[0, *invalid]] = 0.0
+        depth = table[numbers]
+    else:
+        depth = clean_float_depth(where, numbers, unit, invalid)
+    check_plausible(where, depth, DepthUnit(unit), numbers)
+    return depth
+
+
+def _statement(where: str, log: MessageLog, choice: Choice) -> Statement:
+    topic = log.topics.get(TOPIC)
+    if topic is None or topic.type != "std_msgs/msg/String" or not len(topic):
+        return Statement()
+    with log.opened() as read:
+        return read_statement(where, str(decoded(topic, read(topic, 0)).data))

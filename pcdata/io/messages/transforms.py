@@ -1,0 +1,191 @@
+"""The tree of frames that tf describes, and the way from one frame to another at a time.
+
+Source: tf2: a transform is the pose of the child frame in its parent; one that moves is interpolated, one that is
+static holds for ever.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.errors import CaptureError
+from pcdata.geometry import rigid
+from pcdata.io.messages.decoding import stamp
+from pcdata.io.sources.synchronized import Trajectory, joined
+
+Edge = tuple[str, str]  # parent, child
+
+
+class FrameTree:
+    """Frames and the poses that lead from each to its parent, over time; times are nanoseconds."""
+
+    def __init__(self, where: str, moving: Mapping[Edge, Trajectory], static: Mapping[Edge, Tensor]) -> None:
+        self._where, self._moving, self._static = where, dict(moving), dict(static)
+        parents: dict[str, str] = {}
+        for parent, child in (*self._moving, *self._static):
+            if parents.setdefault(child, parent) != parent:
+                raise CaptureError(
+                    f"{where}: tf gives the frame {child!r} two parents, {parents[child]!r} and {parent!r}; a frame "
+                    "has one"
+                )
+        self._parents = parents
+
+    @property
+    def frames(self) -> list[str]:
+        """The names of all frames, sorted."""
+        return sorted({*self._parents, *self._parents.values()})
+
+    def trees(self) -> list[list[str]]:
+        """Return the frames that are connected, for each part of a tree that is not one."""
+        left, found = set(self.frames), []
+        while left:
+            part = set(self._reached(min(left)))
+            found.append(sorted(part))
+            left -= part
+        return found
+
+    def way(self, target: str, source: str) -> list[tuple[Edge, bool]]:
+        """Return the steps from one frame to another: a pair of parent and child, and whether it is gone downwards.
+
+        Raises:
+            CaptureError: a frame is not there, or nothing leads from one to the other.
+        """
+        if target == source:
+            return []
+        for frame in (target, source):
+            if frame not in self._parents and frame not in self._parents.values():
+                raise CaptureError(f"{self._where}: tf has no frame {frame!r:.100}; it has {_named(self.frames)}")
+        before = self._reached(source)
+        if target not in before:
+            trees = "; ".join(f"tree {number}: {_named(part)}" for number, part in enumerate(self.trees(), 1))
+            raise CaptureError(f"{self._where}: tf does not connect {source!r} with {target!r}. {trees}")
+        steps, frame = list[tuple[Edge, bool]](), target
+        while frame != source:
+            nearer = before[frame]
+            assert nearer is not None
+            steps.append(((frame, nearer), True) if self._parents.get(nearer) == frame else ((nearer, frame), False))
+            frame = nearer
+        return steps
+
+    def why_none(self, target: str, source: str, time: int, max_gap: int) -> str | None:
+        """Say why there is no pose at a time; None = there is one."""
+        for edge, _ in self.way(target, source):
+            if edge in self._static:
+                continue
+            gap = self._moving[edge].gap(time)
+            if gap > max_gap:
+                beyond = "no pose before and after it" if gap == float("inf") else f"a pose {gap / 1e9:.3g} s off"
+                return f"tf from {edge[1]!r} to {edge[0]!r} has {beyond}, not within {max_gap / 1e9:g} s"
+        return None
+
+    def pose(self, target: str, source: str, time: int, max_gap: int) -> Tensor:
+        """Return the (4, 4) float64 target_from_source at a time.
+
+        Raises:
+            CaptureError: nothing leads from one to the other, or not at that time.
+        """
+        if why := self.why_none(target, source, time, max_gap):
+            raise CaptureError(f"{self._where}: {why}")
+        matrix = torch.eye(4, dtype=torch.float64, device="cpu")
+        for edge, downwards in self.way(target, source):
+            step = self._static[edge] if edge in self._static else self._moving[edge].pose(time)
+            matrix = matrix @ (step if downwards else rigid.invert_rigid(step))
+        return matrix
+
+    def streams(self, times: NDArray[np.int64], max_gap: int) -> list[dict[str, Any]]:
+        """Return what is joined of each pair of frames that moves, in numbers."""
+        told = []
+        for (parent, child), track in self._moving.items():
+            found = joined(times, track.times, "slerp", max_gap)
+            reached = found.gap[found.found]
+            span = int(track.times[-1] - track.times[0]) if len(track.times) > 1 else 0
+            told.append(
+                {
+                    "topic": "tf",
+                    "type": f"{parent} from {child}",
+                    "role": "pose",
+                    "rule": "slerp",
+                    "rate_hz": (len(track.times) - 1) * 1e9 / span if span else 0.0,
+                    **found.counts(),
+                    "largest_gap_s": float(reached.max()) / 1e9 if len(reached) else 0.0,
+                }
+            )
+        return told
+
+    def only(self, ways: Iterable[Edge]) -> FrameTree:
+        """Return the tree of what leads between some pairs of frames."""
+        edges = {edge for target, source in ways for edge, _ in self.way(target, source)}
+        return FrameTree(
+            self._where,
+            {edge: track for edge, track in self._moving.items() if edge in edges},
+            {edge: pose for edge, pose in self._static.items() if edge in edges},
+        )
+
+    def _reached(self, start: str) -> dict[str, str | None]:
+        """Return every frame that is connected with one, and through which it is reached first."""
+        children: dict[str, list[str]] = {}
+        for child, parent in self._parents.items():
+            children.setdefault(parent, []).append(child)
+        before: dict[str, str | None] = {start: None}
+        waiting = deque([start])
+        while waiting:
+            frame = waiting.popleft()
+            beside = [*children.get(frame, []), *([self._parents[frame]] if frame in self._parents else [])]
+            for other in beside:
+                if other not in before:
+                    before[other] = frame
+                    waiting.append(other)
+        return before
+
+
+class TreeBuilder:
+    """Takes messages of tf, one after another."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._moving: dict[Edge, dict[int, list[float]]] = {}
+        self._static: dict[Edge, list[float]] = {}
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take the transforms of a message; of those of one time the first counts, of static ones the last."""
+        for one in message.transforms if hasattr(message, "transforms") else [message]:
+            edge = (plain_frame(one.header.frame_id), plain_frame(one.child_frame_id))
+            shift, turn = one.transform.translation, one.transform.rotation
+            numbers = [float(value) for value in (shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w)]
+            if static:
+                self._static[edge] = numbers
+            else:
+                self._moving.setdefault(edge, {}).setdefault(stamp(one), numbers)
+
+    def tree(self) -> FrameTree:
+        """Return the tree.
+
+        Raises:
+            CaptureError: a pose cannot be right, or a frame has two parents.
+        """
+        moving, static = {}, {}
+        for edge, numbers in self._static.items():
+            static[edge] = self._track(edge, [0], np.array([numbers])).pose(0)
+        for edge, poses in self._moving.items():
+            if edge not in static:
+                moving[edge] = self._track(edge, list(poses), np.array(list(poses.values()), np.float64))
+        return FrameTree(self._where, moving, static)
+
+    def _track(self, edge: Edge, times: list[int], table: Any) -> Trajectory:
+        return Trajectory(f"{self._where}: tf from {edge[1]!r} to {edge[0]!r}", times, table[:, :3], table[:, 3:])
+
+
+def plain_frame(name: str) -> str:
+    """Return a frame's name without the slash that ROS 1 may begin it with."""
+    return str(name).removeprefix("/")
+
+
+def _named(frames: list[str]) -> str:
+    return ", ".join(frames[:20]) + (f" and {len(frames) - 20} more" if len(frames) > 20 else "") or "none"
