@@ -52,7 +52,8 @@ class PassWatch:
         self._again.fill_(_WARNED)
         warnings.warn(
             f"{what}: a second pass in one epoch repeats every random draw of the first; call set_epoch(number) on the "
-            "dataset before each pass (with the same number where the same draws are wanted); if it is to come several "
+            "dataset before each pass (with the same number where the same draws are wanted), or give Lightning and "
+            "Accelerate a loader with sampler=pcdata.CountedSampler(RandomSampler(dataset)); if it is to come several "
             "times in one epoch, as in ConcatDataset([dataset, dataset]), give it once, with repeats=2",
             RepeatedEpochWarning,
             stacklevel=4,

@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from pcdata.errors import DTypeError
+
 S = TypeVar("S")
 Movable = TypeVar("Movable", bound="Structure")
 
@@ -23,8 +25,18 @@ def derived(structure: S, **changes: Any) -> S:
 class Structure:
     """A frozen dataclass of tensors, of mappings of them, and of structures; whatever else it holds stays as it is."""
 
-    def to(self: Movable, device: torch.device | str, *, non_blocking: bool = False) -> Movable:
-        """Move all tensors to a device."""
+    def to(self: Movable, device: torch.device | str | int, *, non_blocking: bool = False) -> Movable:
+        """Move all tensors to a device; their dtypes stay.
+
+        Raises:
+            DTypeError: what is given is no device.
+        """
+        given: Any = device  # whatever the annotation promises: a tensor's own method would take a dtype, for masks too
+        if not isinstance(given, (torch.device, str, int)) or isinstance(given, bool):
+            raise DTypeError(
+                f"{type(self).__name__}.to: takes a device, got {given!r:.100}; of another dtype is the tensor that a "
+                "network is fed, batch.points.to(device, dtype)"
+            )
         return self._mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def cuda(self: Movable, device: torch.device | str | int | None = None, *, non_blocking: bool = False) -> Movable:

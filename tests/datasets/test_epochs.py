@@ -247,3 +247,60 @@ def test_a_sampler_that_does_not_know_its_dataset_is_told_it():
     assert dataset.epoch == 1
     with pytest.raises(DTypeError, match="no dataset of clouds in this list"):
         set_epoch([1, 2, 3], 1)
+
+
+class AccelerateLoader:
+    """As Accelerate's: it counts passes, and tells its number before each."""
+
+    def __init__(self, loader: DataLoader) -> None:
+        self.base_dataloader, self.iteration = loader, 0
+
+    def __getattr__(self, name: str):
+        return getattr(self.base_dataloader, name)
+
+    def set_epoch(self, epoch: int) -> None:
+        self.iteration = epoch
+        accelerate_sets(self.base_dataloader, epoch, sharded=False)
+
+    def __iter__(self):
+        self.set_epoch(self.iteration)
+        yield from self.base_dataloader
+        self.iteration += 1
+
+
+class FabricLoader:
+    """As Fabric's: it takes over what the loader holds, counts passes, and tells its samplers the number."""
+
+    def __init__(self, loader: DataLoader) -> None:
+        self.__dict__.update(loader.__dict__)
+        self._dataloader, self._num_iter_calls = loader, 0
+
+    def __iter__(self):
+        lightning_sets(self._dataloader, self._num_iter_calls)
+        self._num_iter_calls += 1
+        yield from self._dataloader
+
+
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("kind", [AccelerateLoader, FabricLoader])
+def test_a_loader_that_counts_passes_goes_on_from_the_epoch_that_is_set(kind, counted):
+    dataset = dataset_of(4)
+    sampler = RandomSampler(dataset)
+    loader = kind(
+        DataLoader(dataset, sampler=CountedSampler(sampler) if counted else sampler, collate_fn=collate_packed)
+    )
+    told = []
+    for epoch in (5, 6, 6):  # resumed, and one pass again
+        set_epoch(loader, epoch)
+        told += [dataset.epoch for _ in loader]
+    assert told == [5] * 4 + [6] * 8
+
+
+def test_a_loader_whose_method_calls_the_function_is_not_called_for_ever():
+    class Own(DataLoader):
+        def set_epoch(self, epoch: int) -> None:
+            set_epoch(self, epoch)
+
+    dataset = dataset_of(4)
+    Own(dataset).set_epoch(3)
+    assert dataset.epoch == 3
