@@ -148,6 +148,8 @@ class _Run:
         self.inputs = inputs_of(source)
         self.items: list[Item] = []
         self.total = 0
+        self._done = 0
+        self._unplanned: dict[str, str] = {}  # id of a sample that nothing is made of -> why
         self._coordinates: set[tuple[str, str]] = set()
         self._plan({})
 
@@ -158,9 +160,10 @@ class _Run:
         planned = {sample_id for item in self.items for sample_id in item.ids}
         self.total = len(planned)
         with_bad = "goes with a sample that is left out" if bad else "is in no episode that can be exported"
-        before = self.report.left_out
-        left_out = {name: bad.get(name) or before.get(name) or with_bad for name in ids if name not in planned}
-        self.report.left_out = left_out
+        before = self._unplanned
+        self._unplanned = {name: bad.get(name) or before.get(name) or with_bad for name in ids if name not in planned}
+        told = {sample_id: why for item in self.items for sample_id, why in item.unwritten.items()} | self._unplanned
+        self.report.left_out = left_out = {name: told[name] for name in ids if name in told}
         if not planned:
             first, reason = next(iter(left_out.items()))
             raise CaptureError(
@@ -240,7 +243,8 @@ class _Run:
 
     def keep(self, item: Item) -> None:
         """Count an item that was there."""
-        self.report.kept += len(item.ids)
+        self.report.kept += len(item.ids) - len(item.unwritten)
+        self._done += len(item.ids)
 
     def _samples(self, item: Item) -> Samples:
         for sample_id in item.ids:
@@ -251,9 +255,10 @@ class _Run:
             self._coordinates.add((data.frame_id, data.unit) if isinstance(data, PointCloud) else (CAMERA_FRAME, METRE))
             yield sample_id, data
             # Only when the writer asks for the next one is this one written.
-            self.report.written += 1
+            self.report.written += sample_id not in item.unwritten
+            self._done += 1
             if self.progress is not None:
-                self.progress(self.report.kept + self.report.written, self.total, sample_id)
+                self.progress(self._done, self.total, sample_id)
 
     def _note(self, text: str) -> None:
         if text not in self.report.notes:

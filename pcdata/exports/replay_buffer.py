@@ -1,7 +1,8 @@
 """Replay buffers: the zarr version 2 directories of diffusion policy, of DP3, and of those that took its loader over.
 
 Source: YanjieZe/3D-Diffusion-Policy, ``diffusion_policy_3d/common/replay_buffer.py``, ``dataset/adroit_dataset.py``,
-``dataset/dexart_dataset.py``, ``scripts/convert_real_robot_data.py``; real-stanford/diffusion_policy has the same
+``dataset/dexart_dataset.py``, ``scripts/convert_real_robot_data.py``; real-stanford/diffusion_policy,
+``dataset/blockpush_lowdim_dataset.py`` (obs), ``dataset/pusht_dataset.py`` (state, keypoint), has the same
 buffer. YanjieZe/Improved-3D-Diffusion-Policy, ``dataset/gr1_dex_dataset_3d.py``; ManiFlow,
 ``maniflow/dataset/robotwin_dataset.py``; TEA-Lab/DemoGen, ``demo_generation/demogen.py`` and its policies'
 ``dataset/robosuite_dataset.py``.
@@ -27,6 +28,7 @@ from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
+from pcdata.io.store.manifest import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, Episode, PointCloud
 
@@ -53,6 +55,7 @@ class _ReplayBuffer(Target):
         episodes: states, actions and which samples make an episode, of clouds that have no signals; see
             :func:`pcdata.exports.episodes.read_episodes`.
         colors: store xyz and rgb; False = xyz alone.
+        arrays: further signals, with commas between them, each stored as an array of its own name and shape.
         image: store an array ``img`` of zeros, a pixel per step, which some of the data sets ask for and none uses.
         frame: the frame that the clouds must be in; None = that of the first.
         num_points: points of every cloud, where they are others than those that the policy is used with.
@@ -72,6 +75,7 @@ class _ReplayBuffer(Target):
     action: str = "action"
     next_state: bool = False
     episodes: Given | None = None
+    arrays: str = ""
     colors: bool = True
     image: bool = True
     frame: str | None = None
@@ -96,6 +100,25 @@ class _ReplayBuffer(Target):
             raise ConfigError(f"{self.name}: its clouds have x, y and z alone; leave out colors=true")
         return ("xyz", self.color) if self.colors else ("xyz",)
 
+    @property
+    def further(self) -> tuple[str, ...]:
+        """The arrays that are signals of their names.
+
+        Raises:
+            ConfigError: a name that is no file's, or of an array that there is.
+        """
+        asked = tuple(name for name in map(str.strip, self.arrays.split(",")) if name)
+        taken = {"point_cloud", "action", "img", *self.state_arrays, *self.signal_arrays}
+        for number, name in enumerate(asked):
+            if name in taken or name in asked[:number]:
+                raise ConfigError(f"{self.name}: arrays: {name!r} is an array already; name it once")
+            if name != key_of(name):
+                raise ConfigError(
+                    f"{self.name}: arrays: {name!r:.100} becomes a file name, so it must be of letters, digits, '_', "
+                    "'-' and '.'; attach the signal under such a name"
+                )
+        return (*self.signal_arrays, *asked)
+
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One array of all timesteps: one item."""
         return self.plan(ids, (), ())
@@ -103,6 +126,7 @@ class _ReplayBuffer(Target):
     def plan(self, ids: Sequence[str], episodes: Sequence[Episode], left_out: Collection[str]) -> list[Item]:
         """Whole episodes alone: one with a step that does not fit is left out, since nothing goes on across a gap."""
         known = self.channels and set(ids)
+        further = self.further
         if self.episodes is None:
             given: Iterator[tuple[str, Sequence[str]]] = (
                 (one.id, ids[one.first : one.first + one.length]) for one in episodes
@@ -117,7 +141,7 @@ class _ReplayBuffer(Target):
         else:
             if self.next_state:
                 raise ConfigError(f"{self.name}: next_state is for signals; the files of episodes state the actions")
-            given = self._episodes_of_files(known)
+            given = self._episodes_of_files(known, further)
         order: list[str] = []
         kept: list[Episode] = []
         for name, samples in given:
@@ -125,12 +149,14 @@ class _ReplayBuffer(Target):
             if not short and not any(sample_id in left_out for sample_id in samples):
                 kept.append(Episode(name, len(order), len(samples)))
                 order += samples
-        return [Item(tuple(order), (".zgroup", "data", "meta"), tuple(kept))] if kept else []
+        last = [order[one.first + one.length - 1] for one in kept] if self.next_state else []
+        unwritten = dict.fromkeys(last, "the last step of its episode: its action would be the state after it")
+        return [Item(tuple(order), (".zgroup", "data", "meta"), tuple(kept), unwritten)] if kept else []
 
-    def _episodes_of_files(self, known: Collection[str]) -> Iterator[tuple[str, Sequence[str]]]:
+    def _episodes_of_files(self, known: Collection[str], further: Sequence[str]) -> Iterator[tuple[str, Sequence[str]]]:
         assert self.episodes is not None
         names = episode_names(self.name, self.episodes)
-        for episode in read_episodes(self.name, self.episodes, names, self.signal_arrays):
+        for episode in read_episodes(self.name, self.episodes, names, further):
             for sample_id in episode.samples:
                 if sample_id not in known:
                     raise ConfigError(
@@ -167,7 +193,7 @@ class _ReplayBuffer(Target):
             rows.update(dict.fromkeys(self.state_arrays, state))
             if not self.next_state:
                 rows["action"] = signal_row(where, cloud, "action", self.action)
-            for name in self.signal_arrays:
+            for name in self.further:
                 rows[name] = signal_row(where, cloud, name, name, free=True)
             for name, row in rows.items():
                 if row.shape != seen.setdefault(f"shape of {name}", row.shape):
@@ -182,8 +208,7 @@ class _ReplayBuffer(Target):
         """Write the arrays side by side, a chunk of timesteps at a time."""
         for group in (folder, folder / "data", folder / "meta"):
             write_group(group)
-        dropped = len(item.episodes) if self.next_state else 0
-        arrays = _Arrays(folder / "data", len(item.ids) - dropped, self.compression)
+        arrays = _Arrays(folder / "data", len(item.ids) - len(item.unwritten), self.compression)
         ranges = _Ranges()
         for sample_id, rows in self._steps(item, samples):
             arrays.add(rows)
@@ -197,8 +222,6 @@ class _ReplayBuffer(Target):
         ends = RowWriter(folder / "meta/episode_ends", (len(lengths),), "<i8", chunk_rows=_CHUNK, compression="none")
         for end in np.cumsum(lengths, dtype=np.int64):
             ends.add(end)
-        if dropped:
-            note(f"the last step of each of {dropped} episodes is left out: its action would be the state after it")
         horizon, observed, acted = self.window
         # A sequence may reach observed - 1 steps before an episode and acted - 1 beyond it.
         shortest = horizon - (observed - 1) - (acted - 1)
@@ -234,7 +257,7 @@ class _ReplayBuffer(Target):
         names = episode_names(self.name, self.episodes)
         planned = [one.id for one in item.episodes]
         wanted, written = set(planned), []
-        for episode in read_episodes(self.name, self.episodes, names, self.signal_arrays):
+        for episode in read_episodes(self.name, self.episodes, names, self.further):
             for copy in copies_among(episode.samples, known):
                 name = copy_name(episode.name, copy)
                 if name not in wanted:
@@ -318,7 +341,7 @@ def _buffer(name: str, model: str, arrays: str, *, colors: bool = True, image: b
         **own,
         **dict(facts, name=name, model=model, layout=layout),
     }
-    made = type(f"_{name.title()}", (_ReplayBuffer,), body)
+    made = type(f"_{name.title().replace('_', '')}", (_ReplayBuffer,), body)
     return dataclass(frozen=True, kw_only=True)(made)
 
 
@@ -344,6 +367,15 @@ REPLAY_BUFFERS: tuple[type[Target], ...] = (
         colors=False,
         color="rgb_255",
         state_arrays=("state", "agent_pos"),
+    ),
+    _buffer(
+        "diffusion_policy",
+        "dp3_sim",
+        "obs state action point_cloud",
+        color="rgb_255",
+        scales=False,
+        state_arrays=("obs", "state"),
+        also={"dp3_real": frozenset()},
     ),
 )
 for _target in REPLAY_BUFFERS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -26,6 +26,7 @@ class Item:
     ids: tuple[str, ...]
     paths: tuple[str, ...]
     episodes: tuple[Episode, ...] = ()  # over the ids, of a target that is of episodes
+    unwritten: Mapping[str, str] = field(default_factory=dict)  # ids that are read for others' sake alone -> why
 
 
 class CloudArray(NamedTuple):

@@ -245,7 +245,7 @@ def test_the_page_says_which_targets_keep_finished_samples_and_which_start_over(
     robot["e"]["imagin_robot"] = np.zeros((4, 96, 7))
     given = {"dexart": {"episodes": robot}, "graspnet_scene": {"frames_per_scene": 2}}
     robot = {"e": {name: array for name, array in robot["e"].items() if name != "imagin_robot"}}
-    given |= {name: {"episodes": robot} for name in ("dp3", "idp3", "maniflow", "demogen")}
+    given |= {name: {"episodes": robot} for name in ("dp3", "idp3", "maniflow", "demogen", "diffusion_policy")}
     table = {name: {"class": "mug", "split": "train"} for name in ids}
     given |= {name: {"table": table} for name in ("pointnet", "pointnet_part", "modelnet", "pointcept")}
     halves = [Episode("a", 0, 2), Episode("b", 2, 2)]

@@ -14,14 +14,14 @@ import torch
 from pcdata.datasets import CloudDataset
 from pcdata.errors import CaptureError, ConfigError, ContractError
 from pcdata.exports import TARGETS, check_export, export_dataset
-from pcdata.exports.export_record import FILE_NAME
+from pcdata.exports.export_record import FILE_NAME, ExportRecord
 from pcdata.structures import Episode, PointCloud
 from pcdata.transforms import Compose, Deproject, RandomRotation, RandomSample, ToFrame
 from pcdata.verdicts import Verdict
 from tests.exports.samples import Samples, cloud, frame
 from tests.exports.test_zarr_v2 import read_by_the_specification
 
-COUNTS = {"dp3": 512, "dexart": 1024, "idp3": 10_000, "maniflow": 1024, "demogen": 1024}
+COUNTS = {"dp3": 512, "dexart": 1024, "idp3": 10_000, "maniflow": 1024, "demogen": 1024, "diffusion_policy": 512}
 
 
 class Recording(Samples):
@@ -73,6 +73,7 @@ LOADERS = {
     "dexart": (["state", "action", "point_cloud", "imagin_robot", "img"], 3),  # DexArtDataset
     "idp3": (["state", "action", "point_cloud"], 6),  # GR1DexDataset3D
     "maniflow": (["point_cloud", "state", "action"], 6),  # RoboTwinDataset
+    "diffusion_policy": (["obs", "action", "state", "point_cloud"], 6),  # BlockPushLowdimDataset, PushTLowdimDataset
     "demogen": (["agent_pos", "state", "action", "point_cloud"], 3),  # RobosuitePointcloudDataset, DemoGen
 }
 
@@ -86,7 +87,7 @@ def test_every_data_set_finds_its_arrays_bit_for_bit(tmp_path, target):
     keys, width = LOADERS[target]
     data, ends = read(tmp_path / "out", keys)
     assert ends.tolist() == [3, 5]
-    scale = 255 if target in ("dp3", "idp3") else 1
+    scale = 1 if target == "maniflow" else 255
     for number, name in enumerate(source.ids):
         one = source.samples[name]
         assert np.array_equal(data["point_cloud"][number, :, :3], one.points.numpy())
@@ -100,9 +101,28 @@ def test_every_data_set_finds_its_arrays_bit_for_bit(tmp_path, target):
     assert data["point_cloud"].shape == (5, count, width)
     assert {array.dtype for key, array in data.items() if key != "img"} == {np.dtype(np.float32)}
     assert ("img" in data) == (tmp_path / "out/data/img").exists()
-    if target == "demogen":
-        assert np.array_equal(data["agent_pos"], data["state"])
+    for same in {"agent_pos", "obs"} & data.keys():
+        assert np.array_equal(data[same], data["state"])
     assert check_export(tmp_path / "out", TARGETS[target].model).verdict is Verdict.PASS
+
+
+def test_further_signals_are_arrays_of_their_own_names(tmp_path):
+    """PushTLowdimDataset of diffusion policy: keypoint (T, K, 2) in a row, then the first two numbers of the state."""
+    source = Recording((3,), lambda number: step(number).with_signal("keypoint", torch.rand(1, 9, 2), "invariant"))
+    options = {"state": "tip", "num_points": 64}
+    export_dataset(source, "diffusion_policy", tmp_path / "out", arrays="keypoint, joints", **options)
+    data, _ = read(tmp_path / "out", ["keypoint", "state", "joints"])
+    wanted = torch.cat([one.signals["keypoint"] for one in source.samples.values()])
+    assert np.array_equal(data["keypoint"], wanted.numpy())
+    assert np.concatenate([data["keypoint"].reshape(3, -1), data["state"][:, :2]], axis=-1).shape == (3, 20)
+    for arrays, error, message in [
+        ("state", ConfigError, "'state' is an array already"),
+        ("joints,joints", ConfigError, "'joints' is an array already"),
+        ("a/b", ConfigError, "'a/b' becomes a file name"),
+        ("keypoints", CaptureError, "did you mean 'keypoint'"),
+    ]:
+        with pytest.raises(error, match=message):
+            export_dataset(source, "dp3", tmp_path / "no", arrays=arrays, **options)
 
 
 def test_gr1_draws_4096_of_the_rows_of_idp3(tmp_path):
@@ -122,10 +142,13 @@ def test_the_next_state_is_the_action_in_the_coordinates_of_the_step(tmp_path):
     """RoboTwin's process_data.py: state j and cloud j go with state j + 1, and the last of an episode with none."""
     source = Recording((3, 1, 2), step)
     report = export_dataset(source, "maniflow", tmp_path / "out", state="tip", next_state=True, num_points=64)
-    assert report.left_out == {"t3": "is in no episode that can be exported"}
-    assert any("last step of each of 2 episodes" in note for note in report.notes)
+    last = "the last step of its episode: its action would be the state after it"
+    assert report.left_out == {"t2": last, "t3": "is in no episode that can be exported", "t5": last}
+    record = ExportRecord.read(tmp_path / "out")
+    assert (list(record.samples), record.left_out) == (["t0", "t1", "t4"], report.left_out)
     data, ends = read(tmp_path / "out", LOADERS["maniflow"][0])
     assert ends.tolist() == [2, 3]
+    assert report.written == len(data["state"])  # rows, not the samples that were looked at for them
     for row, (now, after) in enumerate([(0, 1), (1, 2), (4, 5)]):
         assert np.array_equal(data["point_cloud"][row, :, :3], source.samples[f"t{now}"].points.numpy())
         assert np.allclose(data["action"][row], source.samples[f"t{after}"].signals["tip"][0].numpy(), atol=1e-7)
