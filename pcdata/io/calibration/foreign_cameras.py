@@ -17,14 +17,16 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError
-from pcdata.files.opening import read_text
+from pcdata.files.opening import read_bytes, read_text
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding
 from pcdata.geometry import rigid
+from pcdata.io.arrays.plain_pickles import read_plain_pickle
 from pcdata.io.calibration.capture_camera import capture_camera_of
 from pcdata.structures import Camera
 
 Size = tuple[int, int]  # (height, width)
+_MAX_PICKLE = 1 << 27
 _LENSES = ("Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady", "None")
 _YAML_LINE = re.compile(r"^(\w+):[ \t]*([^#\n]*?)[ \t]*(?:#[^\n]*)?$", re.MULTILINE)  # flat: one number a line
 _REALSENSE = re.compile(
@@ -42,6 +44,7 @@ class ForeignCamera(NamedTuple):
     metres_per_unit: float | None = None  # as our own files say it
     depth_encoding: DepthEncoding | None = None
     invalid_values: tuple[int, ...] | None = None
+    poses: Mapping[str, Tensor] | None = None  # signals: (4, 4) float64 of other things, in the same frame
 
 
 def read_foreign_camera(
@@ -58,6 +61,9 @@ def read_foreign_camera(
         if fnmatchcase(path.name.lower(), pattern):
             where = f"read_foreign_camera: {path}"
             try:
+                if path.suffix.lower() == ".pkl":
+                    content = read_bytes(where, path, max_bytes=_MAX_PICKLE, inside=inside)
+                    return _m2t2_said(where, read_plain_pickle(where, content))
                 return read(where, read_text(where, path, inside=inside))
             except PcdataError:
                 raise
@@ -185,9 +191,17 @@ def _realsense(size: Size, *, streams: Mapping[Size, tuple[float, ...]]) -> Came
 
 
 def _m2t2(where: str, text: str) -> ForeignCamera:
-    said = json_object(where, text, error=CaptureError)
+    return _m2t2_said(where, json_object(where, text, error=CaptureError))
+
+
+def _m2t2_said(where: str, said: Any) -> ForeignCamera:
     pose = matrix_of(f"{where}: camera_pose", [value for row in said["camera_pose"] for value in row])
-    return ForeignCamera(pinhole_of_matrix(where, said["intrinsics"]), pose, "base")
+    hand = {
+        name: matrix_of(f"{where}: {name}", [value for row in said[name] for value in row])
+        for name in ("ee_pose",)
+        if said.get(name) is not None
+    }
+    return ForeignCamera(pinhole_of_matrix(where, said["intrinsics"]), pose, "base", poses=hand or None)
 
 
 def _open3d(where: str, text: str) -> ForeignCamera:
@@ -214,6 +228,7 @@ _ROWS: dict[str, Callable[[str, str], ForeignCamera]] = {  # by the name of the 
     "*intrinsic*.yaml": _yaml_intrinsics,
     "*intrinsic*.txt": _text_intrinsics,
     "meta_data.json": _m2t2,
+    "meta_data.pkl": _m2t2,
     "camera*.json": _open3d,
     "intrinsic*.json": _open3d,
 }

@@ -18,7 +18,7 @@ from torch import Tensor
 from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files.opening import check_inside
-from pcdata.files.sample_names import name_some, positions
+from pcdata.files.sample_names import check_known, name_some, positions
 from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
 from pcdata.io.images.reading import read_color, read_raw_depth
 from pcdata.io.sources.frame_files import make_frame
@@ -26,7 +26,7 @@ from pcdata.io.sources.joined_views import join_views
 from pcdata.io.sources.listing import LinkTargets, absolute, is_folder, link_targets, unread_entries, visible_files
 from pcdata.io.sources.option_checks import check_name, check_pinhole
 from pcdata.io.sources.source import Source
-from pcdata.structures import Camera, DepthFrame, register_to_color
+from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
 Size = tuple[int, int]  # (height, width)
 _NAMED = 0.001  # probability above which a unit is worth a mention
@@ -44,6 +44,7 @@ class StoredView:
         readers: images that are stored in a way of their own, by role; functions of the depth's size.
         color: the color image of another camera, its camera, and the (4, 4) color from depth.
         facts: JSON-able, for the provenance.
+        signals: of the moment, B = 1; those of the first view of a sample are the sample's.
     """
 
     files: Mapping[str, Path]
@@ -53,6 +54,7 @@ class StoredView:
     readers: Mapping[str, Callable[[Size], Tensor]] = field(default_factory=dict)
     color: tuple[Path, Callable[[Size], Camera], Tensor] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    signals: Mapping[str, Signal] = field(default_factory=dict)
 
 
 class ListedSource(Source):
@@ -130,14 +132,25 @@ class ListedSource(Source):
         views = self._views[sample_id]
         return {"": views} if isinstance(views, StoredView) else views
 
+    def signals(self, sample_id: str) -> Mapping[str, Signal]:
+        """Return the signals of one sample, which were read with the list.
+
+        Raises:
+            CaptureError: the sample is unknown.
+        """
+        check_known(str(self), sample_id, self._known)
+        return dict(next(iter(self._named(sample_id).values())).signals)
+
     def _load(self, sample_id: str) -> DepthFrame:
         views = self._named(sample_id)
         frames = [self._frame(sample_id, view) for view in views.values()]
-        if len(frames) == 1 and "" in views:
-            return frames[0]
-        facts = [frame.provenance for frame in frames]
-        shared = {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
-        return join_views(frames, {**shared, "cameras": list(views)})
+        frame = frames[0]
+        if len(frames) > 1 or "" not in views:
+            facts = [frame.provenance for frame in frames]
+            shared = {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
+            frame = join_views(frames, {**shared, "cameras": list(views)})
+        signals = self.signals(sample_id)
+        return replace(frame, recorded_signals=signals) if signals else frame
 
     def _frame(self, sample_id: str, view: StoredView) -> DepthFrame:
         files = {role: file for role, file in view.files.items() if role not in view.readers}

@@ -20,11 +20,20 @@ from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.io.calibration.foreign_cameras import ForeignCamera, pinhole, read_foreign_camera
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES, image_size, read_depth, read_raw_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, stated_intrinsics, stated_unit
-from pcdata.io.sources.listing import LinkTargets, absolute, entries, is_folder, link_targets, visible_files
+from pcdata.io.sources.listing import (
+    LinkTargets,
+    absolute,
+    entries,
+    has_file,
+    is_folder,
+    link_targets,
+    visible_files,
+)
 from pcdata.io.sources.option_checks import check_invalid_values, check_label, check_name
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import check_partners
 from pcdata.io.sources.stated import one_value
+from pcdata.structures import Signal
 
 _WORDS = {  # of file names, without case: the role that they tell
     "depth": "depth",
@@ -58,7 +67,7 @@ class _PairsSource(ListedSource):
     needs = (
         "depth_NAME.npy|png|tiff|exr (or NAME_depth.png, NAME-depth-img.exr, depth.npy) in one folder, or one such "
         "file; optional color_NAME.png|jpg (or rgb) and seg_NAME.png (or label, mask); intrinsics in *.intr, "
-        "*intrinsic*.txt|yaml|json, camera*.json or meta_data.json beside them, or by the option"
+        "*intrinsic*.txt|yaml|json, camera*.json or meta_data.json|pkl beside them, or by the option"
     )
 
     def __init__(
@@ -126,6 +135,8 @@ class _PairsSource(ListedSource):
         facts: dict[str, Any] = {} if unit is None else {"metres_per_unit": unit}
         facts |= {} if encoding == "plain" else {"depth_encoding": encoding}
         check_partners(where, found["depth"], {role: files for role, files in found.items() if role != "depth"})
+        frame = check_name(where, "frame_id", frame_id) or said.frame or "world"
+        signals = {name: Signal(pose[None], "pose matrix", frame) for name, pose in (said.poses or {}).items()}
         views = {
             name: StoredView(
                 files={role: files[name] for role, files in found.items()},
@@ -133,6 +144,7 @@ class _PairsSource(ListedSource):
                 camera=camera,
                 pose=said.pose,
                 facts=facts,
+                signals=signals,
             )
             for name in found["depth"]
         }
@@ -140,7 +152,7 @@ class _PairsSource(ListedSource):
         super().__init__(
             path,
             views,
-            frame_id=check_name(where, "frame_id", frame_id) or said.frame or "world",
+            frame_id=frame,
             background_label=self.background_label,
             read=read,
             unread=told,
@@ -190,6 +202,8 @@ def _said_of_camera(where: str, folder: Path, allowed: list[Path]) -> tuple[Fore
     """Return what the files beside the images say together, and those files."""
     said, read = ForeignCamera(), list[Path]()
     for file in entries(folder):
+        if file.suffix.lower() == ".pkl" and has_file(file.with_suffix(".json")):  # the same once more
+            continue
         if is_folder(file) or (found := read_foreign_camera(file, allowed)) is None:
             continue
         read.append(file)

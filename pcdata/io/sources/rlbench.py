@@ -8,6 +8,7 @@ pixel (u, v) is the direction ((u - cx) / fx, (v - cy) / fy).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,10 @@ from pcdata.io.images.coded_depth import read_ranged_depth, read_rgb_ids
 from pcdata.io.sources.listed import ListedSource, Size, StoredView, checked_folder, files_by_id, one_of
 from pcdata.io.sources.listing import LinkTargets, entries, has_file, is_file, is_folder, link_targets
 from pcdata.io.sources.registry import register_layout
+from pcdata.io.sources.rlbench_records import PICKLES, read_rlbench_pickle, rlbench_signals
 from pcdata.io.sources.source import check_partners
 
-_META, _PICKLES = "meta_data.json", ("meta_data.pkl", "low_dim_obs.pkl")
+_META = "meta_data.json"
 _IMAGES = r"(?P<id>\d+)\.png"
 _FOLDERS = {"depth": "{}_depth", "color": "{}_rgb", "labels": "{}_mask"}
 _MAX_BYTES = 1 << 27
@@ -42,8 +44,8 @@ class _RlbenchSource(ListedSource):
     kind = "rlbench"
     is_one_recording = True
     needs = (
-        "CAMERA_depth/N.png (RGB) for one or more cameras and meta_data.json with CAMERA_camera_extrinsics, "
-        "_intrinsics, _near and _far; optional CAMERA_rgb/ and CAMERA_mask/"
+        "CAMERA_depth/N.png (RGB) for one or more cameras and meta_data.json (or meta_data.pkl, low_dim_obs.pkl) "
+        "with CAMERA_camera_extrinsics, _intrinsics, _near and _far; optional CAMERA_rgb/ and CAMERA_mask/"
     )
 
     def __init__(
@@ -51,6 +53,7 @@ class _RlbenchSource(ListedSource):
         path: Path,
         *,
         camera: str | None = None,
+        signals: Mapping[str, Any] | None = None,
         frame_id: str = "world",
         links_to: LinkTargets = (),
     ) -> None:
@@ -59,12 +62,13 @@ class _RlbenchSource(ListedSource):
         Args:
             path: the folder of one episode.
             camera: read this one alone; None = all, as views of one sample.
+            signals: kinds of what is recorded of the robot by name, see :func:`stated_kinds`; None leaves one out.
             frame_id: the frame that the poses lead to.
             links_to: folders outside that links in the capture may lead to.
 
         Raises:
-            CaptureError: a part of the layout is missing, the metadata are a pickle, a camera lacks steps that others
-                have, or numbers cannot be right.
+            CaptureError: a part of the layout is missing, the metadata are a pickle of more than arrays, a camera
+                lacks steps that others have, or numbers cannot be right.
             IntrinsicsError: one focal length is negative and the other is not: the image is mirrored.
         """
         path = checked_folder(self.kind, path, self.needs)
@@ -77,8 +81,15 @@ class _RlbenchSource(ListedSource):
         by_camera = {name: _views(path, name, said) for name in chosen}
         first = by_camera[chosen[0]]
         check_partners(where, first, {name: views for name, views in by_camera.items() if views is not first})
-        views = {step: {name: by_camera[name][step] for name in chosen} for step in first}
-        read = [path / _META, *(path / form.format(name) for name in names for form in _FOLDERS.values())]
+        recorded = rlbench_signals(where, said, [*map(int, first)], signals, frame_id)
+        views: dict[str, dict[str, StoredView]] = {}
+        for step in first:
+            views[step] = {name: by_camera[name][step] for name in chosen}
+            views[step][chosen[0]] = replace(views[step][chosen[0]], signals=recorded[int(step)])
+        read = [
+            *(path / name for name in (_META, *PICKLES)),
+            *(path / form.format(name) for name in names for form in _FOLDERS.values()),
+        ]
         others = [name for name in names if name not in chosen]
         told = [f"{len(others)} other cameras: {name_some(others)}"] if others else []
         super().__init__(path, views, frame_id=frame_id, read=read, unread=told, links_to=links_to)
@@ -86,7 +97,7 @@ class _RlbenchSource(ListedSource):
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         """Folders of depth with their camera's name, and metadata."""
-        return any(is_file(path / name) for name in (_META, *_PICKLES)) and bool(_cameras(path))
+        return any(is_file(path / name) for name in (_META, *PICKLES)) and bool(_cameras(path))
 
 
 def _cameras(path: Path) -> list[str]:
@@ -97,21 +108,18 @@ def _cameras(path: Path) -> list[str]:
     return in_order(name.removesuffix("_depth") for name in found)
 
 
-def _meta(where: str, path: Path, allowed: list[Path]) -> dict[str, Any]:
+def _meta(where: str, path: Path, allowed: list[Path]) -> Mapping[str, Any]:
     if has_file(path / _META):
         text = read_text("rlbench source", path / _META, max_bytes=_MAX_BYTES, inside=allowed)
         return json_object(str(path / _META), text, error=CaptureError)
-    pickled = [name for name in _PICKLES if has_file(path / name)]
-    raise CaptureError(
-        f"{where}: the cameras are stated in {name_some(pickled) or 'no file'}; a pickle runs what is in it, so none "
-        f"is read. If you trust it, write {_META} beside it, where you made it: CAMERA_camera_extrinsics (a 4x4 for "
-        "each step), CAMERA_camera_intrinsics (3x3), CAMERA_camera_near and CAMERA_camera_far (metres), by "
-        "json.dump(meta, file, default=lambda array: array.tolist())"
-    )
+    for name in PICKLES:
+        if has_file(path / name):
+            return read_rlbench_pickle(path / name, allowed)
+    raise CaptureError(f"{where}: has no {_META}; this layout needs {_RlbenchSource.needs}")
 
 
 def _views(path: Path, camera: str, said: Mapping[str, Any]) -> dict[str, StoredView]:
-    where = f"{path / _META}: {camera}_camera"
+    where = f"{path}: {camera}_camera"
     kinds = {role: path / form.format(camera) for role, form in _FOLDERS.items()}
     found = {role: files_by_id(folder, _IMAGES) for role, folder in kinds.items() if is_folder(folder)}
     check_partners(str(path), found["depth"], {role: files for role, files in found.items() if role != "depth"})

@@ -20,6 +20,7 @@ from pcdata.io.sources.synchronized import Trajectory, nearest
 from pcdata.verdicts import Verdict
 from tests import published_captures as made
 from tests.published_captures import COLOR_FROM_DEPTH, FAR, INTRINSICS, NEAR, depth_mm, turned
+from tests.rlbench_demos import Observation, pickled_demo
 
 
 def metres(seed: int) -> torch.Tensor:
@@ -159,17 +160,97 @@ def test_rlbench_metadata_that_cannot_be_are_refused(tmp_path: Path, changes: An
         open_source(made.rlbench(tmp_path, **changes))
 
 
-def test_pickled_metadata_is_never_run_and_the_way_out_is_named(tmp_path: Path) -> None:
+def test_rlbench_records_of_the_robot_are_signals(tmp_path: Path) -> None:
+    steps = range(21)
+    recorded = {
+        "gripper_pose": [[0.1 * step, 0, 0, 0, 0, 0, 1] for step in steps],
+        "gripper_matrix": [turned(step).tolist() for step in steps],
+        "joint_positions": [[float(step)] * 7 for step in steps],
+        "gripper_open": [float(step > 10) for step in steps],
+        "ragged": [[0.0] * (step % 3) for step in steps],
+        "short": [1.0, 2.0],
+        "goal_description": "take the steak off the grill",
+    }
+    path = made.rlbench(tmp_path, **recorded)
+    signals = open_source(path).load("20").recorded_signals
+    assert {name: (one.kind, one.frame) for name, one in signals.items()} == {
+        "gripper_pose": ("pose xyz_quat_xyzw", "world"),
+        "gripper_matrix": ("pose matrix", "world"),
+        "joint_positions": ("invariant", None),
+        "gripper_open": ("invariant", None),
+        "task": ("text", None),
+    }
+    assert signals["gripper_pose"].values.tolist() == [[2.0, 0, 0, 0, 0, 0, 1]]
+    stated = {"joint_positions": {"kind": "invariant 7"}, "gripper_matrix": None}
+    other = open_source(path, signals=stated).load("20").recorded_signals
+    assert other["joint_positions"].kind == "invariant 7"
+    assert "gripper_matrix" not in other
+    with pytest.raises(ConfigError, match="no stream 'gripper'"):
+        open_source(path, signals={"gripper": None})
+
+
+def test_rlbench_metadata_in_a_pickle_of_arrays_are_those_in_json(tmp_path: Path) -> None:
+    path = made.rlbench(tmp_path / "a", gripper_open=[1.0] * 21)
+    frame = open_source(path).load("20")
+    said = json.loads((path / "meta_data.json").read_text())
+    (path / "meta_data.json").unlink()
+    arrays = {name: np.array(value) if isinstance(value, list) else value for name, value in said.items()}
+    (path / "meta_data.pkl").write_bytes(pickle.dumps(arrays))
+    of_arrays = open_source(path).load("20")
+    (path / "meta_data.pkl").unlink()
+    cameras = {name: value for name, value in arrays.items() if "_camera_" in name}
+    observations = [
+        Observation(
+            gripper_open=1.0,
+            misc={name: value[step] if name.endswith("_extrinsics") else value for name, value in cameras.items()},
+        )
+        for step in range(21)
+    ]
+    (path / "low_dim_obs.pkl").write_bytes(pickled_demo(observations))
+    of_demo = open_source(path).load("20")
+    for other in (of_arrays, of_demo):
+        assert torch.equal(other.depth, frame.depth)
+        assert torch.equal(other.world_from_camera, frame.world_from_camera)
+        assert torch.equal(other.camera.intrinsics, frame.camera.intrinsics)
+        assert other.recorded_signals["gripper_open"].same_bits(frame.recorded_signals["gripper_open"])
+
+
+def test_pickled_metadata_of_anything_else_is_never_run_and_the_way_out_is_named(tmp_path: Path) -> None:
     class Hostile:
         def __reduce__(self) -> Any:
             return (Path.touch, (tmp_path / "run",))
 
     made.rlbench(tmp_path / "episode")
     (tmp_path / "episode" / "meta_data.json").unlink()
-    (tmp_path / "episode" / "meta_data.pkl").write_bytes(pickle.dumps(Hostile()))
-    with pytest.raises(CaptureError, match=r"a pickle runs what is in it.*write meta_data\.json"):
-        open_source(tmp_path / "episode")
+    for name in ("meta_data.pkl", "low_dim_obs.pkl"):
+        for content in (Hostile(), {"meta": Hostile()}, [], [3], {"_observations": [3]}):
+            (tmp_path / "episode" / name).write_bytes(pickle.dumps(content))
+            with pytest.raises(
+                CaptureError, match=r"write what is needed as JSON|must hold metadata|must be metres|_camera"
+            ):
+                open_source(tmp_path / "episode")
+        (tmp_path / "episode" / name).unlink()
     assert not (tmp_path / "run").exists()
+
+
+def test_m2t2_metadata_tell_where_the_hand_is_from_json_or_a_pickle(tmp_path: Path) -> None:
+    made.pairs(tmp_path)
+    (tmp_path / "phoxi.intr").unlink()
+    said = {
+        "camera_pose": turned(1),
+        "intrinsics": np.array(made.MATRIX),
+        "ee_pose": turned(2),
+        "object_label": "obj_5",
+    }
+    (tmp_path / "meta_data.pkl").write_bytes(pickle.dumps(said))
+    frames = [open_source(tmp_path).load("000")]
+    as_json = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in said.items()}
+    (tmp_path / "meta_data.json").write_text(json.dumps(as_json))
+    frames.append(open_source(tmp_path, frame_id="table").load("000"))
+    for frame, name in zip(frames, ("base", "table")):
+        assert frame.frame_id == name
+        assert frame.recorded_signals["ee_pose"].frame == name
+        assert np.array_equal(frame.recorded_signals["ee_pose"].values[0].numpy(), turned(2))
 
 
 # -- poses and registration --------------------------------------------------------------------------------------------
