@@ -7,7 +7,7 @@ from typing import Any
 
 from pcdata.cli.choices import add_model_options, given_preset
 from pcdata.cli.known_names import FORMATS
-from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, skip_list
+from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, said_again, skip_list
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -42,9 +42,11 @@ def add_to(commands: Any) -> None:
     build.add_argument("--overwrite", action="store_true", help="replace the dataset that is in DIR")
     build.set_defaults(run=_build)
 
-    inspect = commands.add_parser("inspect", help="say what a dataset, a capture folder or a cloud file holds")
-    inspect.add_argument("path", metavar="PATH")
+    inspect = commands.add_parser("inspect", help="say what captures or a dataset hold, what is missing, how to go on")
+    inspect.add_argument("path", metavar="PATH", help="captures of any layout, a cloud file, or a dataset")
     add_capture_options(inspect)
+    inspect.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    inspect.add_argument("--json", metavar="FILE", help="write the same as JSON to FILE, replacing it; - is the output")
     inspect.set_defaults(run=_inspect)
 
     doctor = commands.add_parser("doctor", help="say what is installed, which backends are live, what to install")
@@ -101,14 +103,44 @@ def _build(arguments: argparse.Namespace) -> None:
 
 
 def _inspect(arguments: argparse.Namespace) -> None:
+    from pcdata.errors import ConfigError, PcdataError
     from pcdata.io.sources.listing import absolute
     from pcdata.io.store.manifest import FILE_NAME
-    from pcdata.report.inspection_text import capture_text, dataset_text
+    from pcdata.report.capture_facts import capture_facts
+    from pcdata.report.inspection_text import dataset_text, facts_text
+    from pcdata.report.unopened_text import unopened_facts, unopened_text
 
     if (absolute(arguments.path) / FILE_NAME).is_file():
+        if arguments.json:
+            raise ConfigError(f"inspect: {arguments.path} is a dataset, whose {FILE_NAME} is JSON; leave --json out")
         print(dataset_text(arguments.path))
-    else:
-        print(capture_text(open_captures(arguments.path, arguments)))
+        return
+    words = said_again(arguments, "--json")
+    try:
+        facts = capture_facts(open_captures(arguments.path, arguments, limit=arguments.limit))
+    except ConfigError:
+        raise
+    except PcdataError as error:  # what can be told without opening it, and then why it is not opened
+        told = unopened_facts(arguments.path, arguments.kind, error)
+        if told is not None:
+            _tell(arguments.json, told, unopened_text(told, words))
+        raise
+    _tell(arguments.json, facts, facts_text(facts, words))
+
+
+def _tell(file: str | None, facts: dict[str, Any], text: str) -> None:
+    import json
+
+    from pcdata.files.opening import replacing
+
+    document = json.dumps(facts, indent=1, allow_nan=False)
+    if file == "-":
+        print(document)
+        return
+    if file is not None:
+        with replacing("inspect --json", file) as temporary:
+            temporary.write_text(document + "\n", encoding="utf-8")
+    print(text)
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

@@ -38,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     wait_asleep()
-    arguments = _parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else [*argv]
+    arguments = _parser().parse_args(words)
+    arguments.words = words[next((place for place, word in enumerate(words) if word[:1] != "-"), 0) + 1 :]
     try:
         _import(getattr(arguments, "imports", []))
         verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code

@@ -255,6 +255,18 @@ def given_flags(arguments: argparse.Namespace, *others: str) -> list[str]:
     return [flag for flag in (*flags, *others) if getattr(arguments, attribute_of(flag), None)]
 
 
+def said_again(arguments: argparse.Namespace, *without: str) -> list[str]:
+    """Return the words that followed the command: path and options, but for some flags with a value."""
+    kept: list[str] = []
+    words = iter(arguments.words)
+    for word in words:
+        if word in without:
+            next(words, None)
+        elif word != "--debug" and not word.startswith(tuple(f"{flag}=" for flag in without)):
+            kept.append(word)
+    return kept
+
+
 def skip_list(arguments: argparse.Namespace) -> list[str]:
     """Return the ids that the command line leaves out."""
     from pcdata.io.sources.open_source import read_skip_file

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 from pcdata.io import WrittenReport
-from pcdata.report.inspection_text import skipped_text
+from pcdata.report.inspection_text import size_in_words, skipped_text
 
 
 def conversion_text(report: WrittenReport) -> str:
@@ -21,12 +21,3 @@ def conversion_text(report: WrittenReport) -> str:
         lines.append(skipped_text(report.left_out))
     lines.append(f"next     pcdata inspect {shlex.quote(str(report.folder))}")
     return "\n".join(lines)
-
-
-def size_in_words(size: float) -> str:
-    """Return a number of bytes as a person says it."""
-    for unit in ("bytes", "kB", "MB", "GB"):
-        if size < 1000 or unit == "GB":
-            break
-        size /= 1000
-    return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from pcdata.build import BuildReport
 from pcdata.datasets import CachedCloudDataset
-from pcdata.io.sources.capture_source import CaptureSource, kinds_of, unread_of
+from pcdata.io.sources.capture_source import CaptureSource
+from pcdata.io.writers.writers import WRITERS
+from pcdata.report.capture_facts import capture_facts
 from pcdata.report.plain_table import text_table
-from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures import PointCloud
 
 _SKIPPED_SHOWN = 20  # captures that were left out, in a summary
+_STREAMS_SHOWN = 40
 
 
 def build_text(report: BuildReport) -> str:
@@ -61,7 +66,7 @@ def dataset_text(folder: str | Path) -> str:
         ["fingerprint", manifest.fingerprint[:16]],
         ["made with", ", ".join(f"{name} {version}" for name, version in manifest.versions.items())],
     ]
-    facts[-2:-2] = [[*row] for row in _signal_facts(cloud)]
+    facts[-2:-2] = [[*row] for row in _signal_rows(cloud)]
     facts += [["built with", f"{one['file']}, sha256 {one['sha256'][:16]}"] for one in manifest.imports]
     stored, on_the_fly = dataset.pipeline.split()
     steps = [["stored", repr(step)] for step in stored.steps]
@@ -70,51 +75,167 @@ def dataset_text(folder: str | Path) -> str:
     return f"{tables}\n\n{skipped_text(manifest.skipped)}" if manifest.skipped else tables
 
 
-def capture_text(source: CaptureSource) -> str:
-    """Tell what a source holds; loads its first capture."""
-    first = source.load(source.ids[0])
-    names = ", ".join(source.ids[:3]) + (", ..." if len(source) > 3 else "")
-    facts = [
-        ["layout", " of ".join(kinds_of(source)) or type(source).__name__],
-        ["captures", f"{len(source)}: {names}"],
-        ["first", repr(first)],
+def capture_text(source: CaptureSource, words: Sequence[str] = ()) -> str:
+    """Tell what a source holds; loads its first and its last capture.
+
+    Args:
+        source: the captures.
+        words: of the command line that opens them: path and options; then the commands to go on are told.
+    """
+    return facts_text(capture_facts(source), words)
+
+
+def facts_text(facts: Mapping[str, Any], words: Sequence[str] = ()) -> str:
+    """Tell what :func:`capture_facts` found; see :func:`capture_text`."""
+    names = ", ".join(facts["ids"]) + (", ..." if facts["captures"] > len(facts["ids"]) else "")
+    size = "" if facts["bytes"] is None else f", {size_in_words(facts['bytes'])}"
+    rows = [
+        ["layout", " of ".join(facts["layout"])],
+        ["captures", f"{facts['captures']}: {names}{size}"],
+        ["first", facts["first"]],
+        *(_frame_rows(facts) if "cameras" in facts else _cloud_rows(facts)),
+        *_rows_of("signals", map(_signal_row, *zip(*facts["signals"].items())) if facts["signals"] else ()),
+        *_episode_rows(facts["episodes"]),
+        *([["time", _times_in_words(facts["time"])]] if facts["time"] else []),
+        *_rows_of("left out", _left_out(facts["left_out"])),
+        *_rows_of("missing", facts["missing"]),
+        *_rows_of("not read", facts["not_read"]),
+        *_rows_of("next", next_commands(facts, words) if words else ()),
     ]
-    facts += _frame_facts(first) if isinstance(first, DepthFrame) else _cloud_facts(first)
-    facts += _signal_facts(first)
-    facts += [["not read" * (not number), line] for number, line in enumerate(unread_of(source))]
-    return text_table(["capture", str(source.name)], facts)
+    tables = [text_table(["capture", facts["name"]], rows)]
+    if facts["streams"]:
+        tables.append(_stream_table(facts["streams"]))
+    return "\n\n".join(tables)
 
 
-def _signal_facts(data: DepthFrame | PointCloud) -> list[list[str]]:
-    """Tell each signal's name, kind, frame and shape."""
-    rows = [f"{name}: {signal!r}" for name, signal in data.recorded_signals.items()]
-    return [["signals" * (not number), row] for number, row in enumerate(rows)]
-
-
-def _frame_facts(frame: DepthFrame) -> list[list[str]]:
-    valid = frame.depth[frame.depth > 0]
-    span = f", {valid.min():.3f} to {valid.max():.3f} m" if len(valid) else ""
+def next_commands(facts: Mapping[str, Any], words: Sequence[str]) -> list[str]:
+    """Return the commands to go on with captures that are opened by these words."""
+    if "cameras" not in facts:
+        return [f"pcdata build --model MODEL --source {shlex.join(words)} --out DATASET   # pcdata models lists them"]
+    checked = shlex.join(word for word in words if word != "--skip-refused")
+    known = [name for name in ("lerobot", "mcap", "folder") if name in WRITERS]
+    others = ", ".join(f"--to {name}" for name in known[1:])
+    model = "dp3_sim" if facts["signals"] and facts["episodes"] else "MODEL"
     return [
-        ["camera", repr(frame.camera)],
-        *([["views", ", ".join(frame.provenance["cameras"])]] if "cameras" in frame.provenance else []),
-        ["depth", f"{valid.numel():,} of {frame.depth.numel():,} pixels valid{span}"],
-        ["unit", _unit(frame)],
-        ["poses", "none" if frame.frame_id is None else f"lead to {frame.frame_id!r}"],
-        *(["missing", str(line)] for line in frame.provenance.get("missing", ())),
+        f"pcdata validate {checked}",
+        f"pcdata convert {shlex.join(words)} --to {known[0]} --out DIR   # or {others}",
+        f"pcdata build --model {model} --source {shlex.join(words)} --out DATASET   # pcdata models lists them",
     ]
 
 
-def _unit(frame: DepthFrame) -> str:
+def _rows_of(name: str, lines: Iterable[str]) -> list[list[str]]:
+    return [[name * (not number), line] for number, line in enumerate(lines)]
+
+
+def _signal_row(name: str, facts: Mapping[str, Any]) -> str:
+    if "text" in facts:
+        return f"{name}: text, such as {facts['text']!r:.100}"
+    frame = "" if facts["frame"] is None else f" in {facts['frame']!r}"
+    return f"{name}: {facts['kind']}{frame}, {tuple(facts['shape'])} {facts['dtype']}"
+
+
+def _episode_rows(episodes: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    if not episodes:
+        return []
+    lengths = [one["captures"] for one in episodes]
+    span = f"{lengths[0]}" if len(set(lengths)) == 1 else f"{min(lengths)} to {max(lengths)}"
+    rows = [f"{len(episodes)} of {span} captures: {_named(one['id'] for one in episodes)}"]
+    if timed := [one for one in episodes if "seconds" in one]:
+        rates = [one["rate_hz"] for one in timed if "rate_hz" in one]
+        worst = max(timed, key=lambda one: float(one["largest_gap_s"]))
+        even = f"{median(rates):.4g} Hz" if rates else "all at one time"
+        gaps = sum(one["gaps"] for one in timed)
+        told = f", {gaps} gaps, the largest {worst['largest_gap_s']:.3g} s in {worst['id']}" if gaps else ", no gaps"
+        rows.append(f"{sum(one['seconds'] for one in timed):.1f} s in all, {even}{told}")
+    if attributes := {name: value for one in episodes for name, value in one["attributes"].items()}:
+        rows.append("attributes: " + ", ".join(f"{name} ({value!r:.40})" for name, value in attributes.items()))
+    return _rows_of("episodes", rows)
+
+
+def _times_in_words(facts: Mapping[str, Any]) -> str:
+    rate = f", {facts['rate_hz']:.4g} Hz" if "rate_hz" in facts else ""
+    gaps = f"{facts['gaps']} gaps, the largest {facts['largest_gap_s']:.3g} s" if facts["gaps"] else "no gaps"
+    return f"{facts['seconds']:.1f} s{rate}, {gaps}"
+
+
+def _stream_table(streams: Sequence[Mapping[str, Any]]) -> str:
+    header = ["stream", "as", "Hz", "messages", "joined by", "dropped", "doubled", "interpolated", "missing", "gap"]
+    rows = [
+        [
+            "/".join(filter(None, (str(one.get("recording", "")), str(one["topic"]).strip("/")))),
+            str(one["role"]),
+            f"{one['rate_hz']:.4g}" if one.get("rate_hz") else "",
+            *(one.get(word, "") for word in ("messages", "rule", "dropped", "doubled", "interpolated", "missing")),
+            f"{one.get('largest_gap_s', 0.0):.3g} s",
+        ]
+        for one in streams[:_STREAMS_SHOWN]
+    ]
+    more = len(streams) - len(rows)
+    return text_table(header, rows) + (f"\nand {more} more; --json FILE has all" if more else "")
+
+
+def _left_out(skipped: Mapping[str, str]) -> list[str]:
+    lines = [f"{sample_id}: {reason}" for sample_id, reason in list(skipped.items())[:3]]
+    more = len(skipped) - len(lines)
+    return [f"{len(skipped)} captures", *lines, *([f"and {more} more"] if more else [])] if skipped else []
+
+
+def _named(names: Iterable[str]) -> str:
+    listed = list(names)
+    return ", ".join(listed[:3]) + (", ..." if len(listed) > 3 else "")
+
+
+def _frame_rows(facts: Mapping[str, Any]) -> list[list[str]]:
+    depth, changes = facts["depth"], facts["changes"]
+    span = f", {depth['nearest_m']:.3f} to {depth['farthest_m']:.3f} m" if "nearest_m" in depth else ""
+    moved = max(changes.get("cameras_moved_m", [0.0]))
+    moving = f", {moved:.3g} m from the first to the last capture" if moved else ""
+    still = ", the same in the first and the last" if "cameras_moved_m" in changes and not moved else ""
+    still = "" if changes.get("cameras_turned") else still
+    return [
+        *_rows_of("cameras", [_camera_in_words(camera) for camera in facts["cameras"]]),
+        *([["", "intrinsics change from capture to capture"]] if changes.get("intrinsics") else []),
+        ["depth", f"{depth['valid']:,} of {depth['pixels']:,} pixels valid{span}"],
+        ["unit", _unit(facts)],
+        ["images", ", ".join(facts["images"]) or "none beside the depth"],
+        ["poses", "none" if facts["poses"] is None else f"lead to {facts['poses']!r}{moving}{still}"],
+        *(
+            [["sensor", ", ".join(f"{name} {value}" for name, value in facts["sensor"].items())]]
+            * bool(facts["sensor"])
+        ),
+        *([["last", changes["last"]]] if "last" in changes else []),
+    ]
+
+
+def _camera_in_words(camera: Mapping[str, Any]) -> str:
+    lens = "" if camera["lens"] is None else f", lens of {camera['lens']} coefficients"
+    focal = ", ".join(f"{word} {camera[word]:.1f}" for word in ("fx", "fy", "cx", "cy"))
+    return f"{camera['name']}: {camera['width']}x{camera['height']}, {focal}{lens}"
+
+
+def _unit(facts: Mapping[str, Any]) -> str:
     """Say how a stored number became metres, as the reader says it."""
-    stored = frame.provenance.get("metres_per_unit")
-    order = frame.provenance.get("depth_encoding", "plain")
+    stored, order = facts["metres_per_unit"], facts["depth_encoding"]
     unit = "metres" if stored in (None, 1.0) else f"1 stored = {stored:.10g} m"
     return unit if order == "plain" else f"{unit}, {order}"
 
 
-def _cloud_facts(cloud: PointCloud) -> list[list[str]]:
-    if not cloud.num_points:
-        return [["extent", "none, the cloud is empty"], ["fields", ", ".join(cloud.fields())]]
-    low, high = cloud.points.amin(0).tolist(), cloud.points.amax(0).tolist()
-    extent = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high))
-    return [["extent", f"{extent} m"], ["fields", ", ".join(cloud.fields())]]
+def _cloud_rows(facts: Mapping[str, Any]) -> list[list[str]]:
+    if facts["extent_m"] is None:
+        return [["extent", "none, the cloud is empty"], ["fields", ", ".join(facts["fields"])]]
+    extent = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", *facts["extent_m"]))
+    return [["extent", f"{extent} m"], ["fields", ", ".join(facts["fields"])]]
+
+
+def _signal_rows(cloud: PointCloud) -> list[list[str]]:
+    """Tell each signal's name, kind, frame and shape."""
+    return _rows_of("signals", [f"{name}: {signal!r}" for name, signal in cloud.recorded_signals.items()])
+
+
+def size_in_words(size: float) -> str:
+    """Return a number of bytes as a person says it."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if size < 1000 or unit == "GB":
+            break
+        size /= 1000
+    return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"

@@ -57,7 +57,7 @@ def test_a_built_dataset_keeps_the_bits_that_the_capture_had(robot, form, tmp_pa
 
 
 def test_a_capture_is_told_with_its_signals(robot):
-    assert "joints: Signal('invariant': (1, 7) torch.float32)" in capture_text(robot)
+    assert "joints: invariant, (7,) float32" in capture_text(robot)
 
 
 @pytest.mark.parametrize("name", list(COLLATES))

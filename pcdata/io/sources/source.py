@@ -115,6 +115,11 @@ class Source(Selectable["Source"], metaclass=_Recorded):
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         """Load one known sample."""
 
+    @classmethod
+    def glance(cls, path: Path) -> list[str]:
+        """Say in words what lies at a path of this layout, for who cannot open it yet; must not raise for any path."""
+        return []
+
     def unread(self) -> list[str]:
         """Say in words what lies in the capture but is not read, one line for each; nothing of it is an error."""
         return []
@@ -137,6 +142,10 @@ class Source(Selectable["Source"], metaclass=_Recorded):
         left out of one, what remains is cut there.
         """
         return list(self._episodes)
+
+    def times(self) -> dict[str, float]:
+        """Return the seconds of the samples by id, as far as they are known."""
+        return {name: time for name, time in self._times().items() if name in self._known}
 
     @property
     def skipped(self) -> dict[str, str]:

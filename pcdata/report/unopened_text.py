@@ -1,0 +1,108 @@
+"""What can be told of captures that cannot be opened yet: their layout, their files, a first depth image, and why."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcdata.errors import PcdataError
+from pcdata.io.images.reading import DEPTH_SUFFIXES, read_raw_depth
+from pcdata.io.sources.detect import detect_layout
+from pcdata.io.sources.layouts import LAYOUTS
+from pcdata.io.sources.listing import absolute, entries, is_folder
+from pcdata.report.capture_facts import SCHEMA
+from pcdata.report.inspection_text import size_in_words
+from pcdata.report.plain_table import text_table
+
+_MOST_FILES = 10_000  # that are counted
+_TRIED = 20  # images, of which the first that can be depth is told
+_FLAG = re.compile(r"\((--[a-z][a-z-]*[^()]*)\)")  # how messages name the option that helps
+
+
+def unopened_facts(path: str, kind: str | None, error: PcdataError) -> dict[str, Any] | None:
+    """Return what can be told of a path without opening its captures, as JSON can hold it; None where nothing can.
+
+    Args:
+        path: the file or folder.
+        kind: its layout, where that was said.
+        error: why it cannot be opened.
+    """
+    place = absolute(path)
+    if not place.exists():
+        return None
+    try:
+        layout = LAYOUTS.get(kind) if kind is not None else detect_layout(place)
+    except PcdataError:
+        layout = None
+    if layout is None:
+        return None
+    files = _files(place)
+    facts: dict[str, Any] = {
+        "schema": SCHEMA,
+        "name": place.name,
+        "layout": [layout.kind],
+        "files": dict(Counter(file.suffix.lower() or file.name for file in files).most_common()),
+        "bytes": sum(file.stat().st_size for file in files),
+        "contents": layout.glance(place),
+        "refused": f"{type(error).__name__}: {error}",
+        "options": _FLAG.findall(str(error)),
+    }
+    return {**facts, "depth": depth} if (depth := _first_depth(files)) else facts
+
+
+def unopened_text(facts: Mapping[str, Any], words: Sequence[str]) -> str:
+    """Tell what :func:`unopened_facts` found, and the command to go on."""
+    counted = ", ".join(f"{count} {suffix}" for suffix, count in list(facts["files"].items())[:8])
+    rows = [["layout", facts["layout"][0]], ["files", f"{counted}; {size_in_words(facts['bytes'])}"]]
+    rows += [["contents" * (not number), line] for number, line in enumerate(facts["contents"])]
+    if depth := facts.get("depth"):
+        rows.append(["depth", f"{depth['file']}: {depth['width']}x{depth['height']} {depth['dtype']}, {depth['told']}"])
+    rows.append(["not opened", facts["refused"].splitlines()[0]])
+    # An image needs both of these; of other options that a message names, one helps.
+    needed = [option for option in facts["options"] if option.startswith(("--intrinsics", "--metres-per-unit"))]
+    commands = [" ".join(needed)] if needed else facts["options"]
+    rows += [
+        ["next" * (not number), f"pcdata inspect {shlex.join(words)} {options}"]
+        for number, options in enumerate(commands)
+    ]
+    return text_table(["capture", facts["name"]], rows)
+
+
+def _files(place: Path) -> list[Path]:
+    if not is_folder(place):
+        return [place]
+    found: list[Path] = []
+    folders = [place]
+    while folders and len(found) < _MOST_FILES:
+        try:
+            inside = entries(folders.pop())
+        except PcdataError:
+            continue
+        found += [entry for entry in inside if entry.is_file()]
+        folders += [entry for entry in reversed(inside) if is_folder(entry) and not entry.is_symlink()]
+    return found
+
+
+def _first_depth(files: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the size, the type and the range of the numbers of the first image that can be depth."""
+    images = [file for file in files if file.suffix.lower() in DEPTH_SUFFIXES]
+    likely = sorted(images, key=lambda file: ("depth" not in str(file).lower(), files.index(file)))
+    for file in likely[:_TRIED]:
+        try:
+            raw = read_raw_depth("inspect", file)
+        except PcdataError:
+            continue
+        readings = raw[np.isfinite(raw) & (raw > 0)]
+        if not readings.size:
+            continue
+        low, middle, high = readings.min(), np.median(readings), readings.max()
+        told = f"stored numbers from {low:g} to {high:g}, half below {middle:g}; {readings.size / raw.size:.0%} not 0"
+        height, width = raw.shape
+        return {"file": file.name, "width": width, "height": height, "dtype": str(raw.dtype), "told": told}
+    return None
