@@ -36,7 +36,8 @@ EXTRAS = {
         _Extra("small_gicp", "calib", "refining camera poses from clouds"),
         _Extra("numcodecs", "zarr", "zarr chunks packed with Blosc, Zstandard or LZ4"),
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
-        _Extra("av", "av", "recordings of an Azure Kinect (.mkv)"),
+        _Extra("av", "av", "recordings of an Azure Kinect (.mkv) and videos of LeRobot datasets"),
+        _Extra("pyarrow", "lerobot", "LeRobot datasets"),
         _Extra("rosbags", "ros", "RealSense recordings (.bag), and ROS 2 recordings (.mcap)"),
         _Extra("open3d", "open3d", "viewing and comparing with Open3D"),
         _Extra(

@@ -16,7 +16,7 @@ from scipy.io import savemat
 from pcdata.errors import CaptureError
 from pcdata.io import open_source, write_pcd, write_ply
 from pcdata.structures import PointCloud
-from tests import published_captures, simulated_captures
+from tests import lerobot_datasets, published_captures, simulated_captures
 
 HEIGHT, WIDTH = 6, 8
 K: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
@@ -131,7 +131,11 @@ CAPTURES: dict[str, Callable[[Path], Path]] = {  # by layout; a test holds the t
     "realsense_bag": bag_capture,
     "ros": ros_capture,
     "clouds": cloud_files,
+    "lerobot": lerobot_datasets.lossless,
     **published_captures.CAPTURES,
     **simulated_captures.CAPTURES,
 }
-OPTIONS: dict[str, dict[str, Any]] = published_captures.OPTIONS  # by layout: what its files cannot say
+OPTIONS: dict[str, dict[str, Any]] = {  # by layout: what its files cannot say
+    "lerobot": {"metres_per_unit": 0.0001},
+    **published_captures.OPTIONS,
+}

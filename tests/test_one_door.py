@@ -28,6 +28,7 @@ ALLOWED = {
     "io/images/writing.py": {"Image.open": "of bytes that it has made"},
     "io/images/exr.py": {"library.File": "after the door, when its structure was checked"},
     "io/sources/matroska.py": {"av.open": "of a stream that the door has opened"},
+    "io/images/video.py": {"av.open": "of a stream that the door has opened"},
     "io/messages/sqlite_file.py": {"sqlite3.connect": "after the door, to read alone"},
     "io/arrays/hdf5_arrays.py": {"h5py.File": "after the door", "h5o.open": "within a file that is open"},
     "io/store/hdf5_store.py": {"h5py.File": "to write"},

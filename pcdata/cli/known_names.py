@@ -23,6 +23,7 @@ KINDS = (
     "pairs",
     "realsense_bag",
     "azure_kinect",
+    "lerobot",
     "clouds",
 )
 CHECKS = (

@@ -82,7 +82,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "type": lambda text: name_and_value(text),
             "metavar": "NAME=KIND",
             "help": "kind of a recorded stream, such as 'eef=pose xyz_quat_xyzw in base' or joints=invariant; NAME= "
-            "leaves it out; repeatable: robomimic, maniskill",
+            "leaves it out; repeatable: robomimic, maniskill, lerobot",
         },
     ),
     "depth_values": (
@@ -94,6 +94,17 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
     "rows": (
         "--rows",
         {"choices": ("top_first", "bottom_first"), "help": "which row of an image is stored first: robomimic"},
+    ),
+    "extrinsics": (
+        "--extrinsics",
+        {
+            "choices": ("camera_to_frame", "frame_to_camera"),
+            "help": "where matrices called extrinsics lead, which their name does not say: lerobot",
+        },
+    ),
+    "clouds": (
+        "--clouds",
+        {"action": "store_const", "const": True, "help": "read point clouds where there is depth too: lerobot"},
     ),
     "links_to": (
         "--links-to",

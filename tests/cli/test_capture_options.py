@@ -74,6 +74,8 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "near": (["0.01"], 0.01),
         "far": (["4"], 4.0),
         "rows": (["bottom_first"], "bottom_first"),
+        "extrinsics": (["frame_to_camera"], "frame_to_camera"),
+        "clouds": ([], True),
     }
     for name, (flag, _) in _FLAGS.items():
         text, value = words[name]

@@ -95,7 +95,29 @@ def read_raw_depth(where: str, path: Path) -> NDArray[Any]:
         return read_exr_channel(where, path, MAX_PIXELS)
     if suffix == ".npy":
         return _read_npy(where, path)
-    mode, pixels, (bits, _) = _decode(where, path, (_FORMATS[suffix],))
+    return _raw_depth(where, *_decode(where, path, (_FORMATS[suffix],)))
+
+
+def decode_raw_depth(where: str, content: bytes) -> NDArray[Any]:  # (H, W)
+    """Return the numbers of a depth image in memory, a PNG or a TIFF, as :func:`read_raw_depth` does of a file.
+
+    Raises:
+        CaptureError: it is damaged, or not a depth image.
+    """
+    return _raw_depth(where, *decoded_image(where, content, (_PNG if content[:8] == PNG_SIGNATURE else _TIFF,)))
+
+
+def decode_color(where: str, content: bytes) -> NDArray[np.uint8]:  # (H, W, 3)
+    """Return a color image in memory, a PNG or a JPEG, as :func:`read_color` does of a file.
+
+    Raises:
+        CaptureError: it is damaged, or no color image of 8 bits.
+    """
+    return _color(where, *decoded_image(where, content, (_PNG, _JPEG)))
+
+
+def _raw_depth(where: str, mode: str, pixels: NDArray[Any], header: tuple[int, int]) -> NDArray[Any]:
+    bits, _ = header
     if mode.startswith("I;16"):
         return pixels.astype(np.uint16)
     if mode == "F":
@@ -152,14 +174,18 @@ def read_color(path: str | os.PathLike[str]) -> Tensor:  # (H, W, 3) uint8
     """
     where = f"read_color: {path}"
     check_suffix(where, path, COLOR_SUFFIXES)
-    mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG, _JPEG))
+    return torch.from_numpy(_color(where, *_decode(where, Path(path), (_PNG, _JPEG))))
+
+
+def _color(where: str, mode: str, pixels: NDArray[Any], header: tuple[int, int]) -> NDArray[np.uint8]:
+    bits, _ = header
     if mode not in ("RGB", "RGBA") or bits == 16:
         found = f"{bits}-bit {mode}" if bits else mode
         raise CaptureError(
             f"{where}: color must be 8-bit RGB, but this image is {found}; convert it on purpose "
             "(for one gray or infrared channel: repeat it three times, or leave the colors out)"
         )
-    return torch.from_numpy(np.array(pixels[..., :3]))
+    return np.array(pixels[..., :3])
 
 
 @locates_path

@@ -20,6 +20,7 @@ from pcdata.io.sources import (  # noqa: F401
     realsense_bag,
     ros,
     azure_kinect,
+    lerobot,
     cloud_files,
     averaged,
     temporal,

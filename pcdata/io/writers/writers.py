@@ -4,6 +4,7 @@
 from pcdata.io.writers import (  # noqa: F401
     capture_folder,
     mcap,
+    lerobot,
 )
 
 # isort: on

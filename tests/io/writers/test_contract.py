@@ -21,7 +21,7 @@ from tests.disk_limits import largest_file
 from tests.exports.samples import tree
 from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
 
-OPTIONS: dict[str, dict[str, Any]] = {}  # what loses least, by writer
+OPTIONS: dict[str, dict[str, Any]] = {"lerobot": {"color": "image", "fps": 10}}  # what loses least, by writer
 IMAGES = {"color": "colors", "labels": "labels", "mask": "mask", "confidence": "confidence"}
 
 

@@ -1,0 +1,200 @@
+"""Columns of Parquet files, some rows at a time, through pyarrow; what a file claims is checked before it is read."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.errors import CaptureError, PcdataError, add_note, near_matches
+from pcdata.extras import require
+from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
+
+_MAX_ROWS = 1 << 31
+_MAX_GROUP_BYTES = 1 << 32  # of one column in one row group, unpacked: an episode of megapixel images
+_MAX_GROUP_VALUES = 1 << 30  # of one column in one row group: a run length may claim any number in a few bytes
+_BATCH = 1 << 25  # bytes of rows that are in memory at once
+_NUMBERS = "biuf"
+
+
+class ParquetColumns:
+    """An open file. Rows are counted from 0 through all of its row groups."""
+
+    def __init__(self, where: str, path: Path, inside: Iterable[Path]) -> None:
+        """Open a file and look at what it says of itself.
+
+        Raises:
+            CaptureError: it is missing, outside, no Parquet file or damaged, or claims what no recording holds.
+            MissingExtraError: pyarrow is not installed.
+        """
+        require("pyarrow")
+        self._where, self._path = where, path
+        with self._named():
+            self._stream = open_input(where, path, max_bytes=MAX_STREAMED_BYTES, inside=inside)
+            try:
+                parquet = importlib.import_module("pyarrow.parquet")
+                self._file = parquet.ParquetFile(self._stream)
+                self._starts = self._checked_groups()
+                self.names: list[str] = list(self._file.schema_arrow.names)
+            except BaseException:
+                self._stream.close()
+                raise
+        self.num_rows = int(self._starts[-1])
+        self._batches: dict[tuple[str, ...], _Batches] = {}
+
+    def close(self) -> None:
+        """Close the file."""
+        self._batches.clear()
+        self._stream.close()
+
+    def table(self, names: Iterable[str]) -> dict[str, list[Any]]:
+        """Return small columns whole, as Python values."""
+        names = self._checked_names(names)
+        with self._named():
+            found = self._file.read(columns=names, use_threads=False)
+            return {name: found.column(name).to_pylist() for name in names}
+
+    def numbers(self, name: str) -> NDArray[Any]:  # (rows,)
+        """Return a column of one number a row, whole.
+
+        Raises:
+            CaptureError: there is none, it is no column of numbers, or a row has none.
+        """
+        with self._named():
+            column = self._file.read(columns=self._checked_names([name]), use_threads=False).column(name)
+            found = [_numbers(name, chunk) for chunk in column.chunks]
+        values = np.concatenate(found) if found else np.empty(0)
+        if len(values) != self.num_rows:
+            raise CaptureError(f"{self._where}: {self._path}: column {name!r:.100} must hold one number a row")
+        return values
+
+    def row(self, number: int, names: Iterable[str]) -> dict[str, Any]:
+        """Return columns of one row: numbers and lists of them as a flat array, all else as Python values.
+
+        Rows of one row group are read onward from the last one; for others the group is begun again.
+
+        Raises:
+            CaptureError: a column is not there, or a value is missing; or there is no such row.
+        """
+        names = self._checked_names(names)
+        if not 0 <= number < self.num_rows:
+            raise CaptureError(f"{self._where}: {self._path}: there is no row {number} among {self.num_rows}")
+        group = int(np.searchsorted(self._starts, number, side="right")) - 1
+        key = tuple(names)
+        with self._named():
+            batches = self._batches.get(key)
+            if batches is None or not batches.reaches(group, number):
+                batches = self._batches[key] = self._batches_of(group, names)
+            batch, place = batches.at(number)
+            return {name: _value(name, batch.column(name).slice(place, 1)) for name in names}
+
+    def _batches_of(self, group: int, names: list[str]) -> _Batches:
+        rows = int(self._starts[group + 1] - self._starts[group])
+        about = self._file.metadata.row_group(group)
+        wanted = set(names)
+        size = sum(
+            column.total_uncompressed_size
+            for column in map(about.column, range(about.num_columns))
+            if column.path_in_schema in wanted or any(column.path_in_schema.startswith(f"{name}.") for name in wanted)
+        )
+        most = max(1, min(rows, _BATCH * rows // max(size, 1)))
+        found = self._file.iter_batches(batch_size=most, row_groups=[group], columns=names, use_threads=False)
+        return _Batches(group, int(self._starts[group]), found)
+
+    def _checked_groups(self) -> NDArray[np.int64]:
+        """Return the first row of every row group, and the end."""
+        about = self._file.metadata
+        if not 0 <= about.num_rows <= _MAX_ROWS:
+            raise CaptureError(f"claims {about.num_rows} rows")
+        starts = [0]
+        for number in range(about.num_row_groups):
+            group = about.row_group(number)
+            for column in map(group.column, range(group.num_columns)):
+                if not (
+                    0 <= column.total_uncompressed_size <= _MAX_GROUP_BYTES
+                    and 0 <= column.num_values <= _MAX_GROUP_VALUES
+                ):
+                    raise CaptureError(
+                        f"claims {column.num_values} values and {column.total_uncompressed_size} bytes of column "
+                        f"{column.path_in_schema!r:.100} in one row group; no recording holds so many"
+                    )
+            starts.append(starts[-1] + group.num_rows)
+        if starts[-1] != about.num_rows:
+            raise CaptureError(f"claims {about.num_rows} rows but its row groups have {starts[-1]}; it is damaged")
+        return np.asarray(starts, dtype=np.int64)
+
+    def _checked_names(self, names: Iterable[str]) -> list[str]:
+        names = list(names)
+        for name in names:
+            if self.names.count(name) != 1:
+                hint = near_matches(name, self.names) or f"; it has {', '.join(self.names)[:500]}"
+                count = "twice" if name in self.names else "no"
+                raise CaptureError(
+                    f"{self._where}: {self._path}: has {count} column {name!r:.100}{'' if name in self.names else hint}"
+                )
+        return names
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except PcdataError as error:
+            add_note(error, f"while reading {self._path}")
+            raise
+        except Exception as error:  # Arrow's errors are of many types, some of them of Python's own
+            raise CaptureError(
+                f"{self._where}: {self._path}: not a readable Parquet file: {type(error).__name__}: {str(error)[:300]}"
+            ) from error
+
+
+class _Batches:
+    """Rows of one row group, onward from its first."""
+
+    def __init__(self, group: int, start: int, batches: Iterator[Any]) -> None:
+        self._group, self._start, self._batches = group, start, batches
+        self._batch: Any = None
+
+    def reaches(self, group: int, number: int) -> bool:
+        return group == self._group and number >= self._start
+
+    def at(self, number: int) -> tuple[Any, int]:
+        """Return the batch that a row is in, and its place there."""
+        while self._batch is None or number >= self._start + self._batch.num_rows:
+            self._start += 0 if self._batch is None else self._batch.num_rows
+            self._batch = next(self._batches, None)
+            if self._batch is None:
+                raise CaptureError(f"has no row {number}, which its index says it has; it is damaged")
+        return self._batch, number - self._start
+
+
+def _value(name: str, column: Any) -> Any:
+    """Return the one value of a column."""
+    arrow = importlib.import_module("pyarrow")
+    if isinstance(column, arrow.ExtensionArray):
+        column = column.storage
+    if column.null_count:
+        raise CaptureError(f"column {name!r:.100} has no value there")
+    inner = column
+    while arrow.types.is_list(inner.type) or _is_other_list(arrow, inner.type):
+        inner = inner.flatten()
+    if arrow.types.is_primitive(inner.type) or arrow.types.is_boolean(inner.type):
+        return _numbers(name, inner)
+    return column.to_pylist()[0]
+
+
+def _is_other_list(arrow: Any, kind: Any) -> bool:
+    return bool(arrow.types.is_large_list(kind) or arrow.types.is_fixed_size_list(kind))
+
+
+def _numbers(name: str, values: Any) -> NDArray[Any]:
+    if values.null_count:
+        raise CaptureError(f"column {name!r:.100} lacks {values.null_count} values")
+    found: NDArray[Any] = values.to_numpy(zero_copy_only=False)
+    if found.dtype.kind not in _NUMBERS:
+        raise CaptureError(f"column {name!r:.100} must hold numbers, but holds {values.type}")
+    return found

@@ -1,0 +1,478 @@
+"""LeRobot datasets, version 3 and 2: depth in videos, images, arrays or raw files, signals in Parquet, episodes.
+
+Source: see :mod:`pcdata.io.sources.lerobot_index` for the format and :mod:`pcdata.io.sources.lerobot_cameras` for the
+names under which depth and cameras were seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pcdata.contracts.lengths import check_metres_per_unit, ways
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, UnitError, near_matches
+from pcdata.files.handles import Handles
+from pcdata.files.sample_names import check_known, name_some
+from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
+from pcdata.io.arrays.parquet import ParquetColumns
+from pcdata.io.sources.joined_views import join_views
+from pcdata.io.sources.lerobot_cameras import (
+    DepthStream,
+    check_direction,
+    depth_streams,
+    is_number,
+    with_partners,
+)
+from pcdata.io.sources.lerobot_clouds import CloudColumns, cloud_columns
+from pcdata.io.sources.lerobot_facts import DTYPES, FACTS, SignalFacts, facts_of_json
+from pcdata.io.sources.lerobot_index import INDEX_COLUMNS, INFO, RecordedEpisode, read_index, read_json
+from pcdata.io.sources.lerobot_pictures import Pictures
+from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
+from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
+from pcdata.io.sources.listed import checked_folder
+from pcdata.io.sources.listing import LinkTargets, is_file, link_targets
+from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole, check_switch
+from pcdata.io.sources.registry import register_layout
+from pcdata.io.sources.source import Source
+from pcdata.io.sources.stated_kinds import check_stated_names, kind_of, signal_of, stated_kinds
+from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
+
+_TASK = "task"
+_LANGUAGE = ("language_persistent", "language_events")
+_MOST_NUMBERS = 1 << 14  # of a signal: more are an image or a cloud
+_NAMED = 0.001  # probability above which a unit is worth a mention
+
+
+@register_layout
+class _LeRobotSource(Source):
+    """One step a sample, ``EPISODE-STEP``; the columns of numbers and texts are signals, the task is one too."""
+
+    kind = "lerobot"
+    needs = (
+        "meta/info.json, data/ and videos/ of a LeRobot dataset of version 3.0 (or 2) with depth or point clouds; "
+        "reading it needs pyarrow and av"
+    )
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        camera: str | Sequence[str] | None = None,
+        clouds: bool | None = None,
+        metres_per_unit: float | Mapping[str, float] | None = None,
+        invalid_values: Collection[int] = (),
+        intrinsics: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
+        extrinsics: str | None = None,
+        frame_id: str | None = None,
+        signals: Mapping[str, Any] | None = None,
+        links_to: LinkTargets = (),
+    ) -> None:
+        """Read what the dataset says of itself, and where its steps are.
+
+        Args:
+            path: the folder.
+            camera: read this one, or these in their order; None = all that have depth, as views of one sample.
+            clouds: read the point clouds of ``observation.pointcloud``; None = where there is no depth.
+            metres_per_unit: of stored depth, or of the coordinates of clouds, where the dataset does not state it; or
+                of several cameras, by name.
+            invalid_values: stored depths besides 0 that mean "no reading".
+            intrinsics: fx, fy, cx, cy in pixels, where the dataset has none; or of several cameras, by name.
+            extrinsics: where matrices called extrinsics lead, which their name does not say: ``camera_to_frame`` maps
+                points of the camera into the frame, ``frame_to_camera`` the other way; None = they are not read.
+            frame_id: the frame that poses lead to or that clouds are in, where the dataset does not state it.
+            signals: kinds and frames of columns, such as ``{"action": {"kind": "position + invariant 1", "frame":
+                "base"}}``; None for one leaves it out.
+            links_to: folders outside that links in the dataset may lead to.
+
+        Raises:
+            CaptureError: the dataset is incomplete, damaged, or has neither depth nor clouds.
+            UnitError, IntrinsicsError: it lacks the unit or the intrinsics of a camera that no option states.
+            ConfigError: an option has no such value, or names what is not there.
+            MissingExtraError: pyarrow is not installed, or av where there are videos.
+        """
+        path = checked_folder(self.kind, path, self.needs, INFO)
+        where = f"{self.kind} source {path}"
+        self._inside = [path, *link_targets(links_to)]
+        self._invalid = check_invalid_values(where, invalid_values)
+        self._direction = check_direction(where, extrinsics)
+        stated = stated_kinds(where, signals)
+        self._index = read_index(where, path, self._inside)
+        said = read_json(where, path, FACTS, self._inside)
+        self._facts = None if said is None else facts_of_json(where, said, self._index.features)
+        self._episode_by_number = {one.number: one for one in self._index.episodes}
+        self._pictures = Pictures(where, path, self._inside)
+        self._rows = Handles(4)
+        frame = check_name(where, "frame_id", frame_id)
+        self._views: list[tuple[DepthStream, Lens, Pose | None]] = []
+        self._cloud: CloudColumns | None = None
+        self._told: list[str] = []
+        found = self._all_depth(where, path)
+        self.frame_id = frame or "world"
+        if clouds is not None:
+            check_switch(where, "clouds", clouds)
+        if clouds or (clouds is None and not found):
+            self._cloud = cloud_columns(
+                where, path, self._inside, self._index, self._facts, frame, _one_number(where, metres_per_unit)
+            )
+            self._told += [f"depth of {name_some(one.camera for one in found)}; clouds=false reads it"] * bool(found)
+        else:
+            if self._facts is not None and self._facts.frame_id is not None:
+                self.frame_id = frame or self._facts.frame_id
+            chosen = _chosen(where, camera, found)
+            self._told += [f"depth of camera {one.camera}" for one in found if one not in chosen]
+            for stream in chosen:
+                self._views.append(self._view(where, path, stream, metres_per_unit, intrinsics, len(found)))
+            _check_sizes(where, [stream for stream, _, _ in self._views])
+        self._signals = self._signal_columns(where, stated)
+        ids = [f"{one.number:06d}-{step:06d}" for one in self._index.episodes for step in range(one.length)]
+        super().__init__(path, ids, links_to)
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        """``meta/info.json`` beside ``data``."""
+        return is_file(path / INFO) and (path / "data").is_dir()
+
+    # -- what is there ---------------------------------------------------------------------------------------------
+
+    def _all_depth(self, where: str, path: Path) -> list[DepthStream]:
+        if self._facts is not None:
+            return [one.stream() for one in self._facts.cameras]
+        files = self._index.episodes[0].videos
+        lossless = [
+            key
+            for key in files
+            if any(one.videos[key][0].endswith(".mkv") for one in self._index.episodes if key in one.videos)
+        ]
+        found = depth_streams(where, self._index.features, lossless)
+        found += [
+            DepthStream(camera=key, key=key, storage="video")
+            for key in files
+            if key not in self._index.features and "depth" in key
+        ]
+        found += depth_beside(where, path, self._inside, self._index)
+        return [with_partners(one, len(found), self._index.features) for one in found]
+
+    def _view(
+        self, where: str, path: Path, stream: DepthStream, units: Any, intrinsics: Any, count: int
+    ) -> tuple[DepthStream, Lens, Pose | None]:
+        unit = units.get(stream.camera) if isinstance(units, Mapping) else units
+        if unit is not None:
+            unit = check_metres_per_unit(where, unit)
+            if stream.quantized is not None or stream.metres_per_unit not in (None, unit):
+                raise UnitError(
+                    f"{where}: the dataset states the unit of camera {stream.camera!r}; leave out metres_per_unit"
+                )
+            stream = replace(stream, metres_per_unit=unit)
+        if stream.metres_per_unit is None and stream.quantized is None:
+            raise self._no_unit(where, stream)
+        return stream, self._lens(where, path, stream, intrinsics, count), self._pose(stream)
+
+    def _no_unit(self, where: str, stream: DepthStream) -> UnitError:
+        """Name the units that the first image fits."""
+        stored = self._pictures.stored(stream, self._index.episodes[0], 0, self._row)
+        fits = [fit for fit in unit_fits(stored) if fit.probability >= _NAMED][:4]
+        told = f"by its numbers it may be {units_in_words(fits)}" if fits else ways(float(stored.max(initial=0)))
+        example = f"{fits[0].unit.metres:.10g}" if fits else "0.001"
+        return UnitError(
+            f"{where}: nothing states the unit of depth of camera {stream.camera!r} ({stream.key}); {told}. Say "
+            f"metres_per_unit={example} (--metres-per-unit {example}), of one camera alone "
+            f"metres_per_unit={{{stream.camera!r}: {example}}}"
+        )
+
+    def _lens(self, where: str, path: Path, stream: DepthStream, intrinsics: Any, count: int) -> Lens:
+        given = intrinsics
+        if isinstance(intrinsics, Mapping):
+            given = intrinsics.get(stream.camera)
+        elif intrinsics is not None and count > 1:
+            raise ConfigError(
+                f"{where}: intrinsics must say of which camera they are, such as "
+                f"intrinsics={{{stream.camera!r}: (fx, fy, cx, cy)}}"
+            )
+        if given is not None:
+            return lens_of_numbers(check_pinhole(where, given))
+        if stream.intrinsics is not None:
+            return lens_of_column(stream, self._index.features[stream.intrinsics])
+        beside = intrinsics_beside(where, path, self._inside, stream)
+        if beside is not None:
+            return lens_of_numbers(*beside)
+        raise IntrinsicsError(
+            f"{where}: nothing states the intrinsics of camera {stream.camera!r}; say intrinsics={{{stream.camera!r}: "
+            f"(fx, fy, cx, cy)}} in pixels"
+            + (" (--intrinsics FX FY CX CY)" if count == 1 else " (--option intrinsics=...)")
+        )
+
+    def _pose(self, stream: DepthStream) -> Pose | None:
+        if stream.extrinsics is None:
+            return None
+        direction = stream.direction or self._direction
+        if direction is None:
+            self._told.append(
+                f"column {stream.extrinsics}, whose name does not say where it leads; extrinsics=camera_to_frame or "
+                "frame_to_camera (--option) reads it"
+            )
+            return None
+        return Pose(stream.extrinsics, direction == "frame_to_camera")
+
+    def _signal_columns(self, where: str, stated: Mapping[str, Any]) -> dict[str, SignalFacts]:
+        """Return the signals by name: as the dataset's own facts say, else every column that is nothing else."""
+        if self._facts is not None:
+            known = dict(self._facts.signals)
+        else:
+            used = {name for view in self._views for name in _columns_of(*view)}
+            used |= set(self._cloud.columns) if self._cloud is not None else set()
+            known = {}
+            for key, said in self._index.features.items():
+                if key in INDEX_COLUMNS or key in used or key in _LANGUAGE:
+                    continue
+                if str(said.get("dtype")) == "string":
+                    known[key] = SignalFacts(key, "text")
+                elif is_number(said) and _numbers(said) <= _MOST_NUMBERS:
+                    known[key] = SignalFacts(key, "invariant", None, str(said["dtype"]), tuple(_shape(said)))
+            if self._index.episodes[0].tasks and _TASK not in known:
+                known[_TASK] = SignalFacts(None, "text")
+        check_stated_names(where, stated, known)
+        found = {}
+        for name, one in known.items():
+            kind = kind_of(name, stated, (one.kind, one.frame))
+            if kind is not None:
+                found[name] = replace(one, kind=kind[0], frame=kind[1])
+        return found
+
+    # -- what a sample is ------------------------------------------------------------------------------------------
+
+    def files(self, sample_id: str) -> dict[str, Path]:
+        """Return the files that a sample is in, with others: that of its rows, and those of its pictures."""
+        episode, _ = self._place(sample_id)
+        found = {"rows": self.path / episode.file}
+        for stream, _, _ in self._views:
+            for role, key in (("depth", stream.key), ("color", stream.color)):
+                file = None if key is None else self._pictures.file_of(stream, key, episode)
+                if file is not None:
+                    found[f"{stream.camera}_{role}"] = self.path / file
+        return found
+
+    def depth_files(self, sample_id: str) -> list[Path]:
+        """Return none: many samples are in one file."""
+        return []
+
+    def unread(self) -> list[str]:
+        """Name the features that are not read, and episodes whose files are not there."""
+        used = {name for view in self._views for name in _columns_of(*view)} | {*INDEX_COLUMNS}
+        used |= set(self._cloud.columns) if self._cloud is not None else set()
+        used |= {one.column for one in self._signals.values() if one.column is not None}
+        if self._facts is not None:
+            used |= {*self._facts.derived, *([self._facts.time] if self._facts.time else [])}
+        left = [f"feature {key}" for key in self._index.features if key not in used]
+        absent = [f"{len(self._index.absent)} episodes whose rows are not there"] * bool(self._index.absent)
+        return [*self._told, *left, *absent]
+
+    def signals(self, sample_id: str) -> Mapping[str, Signal]:
+        """Read the signals of one sample alone.
+
+        Raises:
+            CaptureError: the sample is unknown, or a value is not of its kind.
+        """
+        check_known(str(self), sample_id, self._known)
+        episode, step = self._place(sample_id)
+        columns = [one.column for one in self._signals.values() if one.column is not None]
+        return self._signals_of(episode, step, self._row(episode, step, columns))
+
+    def _read_episodes(self) -> list[Episode]:
+        found, first = [], 0
+        times = self._own_times()
+        for place, one in enumerate(self._index.episodes):
+            facts = None
+            if self._facts is not None:
+                if one.number >= len(self._facts.episodes):
+                    raise CaptureError(f"{self}: {FACTS} does not know episode {one.number}")
+                facts = self._facts.episodes[one.number]
+            if facts is None:
+                tasks = list(dict.fromkeys(one.tasks))
+                attributes = {"tasks": tasks, "fps": self._index.fps, "episode_index": one.number}
+                robot = self._index.info.get("robot_type")
+                attributes |= {"robot_type": robot} if isinstance(robot, str) else {}
+                found.append(Episode(f"episode_{one.number:06d}", first, one.length, one.seconds, attributes))
+            elif facts.is_episode:
+                own = times[place] if times is not None else ()
+                found.append(Episode(facts.id, first, one.length, own, facts.attributes))
+            first += one.length
+        return found
+
+    def _own_times(self) -> list[list[float]] | None:
+        """Return the seconds of every step as they were recorded, where the dataset keeps them."""
+        if self._facts is None or self._facts.time is None:
+            return None
+        by_file: dict[str, NDArray[Any]] = {}
+        for one in self._index.episodes:
+            if one.file not in by_file:
+                with self._opened(one.file) as table:
+                    by_file[one.file] = table.numbers(self._facts.time)
+        return [by_file[one.file][one.row : one.row + one.length].tolist() for one in self._index.episodes]
+
+    def _times(self) -> dict[str, float]:
+        return {
+            f"{one.number:06d}-{step:06d}": seconds
+            for one in self._index.episodes
+            for step, seconds in enumerate(one.seconds)
+        }
+
+    def _place(self, sample_id: str) -> tuple[RecordedEpisode, int]:
+        number, step = sample_id.split("-")
+        return self._episode_by_number[int(number)], int(step)
+
+    def _opened(self, file: str) -> Any:
+        return self._rows.using(file, lambda: ParquetColumns(str(self), self.path / file, self._inside))
+
+    def _row(self, episode: RecordedEpisode, step: int, columns: Sequence[str]) -> dict[str, Any]:
+        if not columns:
+            return {}
+        with self._opened(episode.file) as table:
+            found: dict[str, Any] = table.row(episode.row + step, columns)
+            return found
+
+    def _load(self, sample_id: str) -> DepthFrame | PointCloud:
+        episode, step = self._place(sample_id)
+        columns = [one.column for one in self._signals.values() if one.column is not None]
+        columns += [name for _, lens, pose in self._views for name in (*lens.columns, *([pose.column] if pose else []))]
+        row = self._row(episode, step, list(dict.fromkeys(columns)))
+        signals = self._signals_of(episode, step, row)
+        facts = {
+            **self.provenance(sample_id),
+            "episode": episode.number,
+            "timestamps": [episode.seconds[step]],
+        }
+        if self._cloud is not None:
+            cloud = self._cloud.cloud(self._row(episode, step, self._cloud.columns))
+            cloud = cloud.with_meta([{"sample_id": sample_id, "provenance": facts}])
+            for name, signal in signals.items():
+                cloud = cloud.with_signal(name, signal.values, signal.kind, signal.frame)
+            return cloud
+        index = sum(one.length for one in self._index.episodes if one.number < episode.number) + step
+        frames = [self._frame(sample_id, index, view, episode, step, row, facts) for view in self._views]
+        names = [stream.camera for stream, _, _ in self._views]
+        frame = join_views(frames, {**_shared([one.provenance for one in frames]), "cameras": names})
+        return replace(frame, recorded_signals=signals)
+
+    def _frame(
+        self,
+        sample_id: str,
+        index: int,
+        view: tuple[DepthStream, Lens, Pose | None],
+        episode: RecordedEpisode,
+        step: int,
+        row: Mapping[str, Any],
+        facts: Mapping[str, Any],
+    ) -> DepthFrame:
+        stream, lens, pose = view
+        where = f"{self}: camera {stream.camera!r}"
+        depth, about = self._pictures.depth(stream, episode, step, self._row, self._invalid)
+        size = (depth.shape[0], depth.shape[1])
+        camera, turn = lens.camera(where, size, row)
+        colors = None
+        if stream.color is not None:
+            color = self._pictures.color(stream.color, episode, step, self._row)
+            if color.shape[:2] != depth.shape:
+                raise CaptureError(
+                    f"{where}: its color image {stream.color} has {color.shape[1]}x{color.shape[0]} pixels, its depth "
+                    f"{size[1]}x{size[0]}; they are of one size or not of one camera"
+                )
+            colors = torch.from_numpy(color)[None]
+        world = None if pose is None else (pose.matrix(where, row) @ turn)[None]
+        return DepthFrame(
+            depth=torch.from_numpy(depth)[None],
+            camera=camera,
+            colors=colors,
+            world_from_camera=world,
+            frame_id=None if world is None else self.frame_id,
+            sample_id=sample_id,
+            capture_index=index,
+            provenance={**facts, **about},
+        )
+
+    def _signals_of(self, episode: RecordedEpisode, step: int, row: Mapping[str, Any]) -> dict[str, Signal]:
+        found = {}
+        for name, one in self._signals.items():
+            values: Any
+            if one.dtype is None:
+                text = row[one.column] if one.column is not None else episode.tasks[step]
+                if not isinstance(text, str):
+                    raise CaptureError(f"{self}: column {one.column!r} must hold texts, got {type(text).__name__}")
+                values = (text,)
+            else:
+                values = _tensor(f"{self}: column {one.column!r}", row[str(one.column)], one)
+            found[name] = signal_of(str(self), name, values, (one.kind, one.frame))
+        return found
+
+
+def _columns_of(stream: DepthStream, lens: Lens, pose: Pose | None) -> list[str]:
+    return [
+        stream.key,
+        *([stream.color] if stream.color else []),
+        *lens.columns,
+        *([pose.column] if pose else []),
+    ]
+
+
+def _tensor(where: str, values: Any, one: SignalFacts) -> torch.Tensor:
+    count = int(np.prod(one.shape, dtype=np.int64))
+    if not isinstance(values, np.ndarray) or values.size != count:
+        found = f"{values.size} numbers" if isinstance(values, np.ndarray) else type(values).__name__
+        raise CaptureError(f"{where}: must hold {list(one.shape)} numbers as its feature says, got {found}")
+    # torch has no unsigned integers above 8 bits to compute with: the next wider signed ones hold them all.
+    wider = {"uint16": "int32", "uint32": "int64", "uint64": "int64"}.get(values.dtype.name)
+    if values.dtype == np.uint64 and values.size and values.max() >= 1 << 63:
+        raise CaptureError(f"{where}: holds {values.max()}, above what int64 holds")
+    tensor = torch.from_numpy(np.array(values if wider is None else values.astype(wider)))
+    wanted = DTYPES.get(str(one.dtype), tensor.dtype)
+    return tensor.to(wanted).reshape(1, *one.shape)
+
+
+def _shared(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
+
+
+def _shape(said: Mapping[str, Any]) -> list[int]:
+    shape = said.get("shape", [1])
+    return list(shape) if isinstance(shape, list) else [shape]
+
+
+def _numbers(said: Mapping[str, Any]) -> int:
+    return int(np.prod(_shape(said), dtype=np.float64))
+
+
+def _one_number(where: str, unit: Any) -> float | None:
+    if isinstance(unit, Mapping):
+        raise ConfigError(f"{where}: metres_per_unit of clouds must be one number, got {unit!r:.100}")
+    return None if unit is None else check_metres_per_unit(where, unit)
+
+
+def _chosen(where: str, camera: Any, found: list[DepthStream]) -> list[DepthStream]:
+    names = [one.camera for one in found]
+    if camera is None:
+        return found
+    wanted = [camera] if isinstance(camera, str) else camera
+    if not isinstance(wanted, (list, tuple)) or not wanted or not all(isinstance(name, str) for name in wanted):
+        raise ConfigError(f"{where}: camera must be a name, or a list of names, got {camera!r:.100}")
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(
+                f"{where}: there is no depth of a camera {name!r:.100}{near_matches(name, names)}; there is of "
+                f"{', '.join(names) or 'none'}"
+            )
+    return [found[names.index(name)] for name in dict.fromkeys(wanted)]
+
+
+def _check_sizes(where: str, streams: Sequence[DepthStream]) -> None:
+    sizes = {one.camera: one.size for one in streams if one.size is not None}
+    if len(set(sizes.values())) > 1:
+        told = ", ".join(f"{name} {size[1]}x{size[0]}" for name, size in sizes.items())
+        raise CaptureError(
+            f"{where}: its cameras have images of different sizes ({told}), which are no views of one sample; say "
+            "which to read: camera=NAME (--camera NAME)"
+        )

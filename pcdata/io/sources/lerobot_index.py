@@ -1,0 +1,364 @@
+"""What a LeRobot dataset says of itself: its features, and in which row and at which second of a video each step is.
+
+Source: LeRobot, ``datasets/utils.py``, ``dataset_metadata.py`` and ``dataset_reader.py`` (0.6), for version 3.0;
+``convert_dataset_v21_to_v30.py`` for version 2, where every episode has files of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcdata.errors import CaptureError
+from pcdata.files.opening import check_inside, read_text
+from pcdata.files.sample_names import name_some
+from pcdata.files.strict_json import json_object
+from pcdata.io.arrays.parquet import ParquetColumns
+from pcdata.io.sources.listing import entries, has_file, is_folder
+
+INFO = "meta/info.json"
+INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+TASKS_PATH = "meta/tasks.parquet"
+_DATA = {3: DATA_PATH,
+         2: "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"}  # fmt: skip
+_VIDEO = {3: VIDEO_PATH,
+          2: "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"}  # fmt: skip
+_FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
+_VIDEO_COLUMN = re.compile(r"videos/(.+)/chunk_index")
+_MAX_TEXT = 1 << 28
+_MOST = 1 << 40  # of any number in the index
+_LATEST = 1e9  # seconds into a video
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """One episode.
+
+    Args:
+        number: its ``episode_index``.
+        file: of its rows, from the folder of the dataset.
+        row: of its first step.
+        seconds: (length,) of every step, by which its videos are read.
+        tasks: (length,) the text of each step's task.
+        videos: by key, the file and the second in it where the episode begins.
+    """
+
+    number: int
+    file: str
+    row: int
+    seconds: tuple[float, ...]
+    tasks: tuple[str, ...]
+    videos: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+
+    @property
+    def length(self) -> int:
+        """How many steps it has."""
+        return len(self.seconds)
+
+
+@dataclass(frozen=True)
+class LeRobotIndex:
+    """What is known of a dataset once it is opened.
+
+    Args:
+        info: ``meta/info.json``.
+        features: of it, by key.
+        fps: steps in a second.
+        episodes: those whose rows are there, in order.
+        absent: the numbers of episodes whose rows are not there, as after a download of some.
+    """
+
+    info: Mapping[str, Any]
+    features: Mapping[str, Mapping[str, Any]]
+    fps: float
+    episodes: tuple[RecordedEpisode, ...]
+    absent: tuple[int, ...]
+
+
+def read_index(where: str, root: Path, inside: Sequence[Path]) -> LeRobotIndex:
+    """Read all but pictures and features.
+
+    Args:
+        where: for messages.
+        root: the folder.
+        inside: what files may lie in, once links have been followed.
+
+    Raises:
+        CaptureError: a file is missing, damaged or outside, or its numbers contradict each other.
+    """
+    text = read_text(where, root / INFO, max_bytes=_MAX_TEXT, inside=inside)
+    info = json_object(f"{where}: {INFO}", text, error=CaptureError)
+    version, features, fps = _version(where, info), _features(where, info), _fps(where, info)
+    read = _episodes_v3 if version == 3 else _episodes_v2
+    keys = [key for key, said in features.items() if "video" in str(said.get("dtype"))]
+    listed, tasks = read(_Opened(where, root, inside, info, version), keys)
+    episodes, absent = [], []
+    files: dict[str, list[dict[str, Any]]] = {}
+    for one in listed:
+        files.setdefault(one["file"], []).append(one)
+    for file, own in files.items():
+        if has_file(root / file):
+            episodes += _located(where, root / file, inside, own, tasks)
+        else:
+            absent += [one["number"] for one in own]
+    if not episodes:
+        raise CaptureError(f"{where}: none of its files of rows is there, such as {next(iter(files), 'any')}")
+    return LeRobotIndex(info, features, fps, tuple(sorted(episodes, key=lambda one: one.number)), tuple(sorted(absent)))
+
+
+@dataclass(frozen=True)
+class _Opened:
+    where: str
+    root: Path
+    inside: Sequence[Path]
+    info: Mapping[str, Any]
+    version: int
+
+    def path(self, key: str, default: Mapping[int, str], **fields: Any) -> str:
+        """Fill in the pattern of a path; the result lies in the folder.
+
+        Raises:
+            CaptureError: it has other fields, or leads elsewhere.
+        """
+        template = self.info.get(key) or default[self.version]
+        if not isinstance(template, str) or len(template) > 500:
+            raise CaptureError(f"{self.where}: {INFO}: {key} must be a pattern of paths, got {template!r:.100}")
+
+        def filled(match: re.Match[str]) -> str:
+            name, width = match.groups()
+            if name not in fields or (width and not isinstance(fields[name], int)):
+                raise CaptureError(
+                    f"{self.where}: {INFO}: {key} {template!r:.200} has a field {match[0]!r} that is not known"
+                )
+            return str(fields[name]).zfill(int(width or 0))
+
+        path = _FIELD.sub(filled, template)
+        parts = path.replace("\\", "/").split("/")
+        if "{" in path or "}" in path or path.startswith(("/", "\\", "~")) or ".." in parts or ":" in path:
+            raise CaptureError(
+                f"{self.where}: {INFO}: {key} {template!r:.200} leads out of the dataset, to {path!r:.200}"
+            )
+        return path
+
+    def video(self, key: str, **fields: Any) -> str:
+        """Return the file of a video; depth without loss is in .mkv files where the pattern says .mp4."""
+        path = self.path("video_path", _VIDEO, video_key=key, **fields)
+        other = f"{path.rpartition('.')[0]}.mkv"
+        return other if not has_file(self.root / path) and has_file(self.root / other) else path
+
+    def lines(self, name: str) -> list[dict[str, Any]]:
+        """Read a file of one JSON object a line."""
+        text = read_text(self.where, self.root / name, max_bytes=_MAX_TEXT, inside=self.inside)
+        return [
+            json_object(f"{self.where}: {name} line {number}", line, error=CaptureError)
+            for number, line in enumerate(text.splitlines(), 1)
+            if line.strip()
+        ]
+
+    def tables(self, folder: str) -> list[ParquetColumns]:
+        """Open the Parquet files of a folder of chunks, in order."""
+        found = []
+        for chunk in entries(self.root / folder) if is_folder(self.root / folder) else []:
+            if is_folder(chunk):
+                found += [one for one in entries(chunk) if one.suffix == ".parquet"]
+        if not found:
+            raise CaptureError(f"{self.where}: has no {folder}/chunk-000/file-000.parquet")
+        return [ParquetColumns(self.where, path, self.inside) for path in sorted(found)]
+
+
+def _version(where: str, info: Mapping[str, Any]) -> int:
+    stated = info.get("codebase_version")
+    match = re.fullmatch(r"v?([23])\.\d+(\.\d+)?", stated) if isinstance(stated, str) else None
+    if match is None:
+        raise CaptureError(
+            f"{where}: {INFO}: codebase_version must be v2.0, v2.1 or v3.0, got {stated!r:.60}; convert it with the "
+            "scripts of the lerobot package"
+        )
+    return int(match[1])
+
+
+def _features(where: str, info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    features = info.get("features")
+    if not isinstance(features, dict) or not all(isinstance(said, dict) for said in features.values()):
+        raise CaptureError(f"{where}: {INFO}: features must be an object of objects, got {features!r:.100}")
+    for key, said in features.items():
+        shape = said.get("shape", [1])
+        sides = shape if isinstance(shape, list) else [shape]
+        if not all(isinstance(side, int) and not isinstance(side, bool) and 0 <= side < 1 << 31 for side in sides):
+            raise CaptureError(f"{where}: {INFO}: the shape of {key!r:.100} must be whole numbers, got {shape!r:.100}")
+    return features
+
+
+def _fps(where: str, info: Mapping[str, Any]) -> float:
+    fps = info.get("fps")
+    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1e6:
+        raise CaptureError(f"{where}: {INFO}: fps must be steps in a second, got {fps!r:.60}")
+    return float(fps)
+
+
+def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
+    needed = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
+    listed = []
+    for table in opened.tables("meta/episodes"):
+        try:
+            # Of more than the features: depth without loss may be a video that the format does not know as one.
+            found = (_VIDEO_COLUMN.fullmatch(name) for name in table.names)
+            videos = [match[1] for match in found if match]
+            parts = [
+                f"videos/{key}/{part}" for key in videos for part in ("chunk_index", "file_index", "from_timestamp")
+            ]
+            columns = {name: table.numbers(name) for name in (*needed, *parts)}
+        finally:
+            table.close()
+        for row in range(table.num_rows):
+            said = {name: _whole(opened.where, name, columns[name][row]) for name in needed}
+            at = {}
+            for key in videos:
+                chunk, file = (
+                    _whole(opened.where, part, columns[f"videos/{key}/{part}"][row])
+                    for part in ("chunk_index", "file_index")
+                )
+                begin = float(columns[f"videos/{key}/from_timestamp"][row])
+                if not 0 <= begin < _LATEST:
+                    raise CaptureError(f"{opened.where}: videos/{key}/from_timestamp must be seconds, got {begin}")
+                at[key] = (opened.video(key, chunk_index=chunk, file_index=file), begin)
+            chunk, file = said["data/chunk_index"], said["data/file_index"]
+            listed.append(
+                {
+                    "number": said["episode_index"],
+                    "length": said["length"],
+                    "first": said["dataset_from_index"],
+                    "file": opened.path("data_path", _DATA, chunk_index=chunk, file_index=file),
+                    "videos": at,
+                }
+            )
+    _check_apart(opened.where, listed)
+    return listed, _tasks_v3(opened)
+
+
+def _check_apart(where: str, listed: list[dict[str, Any]]) -> None:
+    """Require episodes with numbers of their own that share no step."""
+    if len({one["number"] for one in listed}) != len(listed):
+        raise CaptureError(f"{where}: meta/episodes: two episodes have one episode_index")
+    end = 0
+    for one in sorted(listed, key=lambda one: int(one["first"])):
+        if one["first"] < end:
+            raise CaptureError(
+                f"{where}: meta/episodes: episode {one['number']} begins at {one['first']}, before the end of another "
+                f"at {end}"
+            )
+        end = one["first"] + one["length"]
+
+
+def _tasks_v3(opened: _Opened) -> dict[int, str]:
+    path = opened.root / TASKS_PATH
+    if not has_file(path):
+        return {}
+    table = ParquetColumns(opened.where, path, opened.inside)
+    try:
+        # pandas writes an index without a name under one that it makes up.
+        text = next((name for name in ("task", "__index_level_0__") if name in table.names), None)
+        if text is None:
+            raise CaptureError(f"{opened.where}: {path}: has no column task; it has {name_some(table.names)}")
+        columns = table.table([text, "task_index"])
+    finally:
+        table.close()
+    return _tasks(opened.where, [*zip(columns["task_index"], columns[text])])
+
+
+def _episodes_v2(opened: _Opened, keys: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
+    chunks = opened.info.get("chunks_size", 1000)
+    if not isinstance(chunks, int) or isinstance(chunks, bool) or not 0 < chunks < 1 << 31:
+        raise CaptureError(f"{opened.where}: {INFO}: chunks_size must be a whole number from 1, got {chunks!r:.60}")
+    listed, first = [], 0
+    for said in opened.lines("meta/episodes.jsonl"):
+        number = _whole(opened.where, "episode_index", said.get("episode_index"))
+        length = _whole(opened.where, "length", said.get("length"))
+        fields = {"episode_chunk": number // chunks, "chunk_index": number // chunks, "episode_index": number}
+        listed.append(
+            {
+                "number": number,
+                "length": length,
+                "first": first,
+                "file": opened.path("data_path", _DATA, **fields),
+                "videos": {key: (opened.video(key, **fields), 0.0) for key in keys},
+            }
+        )
+        first += length
+    _check_apart(opened.where, listed)
+    told = opened.lines("meta/tasks.jsonl") if has_file(opened.root / "meta/tasks.jsonl") else []
+    return listed, _tasks(opened.where, [(one.get("task_index"), one.get("task")) for one in told])
+
+
+def _tasks(where: str, rows: list[tuple[Any, Any]]) -> dict[int, str]:
+    found = {}
+    for number, text in rows:
+        if not isinstance(text, str):
+            raise CaptureError(f"{where}: meta/tasks: a task must be a text, got {text!r:.100}")
+        found[_whole(where, "task_index", number)] = text
+    return found
+
+
+def _located(
+    where: str, path: Path, inside: Sequence[Path], listed: list[dict[str, Any]], tasks: Mapping[int, str]
+) -> list[RecordedEpisode]:
+    """Find the rows of the episodes of one file, and hold their own numbers to what the index says of them."""
+    table = ParquetColumns(where, path, inside)
+    try:
+        numbers = {name: table.numbers(name) for name in INDEX_COLUMNS if name in table.names or name != "task_index"}
+    finally:
+        table.close()
+    of = numbers["episode_index"]
+    found = []
+    for one in listed:
+        rows = np.flatnonzero(of == one["number"])
+        first = int(rows[0]) if len(rows) else 0
+        if len(rows) != one["length"] or not len(rows) or int(rows[-1]) != first + len(rows) - 1:
+            raise CaptureError(
+                f"{where}: {path}: episode {one['number']} should have {one['length']} rows, one after another, but "
+                f"{len(rows)} have its episode_index"
+            )
+        own = {name: values[first : first + len(rows)] for name, values in numbers.items()}
+        if not np.array_equal(own["frame_index"], np.arange(len(rows))):
+            raise CaptureError(f"{where}: {path}: frame_index of episode {one['number']} must count from 0")
+        seconds = own["timestamp"].astype(np.float64)
+        if not (np.isfinite(seconds).all() and (np.abs(seconds) < _LATEST).all()):
+            raise CaptureError(f"{where}: {path}: timestamp of episode {one['number']} must be finite seconds")
+        texts = _texts(where, own["task_index"], tasks) if "task_index" in own else ()
+        found.append(RecordedEpisode(one["number"], one["file"], first, tuple(seconds.tolist()), texts, one["videos"]))
+    return found
+
+
+def _texts(where: str, numbers: NDArray[Any], tasks: Mapping[int, str]) -> tuple[str, ...]:
+    if not tasks:
+        return ()
+    for number in np.unique(numbers).tolist():
+        if number not in tasks:
+            raise CaptureError(f"{where}: a step has task_index {number}, which meta/tasks does not have")
+    return tuple(tasks[number] for number in numbers.tolist())
+
+
+def _whole(where: str, name: str, value: Any) -> int:
+    is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if isinstance(value, (float, np.floating)) and float(value).is_integer():  # pandas makes floats of gaps
+        is_whole = True
+    if not is_whole or not 0 <= value < _MOST:
+        raise CaptureError(f"{where}: {name} must be a whole number from 0, got {value!r:.60}")
+    return int(value)
+
+
+def read_json(where: str, root: Path, name: str, inside: Sequence[Path]) -> dict[str, Any] | None:
+    """Return a JSON object of the dataset; None where there is no such file."""
+    if not has_file(root / name):
+        return None
+    check_inside(where, root / name, inside)
+    return json_object(f"{where}: {name}", read_text(where, root / name, max_bytes=_MAX_TEXT), error=CaptureError)

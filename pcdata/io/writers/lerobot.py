@@ -1,0 +1,507 @@
+"""Captures as a LeRobot dataset, version 3.0, that keeps what depth means: lossless, with its unit, cameras and poses.
+
+The package lerobot opens it as it is. What the format has no place for stands beside it: depth as lossless videos that
+are no feature (``depth.CAMERA``), and ``meta/pcdata.json``.
+
+Source: LeRobot 0.6, ``datasets/dataset_writer.py``, ``dataset_metadata.py``, ``feature_utils.py``.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pcdata.contracts.lengths import check_metres_per_unit
+from pcdata.errors import CaptureError, ConfigError
+from pcdata.functional.depth.stored_depth import metres_of_value
+from pcdata.io.sources.lerobot_facts import FACTS, CameraFacts, DatasetFacts, EpisodeFacts
+from pcdata.io.sources.lerobot_index import DATA_PATH, INFO, VIDEO_PATH
+from pcdata.io.writers.lerobot_columns import (
+    camera_names,
+    derived_columns,
+    derived_value,
+    index_features,
+    number_feature,
+    signal_columns,
+    signal_features,
+    signal_value,
+)
+from pcdata.io.writers.lerobot_stats import AllStats, ColorStats, Stats, stats_of
+from pcdata.io.writers.lerobot_tables import FILE_MEGABYTES, RowsWriter, write_episodes_table, write_tasks_table
+from pcdata.io.writers.lerobot_videos import FILE_MEGABYTES as VIDEO_MEGABYTES
+from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK, VideoWriter
+from pcdata.io.writers.registry import register_writer
+from pcdata.io.writers.writer import Captures, Writer
+from pcdata.structures import DepthFrame, Episode, Signal
+
+DepthStorage = Literal["auto", "ffv1", "image", "array"]
+ColorStorage = Literal["video", "image", "none"]
+
+_UNITS = (0.001, 0.0001, 0.00025, 0.0002, 0.000125)  # of sensors: tried where captures do not state theirs
+_HIGHEST = 65535
+_TIME = "recorded_time"
+_STATE, _ACTION = "observation.state", "action"
+_MOST_IN_STATS = 1 << 14  # numbers of a feature: an image or a cloud of numbers is normalized by nobody
+_COMPRESSION = 3  # of PNG: half the time of the default, and as small
+
+
+@register_writer
+@dataclass(frozen=True, kw_only=True)
+class LeRobotWriter(Writer):
+    """LeRobot v3.0.
+
+    Args:
+        depth: "ffv1": lossless 16-bit videos beside the features; "image": 16-bit PNG in the rows, which the package
+            lerobot reads too; "array": float32 metres in the rows; "auto": ffv1 where the depth of the first capture
+            is whole units, else array.
+        metres_per_unit: of stored depth, which is rounded to it; None = the unit that the first capture is whole in.
+        color: "video": H.264, whose loss shows; "image": PNG; "none": left out.
+        fps: steps in a second; None = of the times of the episodes.
+        state: signals that ``observation.state`` repeats in one row, as policies take them.
+        action: the same of ``action``, where no signal is called so.
+        registered_to: what to say of whose pixels depth has; None = of color, where captures have that.
+        robot_type: the name of the robot.
+    """
+
+    kind: ClassVar[str] = "lerobot"
+    layout: ClassVar[str] = "LeRobot v3.0: Parquet, videos, and depth without loss; needs pyarrow and av"
+    keeps: ClassVar[frozenset[str]] = frozenset({"color", "lens", "pose", "signals"})
+    depth: DepthStorage = "auto"
+    metres_per_unit: float | None = None
+    color: ColorStorage = "video"
+    fps: float | None = None
+    state: Sequence[str] = ()
+    action: Sequence[str] = ()
+    registered_to: str | None = None
+    robot_type: str | None = None
+
+    def __post_init__(self) -> None:
+        for option, value, known in (
+            ("depth", self.depth, get_args(DepthStorage)),
+            ("color", self.color, get_args(ColorStorage)),
+        ):
+            if value not in known:
+                raise ConfigError(f"lerobot: {option} must be one of {', '.join(known)}, got {value!r:.60}")
+        if self.metres_per_unit is not None:
+            check_metres_per_unit("lerobot", self.metres_per_unit)
+        if self.depth == "array" and self.metres_per_unit is not None:
+            raise ConfigError("lerobot: depth=array stores metres as they are; leave out metres_per_unit")
+        fps: Any = self.fps
+        if fps is not None and not (isinstance(fps, (int, float)) and 1 <= fps <= 1000):
+            raise ConfigError(f"lerobot: fps must be steps in a second, 1 or more, got {fps!r:.60}")
+        for option, text in (("registered_to", self.registered_to), ("robot_type", self.robot_type)):
+            if text is not None and not (isinstance(text, str) and text):
+                raise ConfigError(f"lerobot: {option} must be a text, got {text!r:.60}")
+
+    def write(self, captures: Captures, folder: Path) -> None:
+        """Write all captures, episode after episode; captures of no episode become episodes between them."""
+        written: _Dataset | None = None
+        parts = _parts(captures)
+        try:
+            for episode in parts:
+                ids = captures.ids[episode.first : episode.first + episode.length]
+                for sample_id, frame in captures.read(ids):
+                    if written is None:
+                        written = _Dataset(self, captures, folder, sample_id, frame, parts)
+                    if sample_id == ids[0]:
+                        written.begin(episode)
+                    written.add(sample_id, frame)
+                if written is not None:
+                    written.end(episode)
+            if written is not None:
+                written.close()
+        except BaseException:
+            if written is not None:
+                written.abandon()
+            raise
+
+
+@dataclass(frozen=True)
+class _View:
+    """One camera as it is written."""
+
+    facts: CameraFacts
+    unit: float | None
+    depth: VideoWriter | None
+    color: VideoWriter | None
+
+
+class _Dataset:
+    """The files that grow, one step at a time."""
+
+    def __init__(
+        self,
+        options: LeRobotWriter,
+        captures: Captures,
+        folder: Path,
+        sample_id: str,
+        first: DepthFrame,
+        parts: Sequence[Episode],
+    ) -> None:
+        self._options, self._captures, self._folder = options, captures, folder
+        self._first_id, self._first = sample_id, first
+        self._fps = _rate(parts) if options.fps is None else max(1, round(options.fps))
+        if options.fps is not None and self._fps != options.fps:
+            raise ConfigError(f"lerobot: fps must be a whole number, got {options.fps:g}")
+        self._signals = signal_columns(f"lerobot: {sample_id}", first.recorded_signals)
+        self._derived: dict[str, Sequence[str]] = {}
+        self._features: dict[str, dict[str, Any]] = signal_features(self._signals)
+        for option, column, names in (("state", _STATE, options.state), ("action", _ACTION, options.action)):
+            feature = derived_columns("lerobot", option, column, names, self._signals)
+            if feature is not None:
+                self._features[column] = feature
+                self._derived[column] = names
+        self._has_times = any(one.times for one in parts)
+        if self._has_times:
+            self._features[_TIME] = number_feature("float64", [1])
+        names = camera_names(first)
+        self._views = [self._view(name, view) for view, name in enumerate(names)]
+        self._features |= index_features()
+        self._rows = RowsWriter(folder, self._features)
+        self._tasks: dict[str, int] = {}
+        self._episodes: list[dict[str, Any]] = []
+        self._episode_facts: list[EpisodeFacts] = []
+        self._all_stats = AllStats()
+        self._count = 0  # steps so far
+        self._check_partners()
+
+    # -- what is written -------------------------------------------------------------------------------------------
+
+    def _view(self, name: str, view: int) -> _View:
+        options, first = self._options, self._first
+        height, width = first.size
+        storage, unit = self._storage(view)
+        depth_key = f"depth.{name}" if storage != "image" else f"observation.images.{name}_depth"
+        depth = None
+        if storage == "ffv1":
+            depth = VideoWriter(self._folder, depth_key, self._fps, is_depth=True)
+        elif storage == "image":
+            about = {"is_depth_map": True, **({"depth_unit": "mm"} if unit == 0.001 else {})}
+            names = ["height", "width", "channels"]
+            self._features[depth_key] = {**number_feature("image", [height, width, 1], names), "info": about}
+        else:
+            self._features[depth_key] = number_feature("float32", [height, width], ["height", "width"])
+        color_key, color = None, None
+        if first.colors is not None and options.color == "none":
+            self._captures.lose(
+                "color", "left out, as color=none says", captures=len(self._captures) if not view else 0
+            )
+        elif first.colors is not None:
+            color_key = f"observation.images.{name}"
+            self._features[color_key] = number_feature(
+                options.color, [height, width, 3], ["height", "width", "channels"]
+            )
+            if options.color == "video":
+                color = VideoWriter(self._folder, color_key, self._fps, is_depth=False)
+        base = f"camera.{name}"
+        self._features[f"{base}.intrinsics"] = number_feature("float64", [3, 3])
+        lens, pose = None, None
+        if first.camera.distortion is not None:
+            lens = f"{base}.distortion"
+            self._features[lens] = number_feature("float64", [first.camera.distortion.shape[1]])
+        if first.world_from_camera is not None:
+            pose = f"{base}.{str(first.frame_id).replace('/', '_')}_from_camera"
+            self._features[pose] = number_feature("float64", [4, 4])
+        facts = CameraFacts(
+            name=name,
+            depth=depth_key,
+            storage="video" if storage == "ffv1" else "image" if storage == "image" else "array",
+            size=(height, width),
+            intrinsics=f"{base}.intrinsics",
+            metres_per_unit=unit,
+            registered_to=options.registered_to or color_key,
+            color=color_key,
+            distortion=lens,
+            world_from_camera=pose,
+            is_window=first.camera.is_window,
+        )
+        return _View(facts, unit, depth, color)
+
+    def _storage(self, view: int) -> tuple[str, float | None]:
+        """Return how the depth of a view is stored, and its unit."""
+        options = self._options
+        if options.depth == "array":
+            return "array", None
+        unit = options.metres_per_unit
+        if unit is None:
+            stated = self._first.provenance.get("metres_per_unit")
+            known = [float(stated)] if isinstance(stated, (int, float)) and 0 < stated < 1 else []
+            metres = self._first.depth[view].numpy()
+            unit = next((one for one in [*known, *_UNITS] if _is_whole(metres, one)), None)
+        if unit is not None:
+            return ("ffv1" if options.depth == "auto" else options.depth), unit
+        if options.depth == "auto":
+            self._captures.note("depth is no whole units of any sensor: float32 metres in the rows (depth=array)")
+            return "array", None
+        raise ConfigError(
+            f"lerobot: depth={options.depth} stores whole numbers, and the depth of {self._first_id} is no whole units "
+            "of any sensor; say metres_per_unit=0.0001 to round to a tenth of a millimetre (it reaches 6.5 m), or "
+            "depth=array to keep it as it is"
+        )
+
+    def _check_partners(self) -> None:
+        if not self._signals:
+            self._captures.note("captures have no signals, so the dataset has neither state nor action")
+        elif _STATE not in self._features:
+            self._captures.note(
+                f"there is no {_STATE}, which LeRobot's policies take; state=[NAME, ...] makes it of signals"
+            )
+        if _ACTION not in self._features and self._signals:
+            self._captures.note("there is no action; action=[NAME, ...] makes it of signals")
+
+    # -- step after step -------------------------------------------------------------------------------------------
+
+    def begin(self, episode: Episode) -> None:
+        """Start an episode."""
+        self._step = 0
+        self._episode = episode
+        self._of_episode: dict[str, list[NDArray[Any]]] = {}
+        self._color_stats: dict[str, ColorStats] = {}
+        self._tasks_of_episode: dict[str, None] = {}
+        self._place: dict[str, Any] = {f"data/{name}": value for name, value in self._rows.begin_episode().items()}
+        for _, key, video in self._videos():
+            self._place |= {f"videos/{key}/{name}": value for name, value in video.begin_episode().items()}
+
+    def add(self, sample_id: str, frame: DepthFrame) -> None:
+        """Add a step.
+
+        Raises:
+            CaptureError: it has other cameras, images or signals than the first.
+        """
+        self._check_alike(sample_id, frame)
+        row: dict[str, Any] = {}
+        for name, one in self._signals.items():
+            if one.column is not None:
+                row[one.column] = signal_value(one, frame.recorded_signals[name])
+        for column, names in self._derived.items():
+            row[column] = derived_value(names, frame.recorded_signals)
+        for view, written in enumerate(self._views):
+            self._add_view(row, frame, view, written)
+        task = self._task(frame.recorded_signals)
+        self._tasks_of_episode[task] = None
+        row |= {
+            "timestamp": np.array([self._step / self._fps], np.float32),
+            "frame_index": np.array([self._step]),
+            "episode_index": np.array([len(self._episodes)]),
+            "index": np.array([self._count]),
+            "task_index": np.array([self._tasks.setdefault(task, len(self._tasks))]),
+        }
+        if self._has_times:
+            times = self._episode.times
+            row[_TIME] = np.array([times[self._step] if times else self._step / self._fps])
+        for key, said in self._features.items():
+            if said["dtype"] not in ("string", "image", "video") and np.prod(said["shape"]) <= _MOST_IN_STATS:
+                self._of_episode.setdefault(key, []).append(row[key])
+        self._rows.add(row)
+        self._step += 1
+        self._count += 1
+
+    def _add_view(self, row: dict[str, Any], frame: DepthFrame, view: int, written: _View) -> None:
+        facts = written.facts
+        metres = frame.depth[view].numpy()
+        if written.unit is None:
+            row[facts.depth] = metres
+        else:
+            units = self._units(metres, written.unit)
+            if written.depth is not None:
+                written.depth.add(units)
+            else:
+                row[facts.depth] = _png(units)
+        if facts.color is not None and frame.colors is not None:
+            color = frame.colors[view].numpy()
+            if written.color is not None:
+                written.color.add(color)
+                if not view:
+                    self._captures.lose("color", "coded as H.264; color=image keeps it as it is", captures=1)
+            else:
+                row[facts.color] = _png(color)
+            self._color_stats.setdefault(facts.color, ColorStats()).add(color)
+        row[facts.intrinsics] = frame.camera.intrinsics[view].numpy()
+        if facts.distortion is not None and frame.camera.distortion is not None:
+            row[facts.distortion] = frame.camera.distortion[view].numpy()
+        if facts.world_from_camera is not None and frame.world_from_camera is not None:
+            row[facts.world_from_camera] = frame.world_from_camera[view].numpy()
+
+    def _units(self, metres: NDArray[np.float32], unit: float) -> NDArray[np.uint16]:
+        """Return depth in whole units; tell by how much that differs."""
+        units = np.rint(metres.astype(np.float64) / unit)
+        beyond = (units > _HIGHEST) | ((units == 0) & (metres > 0))
+        units[beyond] = 0
+        stored: NDArray[np.uint16] = units.astype(np.uint16)
+        off = np.abs(metres_of_value(unit)[stored].astype(np.float64) - metres)[~beyond]
+        if beyond.any() or (len(off) and off.max() > 0):
+            self._captures.lose(
+                "depth",
+                f"rounded to whole units of {unit:g} m, and none where beyond {_HIGHEST} of them",
+                metres=float(off.max(initial=0.0)),
+                values=int(beyond.sum()),
+                captures=1,
+            )
+        return stored
+
+    def _task(self, signals: Mapping[str, Signal]) -> str:
+        name = next((name for name, one in self._signals.items() if one.column is None), None)
+        if name is not None:
+            return str(signals[name].values[0])
+        stated = next((self._episode.attributes.get(key) for key in ("task", "instruction")), None)
+        return stated if isinstance(stated, str) else ""
+
+    def _check_alike(self, sample_id: str, frame: DepthFrame) -> None:
+        first = self._first
+        if (frame.num_views, frame.size) != (first.num_views, first.size):
+            raise CaptureError(
+                f"{sample_id}: has {frame.num_views} views of {frame.size[1]}x{frame.size[0]}, {self._first_id} has "
+                f"{first.num_views} of {first.size[1]}x{first.size[0]}; write these apart (--only, --skip)"
+            )
+        for name in ("colors", "world_from_camera"):
+            if (getattr(frame, name) is None) != (getattr(first, name) is None):
+                raise CaptureError(f"{sample_id}: has {name} or not, unlike {self._first_id}; write these apart")
+        if frame.frame_id != first.frame_id:
+            raise CaptureError(
+                f"{sample_id}: its poses lead to {frame.frame_id!r}, those of {self._first_id} to {first.frame_id!r}"
+            )
+        lenses = [one.camera.distortion for one in (frame, first)]
+        if [None if lens is None else lens.shape for lens in lenses].count(
+            None if lenses[0] is None else lenses[0].shape
+        ) != 2 or frame.camera.is_window != first.camera.is_window:
+            raise CaptureError(f"{sample_id}: has another lens model than {self._first_id}; write these apart")
+        found = signal_columns(f"lerobot: {sample_id}", frame.recorded_signals)
+        if found != self._signals:
+            unlike = sorted({*found} ^ {*self._signals}) or [
+                name for name, one in found.items() if self._signals[name] != one
+            ]
+            raise CaptureError(
+                f"{sample_id}: its signals are not those of {self._first_id} ({', '.join(unlike)[:200]} differ); a "
+                "dataset has the same in every step"
+            )
+
+    def end(self, episode: Episode) -> None:
+        """End an episode."""
+        self._rows.end_episode()
+        for _, key, video in self._videos():
+            self._place[f"videos/{key}/to_timestamp"] = video.end_episode()
+        stats: dict[str, Stats] = {
+            key: stats_of(np.stack(values), self._step) for key, values in self._of_episode.items()
+        }
+        stats |= {key: one.stats() for key, one in self._color_stats.items()}
+        self._all_stats.add(stats)
+        self._episodes.append(
+            {
+                "episode_index": len(self._episodes),
+                "tasks": list(self._tasks_of_episode),
+                "length": self._step,
+                **self._place,
+                "dataset_from_index": self._count - self._step,
+                "dataset_to_index": self._count,
+                **{f"stats/{key}/{name}": value.tolist() for key, one in stats.items() for name, value in one.items()},
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+        is_episode = any(episode is one for one in self._captures.episodes)
+        self._episode_facts.append(EpisodeFacts(episode.id, is_episode, dict(episode.attributes)))
+
+    def close(self) -> None:
+        """Write what is known at the end."""
+        self._rows.close()
+        for role, key, video in self._videos():
+            video.close()
+            if role == "color":
+                self._features[key]["info"] = video.info()
+        write_episodes_table(self._folder, self._episodes)
+        write_tasks_table(self._folder, list(self._tasks))
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": self._options.robot_type,
+            "total_episodes": len(self._episodes),
+            "total_frames": self._count,
+            "total_tasks": len(self._tasks),
+            "chunks_size": FILES_IN_CHUNK,
+            "data_files_size_in_mb": FILE_MEGABYTES,
+            "video_files_size_in_mb": VIDEO_MEGABYTES,
+            "fps": self._fps,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+            "features": self._features,
+        }
+        facts = DatasetFacts(
+            frame_id=self._first.frame_id,
+            cameras=tuple(view.facts for view in self._views),
+            signals=self._signals,
+            episodes=tuple(self._episode_facts),
+            time=_TIME if self._has_times else None,
+            derived=tuple(self._derived),
+        )
+        for name, content in (
+            (INFO, info),
+            ("meta/stats.json", self._all_stats.as_json()),
+            (FACTS, facts.as_json()),
+        ):
+            text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+            (self._folder / name).write_text(text + "\n", encoding="utf-8")
+
+    def abandon(self) -> None:
+        """Close the files after a failure, whatever that says."""
+        for _, _, video in self._videos():
+            with suppress(Exception):
+                video.abandon()
+        with suppress(Exception):
+            self._rows.close()
+
+    def _videos(self) -> list[tuple[str, str, VideoWriter]]:
+        found = []
+        for view in self._views:
+            if view.depth is not None:
+                found.append(("depth", view.facts.depth, view.depth))
+            if view.color is not None and view.facts.color is not None:
+                found.append(("color", view.facts.color, view.color))
+        return found
+
+
+def _parts(captures: Captures) -> list[Episode]:
+    """Return the episodes, and what lies before, between and after them as episodes too."""
+    found: list[Episode] = []
+    end = 0
+    for one in [*captures.episodes, None]:
+        first = len(captures.ids) if one is None else one.first
+        if first > end:
+            found.append(Episode(f"captures-{len(found)}", end, first - end))
+        if one is not None:
+            found.append(one)
+            end = one.first + one.length
+    return found
+
+
+def _is_whole(metres: NDArray[np.float32], unit: float) -> bool:
+    """Whether depth is whole units, bit for bit as the reader gives it back."""
+    units = np.rint(metres.astype(np.float64) / unit)
+    return bool(units.max() <= _HIGHEST and (metres_of_value(unit)[units.astype(np.uint16)] == metres).all())
+
+
+def _png(pixels: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=_COMPRESSION)
+    return buffer.getvalue()
+
+
+def _rate(parts: Sequence[Episode]) -> int:
+    """Return the steps in a second.
+
+    Raises:
+        ConfigError: no episode has times.
+    """
+    gaps = [later - time for one in parts for time, later in zip(one.times, one.times[1:]) if later > time]
+    if not gaps:
+        raise ConfigError("lerobot: nothing states how many steps the captures have in a second; say fps=NUMBER")
+    return max(1, round(1 / statistics.median(gaps)))

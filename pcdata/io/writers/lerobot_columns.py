@@ -1,0 +1,128 @@
+"""Which columns the signals and cameras of captures become in a LeRobot dataset."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.errors import CaptureError, ConfigError, near_matches
+from pcdata.io.sources.lerobot_facts import DTYPES, SignalFacts
+from pcdata.io.sources.lerobot_index import INDEX_COLUMNS
+from pcdata.structures import DepthFrame, Signal
+
+_TASKS = ("task", "instruction", "language_instruction", "language")
+_INDEX_DTYPES = {"timestamp": "float32"}
+_UNFIT = re.compile(r"[/\s]+")  # LeRobot takes no / in a name
+
+
+def index_features() -> dict[str, dict[str, Any]]:
+    """Return the features that every LeRobot dataset has."""
+    return {name: _feature(_INDEX_DTYPES.get(name, "int64"), [1]) for name in INDEX_COLUMNS}
+
+
+def camera_names(frame: DepthFrame) -> list[str]:
+    """Return a name for each view, as its source calls them where it does."""
+    cameras = frame.provenance.get("cameras")
+    usual = [f"view{view}" for view in range(frame.num_views)]
+    names = [*map(str, cameras)] if isinstance(cameras, list) and len(cameras) == frame.num_views else usual
+    fit = [_UNFIT.sub("_", name).strip("._") for name in names]
+    return fit if len(set(fit)) == len(fit) and all(fit) else usual
+
+
+def signal_columns(where: str, signals: Mapping[str, Signal]) -> dict[str, SignalFacts]:
+    """Return the column of each signal: ``action`` and ``observation.NAME``, texts apart, one of them the task.
+
+    Raises:
+        CaptureError: two would have one column, or one has a dtype that cannot be stored.
+    """
+    texts = [name for name, signal in signals.items() if isinstance(signal.values, tuple)]
+    task = next((name for name in _TASKS if name in texts), texts[0] if len(texts) == 1 else None)
+    found: dict[str, SignalFacts] = {}
+    for name, signal in signals.items():
+        if not isinstance(signal.values, Tensor):
+            column = None if name == task else f"text.{_UNFIT.sub('_', name)}"
+            found[name] = SignalFacts(column, signal.kind)
+            continue
+        dtype = str(signal.values.dtype).removeprefix("torch.")
+        if dtype not in DTYPES or 0 in signal.values.shape:
+            raise CaptureError(
+                f"{where}: signal {name!r:.100} of {dtype} {tuple(signal.values.shape)} cannot be stored"
+            )
+        found[name] = SignalFacts(_column_name(name), signal.kind, signal.frame, dtype, tuple(signal.values.shape[1:]))
+    columns = [one.column for one in found.values() if one.column is not None]
+    if twice := next((one for one in columns if columns.count(one) > 1 or one in INDEX_COLUMNS), None):
+        raise CaptureError(f"{where}: two signals would both be the column {twice!r:.100}; rename one")
+    return found
+
+
+def signal_features(facts: Mapping[str, SignalFacts]) -> dict[str, dict[str, Any]]:
+    """Return the features that signals are, by column."""
+    found = {}
+    for one in facts.values():
+        if one.column is not None:
+            found[one.column] = _feature(stored_dtype(one), list(one.shape) or [1])
+    return found
+
+
+def stored_dtype(one: SignalFacts) -> str:
+    """Return the dtype of a column: the signal's own, or one that holds all of its numbers."""
+    return "string" if one.dtype is None else "float32" if one.dtype == "bfloat16" else one.dtype
+
+
+def signal_value(one: SignalFacts, signal: Signal) -> Any:
+    """Return what the row of one step holds of a signal."""
+    if not isinstance(signal.values, Tensor):
+        return signal.values[0]
+    values = signal.values[0]
+    array: NDArray[Any] = (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+    return array.reshape(one.shape or (1,))
+
+
+def derived_columns(
+    where: str, option: str, column: str, names: Sequence[str], facts: Mapping[str, SignalFacts]
+) -> dict[str, Any] | None:
+    """Return the feature that repeats several signals in one row of numbers, as policies take them.
+
+    Raises:
+        ConfigError: one is not there, is a text, or there is such a column already.
+    """
+    if not names:
+        return None
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"{where}: {option} must be a list of signals, got {names!r:.100}")
+    if any(one.column == column for one in facts.values()):
+        raise ConfigError(f"{where}: {option}: a signal is the column {column} already; leave the option out")
+    width = 0
+    for name in names:
+        if name not in facts or facts[name].dtype is None:
+            hint = near_matches(name, facts) or f"; there are {', '.join(facts) or 'none'}"
+            raise ConfigError(f"{where}: {option}: there is no signal of numbers {name!r:.100}{hint}")
+        width += int(np.prod(facts[name].shape, dtype=np.int64))
+    return _feature("float32", [width])
+
+
+def derived_value(names: Sequence[str], signals: Mapping[str, Signal]) -> NDArray[np.float32]:
+    """Return several signals in one row of numbers."""
+    parts = [signals[name].values for name in names]
+    return torch.cat([part.reshape(-1).float() for part in parts if isinstance(part, Tensor)]).numpy()
+
+
+def number_feature(dtype: str, shape: Sequence[int], names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return the feature of a column of numbers."""
+    return _feature(dtype, shape, names)
+
+
+def _feature(dtype: str, shape: Sequence[int], names: Sequence[str] | None = None) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": list(shape), "names": None if names is None else list(names)}
+
+
+def _column_name(name: str) -> str:
+    fit = _UNFIT.sub("_", name)
+    is_named = fit in ("action", "observation") or fit.startswith(("observation.", "action."))
+    return fit if is_named else f"observation.{fit}"
