@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pcdata.cli.known_names import TARGETS
+from pcdata.cli.choices import given_preset
+from pcdata.cli.known_names import MODELS, TARGETS
 from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
 from pcdata.cli.progress_bar import ProgressBar
+
+if TYPE_CHECKING:
+    from pcdata.models import Preset
 
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
     export = commands.add_parser("export", help="write a dataset or captures in the layout of a model's own loader")
-    export.add_argument("path", metavar="PATH", help="dataset that 'pcdata build' wrote, or captures for image targets")
+    export.add_argument(
+        "path", metavar="PATH", help="dataset that 'pcdata build' wrote; or captures, for image targets or with --model"
+    )
     export.add_argument("--to", required=True, metavar="NAME", help=f"target: {', '.join(TARGETS)}")
     export.add_argument("--out", required=True, metavar="DIR", help="folder of the export")
     export.add_argument(
@@ -23,6 +29,12 @@ def add_to(commands: Any) -> None:
         metavar="OPTION=VALUE",
         type=name_and_value,
         help="option of the target; repeatable: " + "; ".join(_options_in_words()),
+    )
+    export.add_argument(
+        "--model",
+        metavar="NAME",
+        help="make clouds of captures as this model takes them, without a dataset between; its choices are --set too: "
+        f"{', '.join(MODELS)}",
     )
     add_capture_options(export)
     export.add_argument("--seed", type=int, metavar="N", help="of the random end of a built dataset's pipeline (0)")
@@ -58,7 +70,7 @@ def _options_in_words() -> list[str]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from pcdata.datasets import CachedCloudDataset
+    from pcdata.datasets import CachedCloudDataset, CloudDataset
     from pcdata.errors import ConfigError
     from pcdata.exports import export_dataset
     from pcdata.exports.export_record import FILE_NAME
@@ -66,16 +78,22 @@ def _export(arguments: argparse.Namespace) -> None:
     from pcdata.exports.targets import target_named
     from pcdata.report.inspection_text import skipped_text
 
-    options = dict(arguments.set)
+    options: dict[str, Any] = dict(arguments.set)
     draws = {name: getattr(arguments, name) for name in ("seed", "epoch", "copies")}
     if len(options) != len(arguments.set):
         raise ConfigError("export: an option is set twice; set it once")
+    preset = None
+    if arguments.model is not None:
+        preset, options = _for_model(arguments.model, arguments.to, arguments.set)
     target_named(arguments.to, options)  # a wrong name must not wait for a folder to be listed
     source: Any = arguments.path
     if not is_built(source):
         if arguments.as_stored:
             raise ConfigError(f"export: --as-stored is for a built dataset, and {source} is none; leave it out")
         source = open_captures(source, arguments, limit=arguments.limit)
+        source = source if preset is None else CloudDataset(source, preset.pipeline)
+    elif preset is not None:
+        raise ConfigError(f"export: {source} is a built dataset, whose clouds are made; --model is for captures")
     elif given := given_flags(arguments, "--limit"):
         flags = ", ".join(given)
         raise ConfigError(f"export: {source} is a built dataset, which {flags} cannot change; leave that out")
@@ -103,3 +121,27 @@ def _export(arguments: argparse.Namespace) -> None:
         print(skipped_text(report.left_out, "samples", FILE_NAME))
     for note in report.notes:
         print(f"note    {note}")
+
+
+def _for_model(model: str, to: str, pairs: list[tuple[str, str]]) -> tuple[Preset, dict[str, Any]]:
+    """Return the preset, and the options of the target: what is said of both, such as the frame, is said once.
+
+    Raises:
+        ConfigError: no such model, target, choice or option, or the target is of captures.
+    """
+    from dataclasses import fields
+
+    from pcdata.errors import ConfigError
+    from pcdata.exports.export_source import options_for_model
+    from pcdata.exports.targets import TARGETS as KNOWN
+    from pcdata.models import contract
+    from pcdata.models.catalog import possible_choices
+
+    kind = KNOWN.named("export", to)
+    if kind.takes == "captures":
+        raise ConfigError(f"export: {to} is written from depth images, of which --model makes clouds; leave it out")
+    choices = possible_choices(contract(model))
+    own = {field.name for field in fields(kind)}
+    preset = given_preset(model, [(name, text) for name, text in pairs if name in choices])
+    options = {name: text for name, text in pairs if name in own or name not in choices}
+    return preset, {**options_for_model(model, preset.plain_choices(), kind), **options}

@@ -228,13 +228,18 @@ def stated_by_model(source: Any, kind: type[Target]) -> dict[str, Any]:
     if isinstance(source, str | os.PathLike) and is_built(source):
         given = CachedCloudDataset(absolute(source))
     model: dict[str, Any] = dict(given.manifest.model) if isinstance(given, CachedCloudDataset) else {}
-    if model.get("name") not in kind.models():
+    return options_for_model(model.get("name"), model.get("choices", {}), kind)
+
+
+def options_for_model(name: str | None, choices: Mapping[str, Any], kind: type[Target]) -> dict[str, Any]:
+    """Return the options of a target that the choices for a model state, where the target is of that model."""
+    if name not in kind.models():
         return {}
     known = {field.name for field in fields(kind)}
-    choices: dict[str, Any] = {name: model["choices"].get(name) for name in {"frame", "num_points"} & known}
-    if "colors" in known and (channels := model["choices"].get("channels")):
-        choices["colors"] = any(name.startswith("rgb") for name in channels)
-    return {name: value for name, value in choices.items() if value is not None}
+    stated: dict[str, Any] = {name: choices.get(name) for name in {"frame", "num_points"} & known}
+    if "colors" in known and (channels := choices.get("channels")):
+        stated["colors"] = any(name.startswith("rgb") for name in channels)
+    return {name: value for name, value in stated.items() if value is not None}
 
 
 def identity_of(source: CaptureSource) -> str:
