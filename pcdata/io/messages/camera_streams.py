@@ -108,7 +108,9 @@ def told(topic: Topic) -> str:
     return f"{topic.name} ({topic.type}, {len(topic)} message{'s' * (len(topic) != 1)}{rate})"
 
 
-def chosen_cameras(where: str, log: MessageLog, said: Statement, choice: Choice) -> list[CameraStream]:
+def chosen_cameras(
+    where: str, log: MessageLog, images: Mapping[str, ImageTopic], said: Statement, choice: Choice
+) -> list[CameraStream]:
     """Return the depth cameras that are named, else all that the recording states, else the only one there is.
 
     Raises:
@@ -116,7 +118,6 @@ def chosen_cameras(where: str, log: MessageLog, said: Statement, choice: Choice)
         ConfigError: no topic is called so.
         UnitError, IntrinsicsError: what an image needs is stated nowhere.
     """
-    images = image_topics(log)
     depths = _depths(where, log, images, said, choice.depth)
     if choice.intrinsics is not None and len(depths) > 1:
         raise ConfigError(f"{where}: intrinsics are of one camera, and {len(depths)} are read")

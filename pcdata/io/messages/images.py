@@ -81,7 +81,7 @@ def color_pixels(message: Any) -> NDArray[np.uint8]:  # (H, W, 3)
         mode, pixels, (bits, _) = decoded_image("a packed image", _content(message), ("PNG", "JPEG"))
         if mode not in ("RGB", "RGBA", "L") or bits == 16:
             raise CaptureError(f"a packed color image must be 8-bit RGB, this one is {bits or ''} {mode}")
-        return np.repeat(pixels[..., None], 3, 2) if mode == "L" else np.ascontiguousarray(pixels[..., :3])
+        return np.repeat(pixels[..., None], 3, 2) if mode == "L" else np.array(pixels[..., :3])
     if message.encoding not in _CHANNELS:
         raise CaptureError(f"color must be encoded as {', '.join(_CHANNELS)}, not {message.encoding!r:.50}; convert it")
     order, count = _CHANNELS[message.encoding]

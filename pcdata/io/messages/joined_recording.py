@@ -15,7 +15,15 @@ from torch import Tensor
 from pcdata.errors import CaptureError, FrameError, PcdataError, add_note
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthUnit
-from pcdata.io.messages.camera_streams import RECORDED, CameraStream, Choice, chosen_cameras, told
+from pcdata.io.messages.camera_streams import (
+    RECORDED,
+    CameraStream,
+    Choice,
+    ImageTopic,
+    chosen_cameras,
+    image_topics,
+    told,
+)
 from pcdata.io.messages.cameras import camera_of
 from pcdata.io.messages.decoding import decoded, plain_type
 from pcdata.io.messages.images import color_pixels, depth_numbers
@@ -25,6 +33,7 @@ from pcdata.io.messages.signal_streams import SignalStream, chosen_signals
 from pcdata.io.messages.statement import TOPIC, Statement, read_statement
 from pcdata.io.messages.transforms import FrameTree, TreeBuilder
 from pcdata.io.sources.joined_views import join_views
+from pcdata.io.sources.recording import READ_COLOR
 from pcdata.io.sources.synchronized import Joined, joined
 from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
@@ -67,7 +76,8 @@ class JoinedRecording:
         self.file = log.files[0].path
         self._joining = joining
         self.said = _statement(where, log, choice)
-        self.cameras = chosen_cameras(where, log, self.said, choice)
+        images = image_topics(log)
+        self.cameras = chosen_cameras(where, log, images, self.said, choice)
         self.frame_id = joining.frame_id if joining.frame_id is not None else self.said.frame_id
         max_gap = joining.max_gap * 1e9
         self.signals, left = chosen_signals(where, log, self.said, joining.signals, choice.clock, max_gap)
@@ -86,7 +96,7 @@ class JoinedRecording:
                 "allow more by max_time_apart (images) or max_gap (what is interpolated), or leave the stream out"
             )
         used = self._used()
-        self.unread = [*log.damage, *left, *self._unread(log, used), *self._counted()]
+        self.unread = [*log.damage, *left, *self._unread(log, images, used), *self._counted()]
         self._log = log.only(sorted(used))
 
     # -- what belongs together -----------------------------------------------------------------------------------------
@@ -178,8 +188,8 @@ class JoinedRecording:
         if self.frame_id is None and (spatial or self._joining.poses):
             name = next(iter(spatial or self._joining.poses))
             raise FrameError(
-                f"{self._where}: the signal {name!r} is in a frame of its own; say frame_id=FRAME (--option "
-                "frame_id=FRAME), where poses lead to"
+                f"{self._where}: the signal {name!r} is in a frame of its own; say frame_id=FRAME (--frame "
+                "FRAME), where poses lead to"
             )
         ways = self._ways()
         if not ways:
@@ -225,7 +235,7 @@ class JoinedRecording:
             used |= {topic.name for topic in parts if topic is not None}
         return used | {one.topic.name for one in self.signals}
 
-    def _unread(self, log: MessageLog, used: set[str]) -> list[str]:
+    def _unread(self, log: MessageLog, images: Mapping[str, ImageTopic], used: set[str]) -> list[str]:
         lines = []
         for topic in log.topics.values():
             kind = plain_type(topic.type)
@@ -233,9 +243,13 @@ class JoinedRecording:
                 continue
             if kind in _TF:
                 if self._tree is None:
-                    lines.append(f"{told(topic)}; frame_id=FRAME (--option frame_id=FRAME) gives poses of it")
+                    lines.append(f"{told(topic)}; frame_id=FRAME (--frame FRAME) gives poses of it")
                 continue
-            lines.append(told(topic))
+            use = ""
+            if topic.name in images and images[topic.name].form.role == "color":
+                has_color = any(camera.color is not None for camera in self.cameras)
+                use = f"; color={topic.name} reads it" if has_color else f"; color of other pixels: {READ_COLOR}"
+            lines.append(told(topic) + use)
         return lines
 
     def signals_at(self, number: int) -> dict[str, Signal]:

@@ -115,7 +115,7 @@ class SignalStream:
         if self.is_pose and self.kind == "pose matrix":
             given = torch.from_numpy(value.astype(np.float64))
             return rigid.from_rotation_translation(rigid.rotation_from_quaternion(given[3:]), given[:3])[None]
-        return torch.from_numpy(np.ascontiguousarray(value[None]))
+        return torch.from_numpy(np.array(value[None]))
 
     def check_frame(self, message: Any) -> None:
         """Require that a message is in the frame that is stated.
