@@ -148,6 +148,32 @@ def packed_depth(units: np.ndarray, a: float = 0.0, b: float = 0.0) -> bytes:
     return struct.pack("<iff", 0, a, b) + png(units)
 
 
+def packed_rvl(pixels: np.ndarray) -> bytes:
+    """Pack as the paper does, one nibble after another."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            low, value = value & 7, value >> 3
+            nibbles.append(low | (8 if value else 0))
+            if not value:
+                return
+
+    flat, place, last = pixels.reshape(-1).astype(int).tolist(), 0, 0
+    while place < len(flat):
+        for is_reading in (False, True):
+            start = place
+            while place < len(flat) and bool(flat[place]) == is_reading:
+                place += 1
+            put(place - start)
+        for value in flat[start:place]:
+            delta, last = value - last, value
+            put((delta << 1) ^ (delta >> 31))
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{one:x}" for one in nibbles[at : at + 8]), 16) for at in range(0, len(nibbles), 8)]
+    return struct.pack(f"<{len(words)}I", *words)
+
+
 def depth_of(number: int) -> np.ndarray:
     units = np.random.default_rng(number).integers(400, 1400, SIZE).astype(np.uint16)
     units[0, :3] = 0

@@ -22,6 +22,7 @@ _IMAGES = (
     "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"
 )  # fmt: skip
 _INFOS = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+ROLES = ("labels", "mask", "confidence")
 _TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
 RECORDED = "stated in the recording"
 _REP_118 = "REP 118: 16-bit depth is in millimetres"
@@ -55,6 +56,9 @@ class CameraStream:
         infos: what describes the images, where it changes.
         color: images of the same pixels, or of another camera that depth is to be registered to.
         color_camera: of the color images; None = of the same pixels as the depth.
+        others: images of the same pixels that the recording states, by role: labels, mask, confidence.
+        poses: where the camera is, as the recording states it; None = tf tells.
+        facts: what the recording states of the camera.
     """
 
     name: str
@@ -66,6 +70,9 @@ class CameraStream:
     rectified: bool
     color: ImageTopic | None
     color_camera: Camera | None
+    others: Mapping[str, Topic]
+    poses: Topic | None
+    facts: Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,11 +147,11 @@ def _depths(
     if said.cameras:
         found = []
         for camera in said.cameras:
-            fitting = _preferred([image for image in depths if image.base.startswith(f"/{camera}/")])
+            fitting = _preferred([image for image in depths if image.base.startswith(f"/{camera}/depth/")])
             if len(fitting) != 1:
                 raise CaptureError(
                     f"{where}: it states a camera {camera!r:.100}, but {len(fitting)} topics of depth begin with "
-                    f"/{camera:.100}/"
+                    f"/{camera:.100}/depth/"
                 )
             found.append((camera, fitting[0]))
         return found
@@ -203,8 +210,11 @@ def _stream(
     image: ImageTopic,
     number: int,
 ) -> CameraStream:
-    unit, unit_source = _unit(where, image, said.cameras.get(name, {}), choice.metres_per_unit)
-    camera, infos, rectified = _described(where, log, choice, image, choice.intrinsics)
+    own = image.topic.name.split("/")[1] if image.topic.name.count("/") > 1 else ""
+    facts = said.cameras.get(own, {})
+    unit, unit_source = _unit(where, image, facts, choice.metres_per_unit)
+    is_window = facts.get("is_window") is True
+    camera, infos, rectified = _described(where, log, choice, image, choice.intrinsics, is_window=is_window)
     color = _color(where, log, images, choice, image, number)
     color_camera = None
     if color is not None and not _same_pixels(color, image):
@@ -223,8 +233,21 @@ def _stream(
         color = _clocked(log, color, choice.clock)
     elif color is not None:
         color = _clocked(log, color, choice.clock)
+    told_topics = {role: log.topics.get(f"/{own}/{role}/image_raw") for role in ROLES if facts}
+    others = {role: on_clock(log, topic, choice.clock) for role, topic in told_topics.items() if topic is not None}
     return CameraStream(
-        name, _clocked(log, image, choice.clock), unit, unit_source, camera, infos, rectified, color, color_camera
+        str(facts.get("name", name)),
+        _clocked(log, image, choice.clock),
+        unit,
+        unit_source,
+        camera,
+        infos,
+        rectified,
+        color,
+        color_camera,
+        {role: topic for role, topic in others.items() if len(topic)},
+        log.topics.get(f"/{own}/pose_matrix") if facts else None,
+        facts,
     )
 
 
@@ -265,6 +288,8 @@ def _described(
     choice: Choice,
     image: ImageTopic,
     intrinsics: tuple[float, float, float, float] | None,
+    *,
+    is_window: bool = False,
 ) -> tuple[Camera | None, Topic | None, bool]:
     """Return the camera of all images, or the topic that describes each, and whether its projection is theirs."""
     size = image.form.size
@@ -276,8 +301,8 @@ def _described(
     with log.opened() as read:
         first, last = (decoded(topic, read(topic, place)) for place in (0, len(topic) - 1))
     rectified = "rect" in image.base.rpartition("/")[2] and any(first.d if hasattr(first, "d") else first.D)
-    camera = camera_of(told_by, first, size, rectified=rectified)
-    if camera.to_dict() == camera_of(told_by, last, size, rectified=rectified).to_dict():
+    camera = camera_of(told_by, first, size, rectified=rectified, is_window=is_window)
+    if camera.to_dict() == camera_of(told_by, last, size, rectified=rectified, is_window=is_window).to_dict():
         return camera, None, rectified
     return None, topic, rectified
 

@@ -9,6 +9,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+
 from pcdata.errors import IntrinsicsError, PcdataError
 from pcdata.geometry.lens import COEFFICIENT_COUNTS
 from pcdata.structures import Camera
@@ -40,7 +42,9 @@ def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float
     return numbers
 
 
-def camera_of(where: str, info: Any, size: tuple[int, int], *, rectified: bool = False) -> Camera:
+def camera_of(
+    where: str, info: Any, size: tuple[int, int], *, rectified: bool = False, is_window: bool = False
+) -> Camera:
     """Return the camera of an image.
 
     Args:
@@ -48,9 +52,10 @@ def camera_of(where: str, info: Any, size: tuple[int, int], *, rectified: bool =
         info: a CameraInfo, or Foxglove's CameraCalibration.
         size: of the image, (height, width).
         rectified: the image is undistorted already, so the projection matrix is of it and no lens.
+        is_window: cut from a larger image, so the principal point may lie outside.
 
     Raises:
-        IntrinsicsError: it is not calibrated, of another size, has skew, or a lens that is not OpenCV's.
+        IntrinsicsError: it is not calibrated, of another size, or has a lens that is not OpenCV's.
     """
     matrix = [float(value) for value in (info.p if hasattr(info, "p") else info.P)] if rectified else _k(info)
     k = [matrix[0], matrix[1], matrix[2], *matrix[3 + rectified : 6 + rectified]]  # a projection has four columns
@@ -58,11 +63,14 @@ def camera_of(where: str, info: Any, size: tuple[int, int], *, rectified: bool =
     if fx == 0 or fy == 0:
         raise IntrinsicsError(f"{where} states no focal length: the camera was not calibrated; say intrinsics=")
     lens = None if rectified else lens_of(where, str(info.distortion_model), info.d if hasattr(info, "d") else info.D)
-    if skew != 0 or below != 0:
-        raise IntrinsicsError(f"{where} has skew {skew or below}; undistort the recording first")
+    rows = [[fx, skew, cx], [below, fy, cy], [0.0, 0.0, 1.0]]
     try:
-        full = (int(info.height), int(info.width))
-        camera = Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=full, distortion=lens)
+        camera = Camera(
+            intrinsics=torch.tensor([rows], dtype=torch.float64, device="cpu"),
+            size=(int(info.height), int(info.width)),
+            distortion=None if lens is None else torch.tensor([lens], dtype=torch.float64, device="cpu"),
+            is_window=is_window,
+        )
         camera = _of_region(camera, info)
     except PcdataError as error:
         raise IntrinsicsError(f"{where}: {error}") from error

@@ -71,6 +71,20 @@ def depth_numbers(message: Any) -> NDArray[Any]:  # (H, W) uint16, or float32 me
     return rows.view(f"{'>' if message.is_bigendian else '<'}{kind}").astype(kind)
 
 
+def plain_numbers(message: Any) -> NDArray[Any]:  # (H, W) int32 or uint8
+    """Return the numbers of an image that is neither depth nor color: labels (32SC1), a mask or levels (mono8).
+
+    Raises:
+        CaptureError: it is damaged, or encoded in another way.
+    """
+    encoding = getattr(message, "encoding", "none")
+    if encoding == "32SC1":
+        return _rows(message, 4).view(">i4" if message.is_bigendian else "<i4").astype(np.int32)
+    if encoding in _GRAY:
+        return _rows(message, 1)
+    raise CaptureError(f"an image of labels must be encoded as 32SC1 or mono8, not {encoding!r:.50}")
+
+
 def color_pixels(message: Any) -> NDArray[np.uint8]:  # (H, W, 3)
     """Return a color image as RGB; of a gray one the channel three times.
 

@@ -26,7 +26,7 @@ from pcdata.io.messages.camera_streams import (
 )
 from pcdata.io.messages.cameras import camera_of
 from pcdata.io.messages.decoding import decoded, plain_type
-from pcdata.io.messages.images import color_pixels, depth_numbers
+from pcdata.io.messages.images import color_pixels, depth_numbers, plain_numbers
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.messages.signal_streams import SignalStream, chosen_signals
@@ -119,6 +119,10 @@ class JoinedRecording:
                 self.streams.append(_stream("depth", camera.images.topic, "clock", {"messages": count}, 0.0))
             if camera.color is not None:
                 self._add("color", camera.color.topic, "nearest", limit)
+            for role, topic in camera.others.items():
+                self._add(role, topic, "nearest", limit)
+            if (poses := self._stated_pose(camera)) is not None:
+                self._add("pose", poses, "step", math.inf)
         for signal in self.signals:
             self._add(f"signal {signal.name}", signal.topic, signal.rule, signal.max_gap)
 
@@ -173,7 +177,7 @@ class JoinedRecording:
         """Return the pairs of frames between which poses are needed."""
         ways = []
         for camera in self.cameras:
-            if self.frame_id is not None:
+            if self.frame_id is not None and self._stated_pose(camera) is None:
                 ways.append((self.frame_id, camera.images.frame))
             if camera.color_camera is not None and camera.color is not None:
                 ways.append((camera.color.frame, camera.images.frame))
@@ -182,6 +186,10 @@ class JoinedRecording:
             (self.frame_id or "", one.frame) for one in self.signals if one.frame not in (None, self.frame_id, "camera")
         ]
         return [way for way in ways if way[0] != way[1]]
+
+    def _stated_pose(self, camera: CameraStream) -> Topic | None:
+        """Return the topic of the camera's poses, where the recording states those that are wanted."""
+        return camera.poses if self.frame_id is not None and self.frame_id == self.said.frame_id else None
 
     def _frames(self, log: MessageLog) -> FrameTree | None:
         spatial = [one.name for one in self.signals if one.frame not in (None, "camera")]
@@ -231,7 +239,8 @@ class JoinedRecording:
     def _used(self) -> set[str]:
         used = {TOPIC}
         for camera in self.cameras:
-            parts = (camera.images.topic, camera.infos, camera.color.topic if camera.color else None)
+            color = camera.color.topic if camera.color else None
+            parts = (camera.images.topic, camera.infos, color, camera.poses, *camera.others.values())
             used |= {topic.name for topic in parts if topic is not None}
         return used | {one.topic.name for one in self.signals}
 
@@ -291,7 +300,7 @@ class JoinedRecording:
         moved = signal.moved(self.pose(self.frame_id, one.frame, time)[None])
         return Signal(moved, one.kind, self.frame_id)
 
-    def frame(self, number: int, sample_id: str, provenance: Mapping[str, Any], invalid: tuple[int, ...]) -> DepthFrame:
+    def load(self, number: int, sample_id: str, provenance: Mapping[str, Any], invalid: tuple[int, ...]) -> DepthFrame:
         """Read a depth image with all that belongs to it.
 
         Raises:
@@ -326,11 +335,15 @@ class JoinedRecording:
         time = int(topic.times[place])
         where = f"{self._where}: {topic.name}, image {place}"
         numbers = depth_numbers(decoded(topic, read(topic, place)))
-        depth = _in_metres(where, numbers, camera.unit, invalid)
+        is_whole = numbers.dtype == np.uint16
+        # Where one stream has both, as where an image has depth between two units, its floats are metres.
+        unit = 1.0 if not is_whole and camera.images.form.encoding != "32FC1" else camera.unit
+        depth = _in_metres(where, numbers, unit, invalid)
+        recorded = camera.facts.get("recorded_metres_per_unit", camera.unit if is_whole else None)
         topics = {"depth": topic.name}
         facts = {
             **provenance,
-            **({"metres_per_unit": camera.unit} if numbers.dtype == np.uint16 else {}),
+            **({"metres_per_unit": recorded} if isinstance(recorded, float) else {}),
             **({"unit_is_recorded": True} if camera.unit_source == RECORDED else {}),
             "unit_source": camera.unit_source,
             "timestamps": [(time - int(self.times[0])) / 1e9],
@@ -350,17 +363,37 @@ class JoinedRecording:
             depth=torch.from_numpy(depth)[None],
             camera=self._camera(read, camera, time, (depth.shape[0], depth.shape[1])),
             colors=torch.from_numpy(colors)[None] if aligned and colors is not None else None,
+            **self._others(read, camera, number),
             sample_id=sample_id,
             capture_index=number,
             provenance={**facts, "topics": topics},
         )
         if self.frame_id is not None:
-            pose = self.pose(self.frame_id, camera.images.frame, time)
+            pose = self._camera_pose(read, camera, number, time)
             frame = replace(frame, world_from_camera=pose[None], frame_id=self.frame_id)
         if colors is None or camera.color_camera is None or camera.color is None:
             return frame
         color_from_depth = self.pose(camera.color.frame, camera.images.frame, time)
         return register_to_color(frame, torch.from_numpy(colors)[None], camera.color_camera, color_from_depth)
+
+    def _others(self, read: Read, camera: CameraStream, number: int) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for role, topic in camera.others.items():
+            place, _, _ = self.partner(role, topic, number)
+            image = torch.from_numpy(np.array(plain_numbers(decoded(topic, read(topic, place)))))[None]
+            found[role] = image.long() if role == "labels" else image > 0 if role == "mask" else image
+        return found
+
+    def _camera_pose(self, read: Read, camera: CameraStream, number: int, time: int) -> Tensor:
+        assert self.frame_id is not None
+        topic = self._stated_pose(camera)
+        if topic is None:
+            return self.pose(self.frame_id, camera.images.frame, time)
+        place, _, _ = self.partner("pose", topic, number)
+        values = np.asarray(decoded(topic, read(topic, place)).data, np.float64)
+        if values.size != 16:
+            raise CaptureError(f"{self._where}: {topic.name}: a pose has 16 numbers, this one has {values.size}")
+        return torch.from_numpy(values.reshape(4, 4).copy())
 
     def _camera(self, read: Read, camera: CameraStream, time: int, size: tuple[int, int]) -> Camera:
         if camera.infos is None:
@@ -373,7 +406,13 @@ class JoinedRecording:
             return camera.camera
         place = max(0, int(joined([time], camera.infos.times, "step").before[0]))
         info = decoded(camera.infos, read(camera.infos, place))
-        return camera_of(f"{self._where}: {camera.infos.name}", info, size, rectified=camera.rectified)
+        return camera_of(
+            f"{self._where}: {camera.infos.name}",
+            info,
+            size,
+            rectified=camera.rectified,
+            is_window=camera.facts.get("is_window") is True,
+        )
 
 
 def _seen_size(camera: CameraStream) -> tuple[int, int]:
@@ -408,4 +447,4 @@ def _statement(where: str, log: MessageLog, choice: Choice) -> Statement:
     if topic is None or topic.type != "std_msgs/msg/String" or not len(topic):
         return Statement()
     with log.opened() as read:
-        return read_statement(where, str(decoded(topic, read(topic, 0)).data))
+        return read_statement(where, str(decoded(topic, read(topic, len(topic) - 1)).data))

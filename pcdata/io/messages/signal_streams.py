@@ -25,6 +25,7 @@ from pcdata.io.sources.option_checks import check_seconds
 from pcdata.io.sources.stated_kinds import check_stated_names, stated_kinds
 from pcdata.io.sources.synchronized import RULES, Rule, mixed, slerp
 from pcdata.structures.signal_kinds import parse_kind
+from pcdata.structures.signals import check_signal_name
 
 JOINTS = "sensor_msgs/msg/JointState"
 _JOINT_FIELDS = ("position", "velocity", "effort")
@@ -40,6 +41,9 @@ _VECTORS = {  # by type: where in a message the vectors of three are; their kind
     "geometry_msgs/msg/WrenchStamped": (("wrench", "force"), ("wrench", "torque")),
 }  # fmt: skip
 _NUMBERS = re.compile(r"std_msgs/msg/(Float32|Float64|U?Int(8|16|32|64)|Bool)(MultiArray)?")
+_DTYPES = (
+    "float32", "float64", "float16", "bfloat16", "int64", "int32", "int16", "int8", "uint8", "bool"
+)  # fmt: skip
 _TEXT = "std_msgs/msg/String"
 _FIRST = 64  # messages that show whether joints are published together
 
@@ -93,10 +97,10 @@ class SignalStream:
             parts = [_within(message, names) for names in _VECTORS[self.topic.type]]
             return np.array([number for part in parts for number in _numbers(part, "xyz")])
         values = np.asarray(message.data)
-        shape = self.shape if self.shape is not None else _layout(message, values)
-        if int(np.prod(shape)) != values.size:
+        shape = self.shape if self.shape is not None else _layout(message, values, is_stated=self.dtype is not None)
+        if math.prod(shape) != values.size:
             raise CaptureError(f"{self.topic.name}: a message has {values.size} numbers, not those of {shape}")
-        return values.reshape(shape).astype(self.dtype) if self.dtype else values.reshape(shape)
+        return values.reshape(shape)
 
     def between(self, one: Any, other: Any, share: float) -> NDArray[Any] | str:
         """Return the value between two messages."""
@@ -115,7 +119,8 @@ class SignalStream:
         if self.is_pose and self.kind == "pose matrix":
             given = torch.from_numpy(value.astype(np.float64))
             return rigid.from_rotation_translation(rigid.rotation_from_quaternion(given[3:]), given[:3])[None]
-        return torch.from_numpy(np.array(value[None]))
+        given = torch.from_numpy(np.array(value[None]))
+        return given if self.dtype is None else given.to(getattr(torch, self.dtype))
 
     def check_frame(self, message: Any) -> None:
         """Require that a message is in the frame that is stated.
@@ -152,11 +157,14 @@ def _numbers(part: Any, axes: str) -> list[float]:
     return [float(getattr(part, axis)) for axis in axes]
 
 
-def _layout(message: Any, values: NDArray[Any]) -> tuple[int, ...]:
+def _layout(message: Any, values: NDArray[Any], *, is_stated: bool) -> tuple[int, ...]:
+    """Return the shape that a message states; few recorders fill it in, so without one it is a row."""
     if values.ndim == 0:
         return (1,)
-    dims = [int(dim.size) for dim in message.layout.dim] if hasattr(message, "layout") else []
-    return tuple(dims) if dims and int(np.prod(dims)) == values.size else (values.size,)
+    dims = [int(dim.size) for dim in message.layout.dim]
+    if not dims and is_stated and values.size == 1:
+        return ()
+    return tuple(dims) if dims and math.prod(dims) == values.size else (values.size,)
 
 
 def chosen_signals(
@@ -187,8 +195,9 @@ def chosen_signals(
     stated = stated_kinds(where, plain)
     streams: dict[str, SignalStream] = {}
     left: list[str] = []
-    for name, told_of in said.signals.items():
-        streams[name] = _stated(where, log, name, told_of, clock)
+    for own, told_of in said.signals.items():
+        stream = _stated(where, log, own, told_of, clock)
+        streams[stream.name] = stream
     for topic in log.topics.values():
         if topic.type == JOINTS and len(topic) and is_known(topic) and topic.name.strip("/") not in _left_out(stated):
             found, without = joint_streams(where, log, topic, clock, max_gap)
@@ -293,11 +302,10 @@ def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any], clo
         raise CaptureError(f"{where}: is of the kind {kind!r:.60}, but {told(topic)} is none of that")
     try:
         parsed = parse_kind(kind)  # type: ignore[arg-type]
-        plain = None if dtype is None else np.dtype(dtype)
     except (PcdataError, TypeError, ValueError) as error:
         raise CaptureError(f"{where}: {error}") from error
-    if plain is not None and plain.kind not in "fiub":
-        raise CaptureError(f"{where}: dtype must be one of numbers, got {dtype!r:.60}")
+    if dtype not in (None, *_DTYPES):
+        raise CaptureError(f"{where}: dtype must be one of {', '.join(_DTYPES)}, got {dtype!r:.60}")
     is_shape = isinstance(shape, list) and len(shape) <= 31 and all(type(n) is int and 0 <= n < 1 << 31 for n in shape)
     if shape is not None and not is_shape:
         raise CaptureError(f"{where}: shape must be a list of whole numbers, got {shape!r:.60}")
@@ -305,14 +313,16 @@ def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any], clo
         raise CaptureError(
             f"{where}: a {kind!r:.60} is in {'a' if parsed.is_spatial else 'no'} frame, got {frame!r:.60}"
         )
+    own = said.get("name", name)
+    check_signal_name(where, own)
     return SignalStream(
-        name,
+        own,
         on_clock(log, topic, clock),
         parsed.text,
         frame,
         "step",
         math.inf,
-        dtype=None if plain is None else plain.str,
+        dtype=dtype,
         shape=None if shape is None else tuple(shape or ()),
     )
 

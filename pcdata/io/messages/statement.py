@@ -1,11 +1,11 @@
 """What pcdata says of a recording that it wrote: JSON in one message of the topic ``/pcdata``.
 
-``{"schema": 1, "frame_id": "base", "cameras": {"front": {"metres_per_unit": 0.001, "registered_to": "color"}},``
-``"signals": {"joints": {"kind": "invariant", "dtype": "float64", "shape": [7]}}, "samples": ["a_1", "a_2"],``
+``{"schema": 1, "frame_id": "base", "cameras": {"front": {"name": "front", "metres_per_unit": 0.001}},``
+``"signals": {"joints": {"name": "joints", "kind": "invariant", "dtype": "float64"}}, "samples": ["a_1", "a_2"],``
 ``"episodes": [{"id": "pick_0", "first": 0, "length": 24, "attributes": {"task": "pick"}}]}``
 
-A camera's images are under ``/NAME/depth`` and ``/NAME/color``, a signal is ``/signals/NAME``. All but the schema may
-be left out. ``first`` counts the depth images from 0.
+Cameras and signals are by the name in their topics, ``/front/depth/...`` and ``/signals/joints``; all but the schema
+may be left out. ``first`` counts the depth images from 0. Of several such messages the last one counts.
 """
 
 from __future__ import annotations

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.files.opening import check_inside
-from pcdata.files.sample_names import in_order, name_some
-from pcdata.io.messages.camera_streams import Choice
+from pcdata.files.sample_names import check_known, in_order, name_some
+from pcdata.io.messages.camera_streams import Choice, image_topics
 from pcdata.io.messages.clock import CLOCKS, Clock
+from pcdata.io.messages.cloud_recording import CloudRecording, cloud_topics
 from pcdata.io.messages.joined_recording import JoinedRecording, Joining
-from pcdata.io.messages.message_log import CONTAINERS, METADATA, container_of, opened_log
+from pcdata.io.messages.message_log import CONTAINERS, METADATA, MessageLog, container_of, opened_log
 from pcdata.io.sources.listing import LinkTargets, absolute, entries, is_file, is_folder, link_targets
 from pcdata.io.sources.option_checks import (
     check_invalid_values,
@@ -25,7 +27,7 @@ from pcdata.io.sources.option_checks import (
 from pcdata.io.sources.realsense_bag import is_realsense
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
-from pcdata.structures import DepthFrame, Episode, Signal
+from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
 from pcdata.structures.episodes import checked_episodes, joined_episodes, kept_episodes
 
 _SUFFIXES = tuple(container.suffix for container in CONTAINERS)
@@ -55,6 +57,7 @@ class _RosSource(Source):
         depth: str | Collection[str] | None = None,
         color: str | Collection[str] | None = None,
         camera_info: Mapping[str, str] | None = None,
+        cloud: str | None = None,
         registered: bool = False,
         metres_per_unit: float | None = None,
         invalid_values: Collection[int] = (),
@@ -74,6 +77,8 @@ class _RosSource(Source):
             depth: the topic of depth images, or several, whose images are views of one sample; None = the only one.
             color: the topic of color images, or one for each depth; None = that of the same pixels, () = none.
             camera_info: by the topic of images, the one that describes their camera; else ``camera_info`` beside them.
+            cloud: the topic of clouds (PointCloud2) to be read instead of depth images; None = the only one, where
+                there is no depth.
             registered: register depth to color images of another camera.
             metres_per_unit: length of one stored unit; None = that of the encoding: 16UC1 millimetres, 32FC1 metres.
             invalid_values: stored whole numbers besides 0 that mean "no reading".
@@ -114,11 +119,16 @@ class _RosSource(Source):
             max_gap=check_seconds(where, "max_gap", max_gap),
         )
         allowed = link_targets(links_to)
-        self._recordings: dict[str, JoinedRecording] = {}  # by what the ids begin with
+        self._recordings: dict[str, JoinedRecording | CloudRecording] = {}  # by what the ids begin with
         self._paths: dict[str, Path] = {}
         for name, part in _parts(where, path, allowed).items():
             at = f"{self.kind} source {part}"
-            self._recordings[name] = JoinedRecording(at, opened_log(at, part, allowed), choice, joining)
+            log = opened_log(at, part, allowed)
+            topic = _cloud_topic(at, log, choice, check_name(where, "cloud", cloud))
+            if topic is None:
+                self._recordings[name] = JoinedRecording(at, log, choice, joining)
+            else:
+                self._recordings[name] = CloudRecording(at, log, topic, choice.clock, choice.metres_per_unit)
             self._paths[name] = part
         self._numbers: dict[str, tuple[str, int]] = {}
         skipped: dict[str, str] = {}
@@ -171,8 +181,6 @@ class _RosSource(Source):
         Raises:
             CaptureError: the sample is unknown, or a message cannot be read.
         """
-        from pcdata.files.sample_names import check_known
-
         check_known(str(self), sample_id, self._known)
         name, number = self._numbers[sample_id]
         return self._recordings[name].signals_at(number)
@@ -209,9 +217,9 @@ class _RosSource(Source):
         kept = sorted(starts[name] + number for name, number in self._numbers.values())
         return kept_episodes(checked_episodes(str(self), found, total), kept)
 
-    def _load(self, sample_id: str) -> DepthFrame:
+    def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         name, number = self._numbers[sample_id]
-        return self._recordings[name].frame(number, sample_id, self.provenance(sample_id), self._invalid)
+        return self._recordings[name].load(number, sample_id, self.provenance(sample_id), self._invalid)
 
 
 def _parts(where: str, path: Path, allowed: tuple[Path, ...]) -> dict[str, Path]:
@@ -236,7 +244,19 @@ def _files(folder: Path) -> list[Path]:
     return [entry for entry in entries(folder) if entry.suffix.lower() in _SUFFIXES and container_of(entry) is not None]
 
 
-def _ids(recording: JoinedRecording, name: str) -> list[str]:
+def _cloud_topic(where: str, log: MessageLog, choice: Choice, named: str | None) -> str | None:
+    """Return the topic of clouds that is meant; None = depth images are."""
+    if named is not None and choice.depth:
+        raise ConfigError(f"{where}: depth and cloud are both named; read one of them at a time")
+    if named is not None or choice.depth:
+        return named
+    clouds = cloud_topics(log)
+    if len(clouds) != 1 or any(image.form.role == "depth" for image in image_topics(log).values()):
+        return None
+    return clouds[0].name
+
+
+def _ids(recording: JoinedRecording | CloudRecording, name: str) -> list[str]:
     count = len(recording.times)
     said = recording.said.samples
     fits = said is not None and len(said) == count == len(set(said)) and in_order(said) == said
@@ -244,7 +264,7 @@ def _ids(recording: JoinedRecording, name: str) -> list[str]:
     return [f"{name}/{one}" if name else one for one in ids]
 
 
-def _episodes(recording: JoinedRecording, name: str) -> list[Episode]:
+def _episodes(recording: JoinedRecording | CloudRecording, name: str) -> list[Episode]:
     times = recording.times
 
     def episode(name: str, first: int, length: int, attributes: Mapping[str, Any]) -> Episode:
@@ -266,8 +286,6 @@ def _episodes(recording: JoinedRecording, name: str) -> list[Episode]:
 
 def _renamed(episode: Episode) -> Episode:
     """Return an episode NAME/NAME as NAME: the only one of its file."""
-    from dataclasses import replace
-
     start, _, end = episode.id.partition("/")
     return replace(episode, id=start) if start == end else episode
 

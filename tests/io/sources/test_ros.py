@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from tests.ros_recordings import (
     color_of,
     depth_of,
     packed_depth,
+    packed_rvl,
     png,
     recording,
     written,
@@ -102,6 +104,11 @@ def test_a_folder_of_files_has_an_episode_for_each(tmp_path: Path) -> None:
 
 # -- images ------------------------------------------------------------------------------------------------------------
 
+
+def rvl_image(units: np.ndarray) -> bytes:
+    return bytes(12) + struct.pack("<II", units.shape[1], units.shape[0]) + packed_rvl(units)
+
+
 DEPTHS = {
     "padded rows": lambda n, t: ROS2.image(t, depth_of(n), "16UC1", pad=6),
     "big endian": lambda n, t: ROS2.image(t, depth_of(n).astype(">u2"), "16UC1"),
@@ -109,6 +116,7 @@ DEPTHS = {
     "big-endian floats": lambda n, t: ROS2.image(t, metres(depth_of(n)).numpy().astype(">f4"), "32FC1", pad=4),
     "packed": lambda n, t: ROS2.packed(t, packed_depth(depth_of(n)), "16UC1; compressedDepth png"),
     "packed without a name": lambda n, t: ROS2.packed(t, packed_depth(depth_of(n)), "16UC1; compressedDepth"),
+    "RVL": lambda n, t: ROS2.packed(t, rvl_image(depth_of(n)), "16UC1; compressedDepth rvl"),
     "a PNG of 16 bits": lambda n, t: ROS2.packed(t, png(depth_of(n)), "16UC1; png compressed"),
 }
 
