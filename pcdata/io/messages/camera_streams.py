@@ -25,7 +25,7 @@ _INFOS = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
 ROLES = ("labels", "mask", "confidence")
 _TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
 RECORDED = "stated in the recording"
-_REP_118 = "REP 118: 16-bit depth is in millimetres"
+_MILLIMETRE = 0.001  # REP 118
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class CameraStream:
     Args:
         name: of the camera.
         images: the depth images.
-        unit: metres of one stored number.
+        unit, float_unit: metres of a stored whole number, and of a float.
         unit_source: who says so.
         camera: of every depth image; None = ``infos`` describe each.
         infos: what describes the images, where it changes.
@@ -64,6 +64,7 @@ class CameraStream:
     name: str
     images: ImageTopic
     unit: float
+    float_unit: float
     unit_source: str
     camera: Camera | None
     infos: Topic | None
@@ -212,7 +213,7 @@ def _stream(
 ) -> CameraStream:
     own = image.topic.name.split("/")[1] if image.topic.name.count("/") > 1 else ""
     facts = said.cameras.get(own, {})
-    unit, unit_source = _unit(where, image, facts, choice.metres_per_unit)
+    unit, float_unit, unit_source = _units(where, image, facts, choice.metres_per_unit)
     is_window = facts.get("is_window") is True
     camera, infos, rectified = _described(where, log, choice, image, choice.intrinsics, is_window=is_window)
     color = _color(where, log, images, choice, image, number)
@@ -239,6 +240,7 @@ def _stream(
         str(facts.get("name", name)),
         _clocked(log, image, choice.clock),
         unit,
+        float_unit,
         unit_source,
         camera,
         infos,
@@ -263,16 +265,18 @@ def _same_pixels(one: ImageTopic, other: ImageTopic) -> bool:
     return one.form.size == other.form.size and one.frame == other.frame
 
 
-def _unit(where: str, image: ImageTopic, said: Mapping[str, Any], given: float | None) -> tuple[float, str]:
-    stated = said.get("metres_per_unit")
+def _units(where: str, image: ImageTopic, said: Mapping[str, Any], given: float | None) -> tuple[float, float, str]:
+    """Return metres of a stored whole number and of a float, and who says so."""
+    stated, are_floats = said.get("metres_per_unit"), image.form.encoding == "32FC1"
     if given is not None:
-        return check_metres_per_unit(where, given), "stated by metres_per_unit"
+        unit = check_metres_per_unit(where, given)
+        return unit, unit if are_floats else 1.0, "stated by metres_per_unit"
     if stated is not None:
-        return check_metres_per_unit(f"{where}: topic /pcdata", stated), RECORDED
-    if image.form.encoding == "32FC1":
-        return 1.0, "REP 118: depth of floats is in metres"
+        return check_metres_per_unit(f"{where}: topic /pcdata", stated), 1.0, RECORDED
+    if are_floats:
+        return _MILLIMETRE, 1.0, "REP 118: depth of floats is in metres"
     if image.form.encoding == "16UC1":
-        return 0.001, _REP_118
+        return _MILLIMETRE, 1.0, "REP 118: 16-bit depth is in millimetres"
     raise UnitError(
         f"{where}: images of {image.topic.name} are encoded as {image.form.encoding!r}, which says nothing of a unit "
         "(16UC1 would be millimetres); say metres_per_unit=0.001 (--metres-per-unit) if they are millimetres"

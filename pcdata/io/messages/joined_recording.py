@@ -251,7 +251,7 @@ class JoinedRecording:
             if topic.name in used or not len(topic) or kind.endswith(("/CameraInfo", ".CameraCalibration")):
                 continue
             if kind in _TF:
-                if self._tree is None:
+                if self._tree is None and not any(map(self._stated_pose, self.cameras)):
                     lines.append(f"{told(topic)}; frame_id=FRAME (--frame FRAME) gives poses of it")
                 continue
             use = ""
@@ -336,9 +336,7 @@ class JoinedRecording:
         where = f"{self._where}: {topic.name}, image {place}"
         numbers = depth_numbers(decoded(topic, read(topic, place)))
         is_whole = numbers.dtype == np.uint16
-        # Where one stream has both, as where an image has depth between two units, its floats are metres.
-        unit = 1.0 if not is_whole and camera.images.form.encoding != "32FC1" else camera.unit
-        depth = _in_metres(where, numbers, unit, invalid)
+        depth = _in_metres(where, numbers, camera.unit if is_whole else camera.float_unit, invalid)
         recorded = camera.facts.get("recorded_metres_per_unit", camera.unit if is_whole else None)
         topics = {"depth": topic.name}
         facts = {

@@ -133,8 +133,7 @@ class _RosSource(Source):
         self._numbers: dict[str, tuple[str, int]] = {}
         skipped: dict[str, str] = {}
         whole: list[tuple[str, int, list[Episode]]] = []
-        for name, recording in self._recordings.items():
-            ids = _ids(recording, name)
+        for (name, recording), ids in zip(self._recordings.items(), _ids(self._recordings)):
             for number, sample_id in enumerate(ids):
                 if number in recording.skipped:
                     skipped[sample_id] = recording.skipped[number]
@@ -208,8 +207,7 @@ class _RosSource(Source):
         if len(self._recordings) == 1:
             found = self._whole[0][2]
         else:
-            found = joined_episodes(self._whole)
-            found = [_renamed(one) for one in found]
+            found = [_renamed(one) for one in joined_episodes(self._whole)]
         total = sum(count for _, count, _ in self._whole)
         starts, before = {}, 0
         for name, count, _ in self._whole:
@@ -256,12 +254,15 @@ def _cloud_topic(where: str, log: MessageLog, choice: Choice, named: str | None)
     return clouds[0].name
 
 
-def _ids(recording: JoinedRecording | CloudRecording, name: str) -> list[str]:
-    count = len(recording.times)
-    said = recording.said.samples
-    fits = said is not None and len(said) == count == len(set(said)) and in_order(said) == said
-    ids = said if said is not None and fits else [f"{number:06d}" for number in range(count)]
-    return [f"{name}/{one}" if name else one for one in ids]
+def _ids(recordings: Mapping[str, JoinedRecording | CloudRecording]) -> list[list[str]]:
+    """Return the ids of all images of each recording: as they state them, else numbers; of several with their names."""
+    stated = [one.said.samples or [] for one in recordings.values()]
+    together = [name for names in stated for name in names]
+    fits = all(len(names) == len(one.times) for names, one in zip(stated, recordings.values()))
+    if fits and len(set(together)) == len(together) and in_order(together) == together:
+        return stated
+    numbers = [[f"{number:06d}" for number in range(len(one.times))] for one in recordings.values()]
+    return [[f"{name}/{one}" if name else one for one in own] for name, own in zip(recordings, numbers)]
 
 
 def _episodes(recording: JoinedRecording | CloudRecording, name: str) -> list[Episode]:
