@@ -74,7 +74,6 @@ class DepthStream:
         quantized: of 12-bit codes, what they stand for.
         size: (height, width), where it is stated.
         color: the feature of the color image of the same pixels.
-        registered_to: what is said of whose pixels the depth has.
         intrinsics: the column.
         distortion: the column.
         is_window: whether the camera is cut from a larger image.
@@ -91,7 +90,6 @@ class DepthStream:
     quantized: QuantizedDepth | None = None
     size: tuple[int, int] | None = None
     color: str | None = None
-    registered_to: str | None = None
     intrinsics: str | None = None
     distortion: str | None = None
     is_window: bool = False

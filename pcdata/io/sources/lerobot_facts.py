@@ -52,12 +52,12 @@ class CameraFacts:
             metres_per_unit=1.0 if self.metres_per_unit is None else self.metres_per_unit,
             size=self.size,
             color=self.color,
-            registered_to=self.registered_to,
             intrinsics=self.intrinsics,
             distortion=self.distortion,
             is_window=self.is_window,
             extrinsics=self.world_from_camera,
             direction=None if self.world_from_camera is None else "camera_to_frame",
+            facts={} if self.registered_to is None else {"registered_to": self.registered_to},
         )
 
 

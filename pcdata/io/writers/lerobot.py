@@ -9,6 +9,7 @@ Source: LeRobot 0.6, ``datasets/dataset_writer.py``, ``dataset_metadata.py``, ``
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import statistics
 from collections.abc import Mapping, Sequence
@@ -36,19 +37,21 @@ from pcdata.io.writers.lerobot_columns import (
     signal_features,
     signal_value,
 )
+from pcdata.io.writers.lerobot_points import point_columns, point_features
 from pcdata.io.writers.lerobot_stats import AllStats, ColorStats, Stats, stats_of
 from pcdata.io.writers.lerobot_tables import FILE_MEGABYTES, RowsWriter, write_episodes_table, write_tasks_table
 from pcdata.io.writers.lerobot_videos import FILE_MEGABYTES as VIDEO_MEGABYTES
 from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK, VideoWriter
 from pcdata.io.writers.registry import register_writer
 from pcdata.io.writers.writer import Captures, Writer
-from pcdata.structures import DepthFrame, Episode, Signal
+from pcdata.structures import CAMERA_FRAME, DepthFrame, Episode, Signal
 
 DepthStorage = Literal["auto", "ffv1", "image", "array"]
 ColorStorage = Literal["video", "image", "none"]
 
 _UNITS = (0.001, 0.0001, 0.00025, 0.0002, 0.000125)  # of sensors: tried where captures do not state theirs
 _HIGHEST = 65535
+_USUAL_RATE = 10  # as convert's other writers space captures without times
 _TIME = "recorded_time"
 _STATE, _ACTION = "observation.state", "action"
 _MOST_IN_STATS = 1 << 14  # numbers of a feature: an image or a cloud of numbers is normalized by nobody
@@ -66,9 +69,10 @@ class LeRobotWriter(Writer):
             is whole units, else array.
         metres_per_unit: of stored depth, which is rounded to it; None = the unit that the first capture is whole in.
         color: "video": H.264, whose loss shows; "image": PNG; "none": left out.
-        fps: steps in a second; None = of the times of the episodes.
+        fps: steps in a second; None = of the times of the episodes, 10 where there are none.
         state: signals that ``observation.state`` repeats in one row, as policies take them.
         action: the same of ``action``, where no signal is called so.
+        points: rows of ``observation.pointcloud``, the capture's points in the frame of its poses; 0 = none.
         registered_to: what to say of whose pixels depth has; None = of color, where captures have that.
         robot_type: the name of the robot.
     """
@@ -82,6 +86,7 @@ class LeRobotWriter(Writer):
     fps: float | None = None
     state: Sequence[str] = ()
     action: Sequence[str] = ()
+    points: int = 0
     registered_to: str | None = None
     robot_type: str | None = None
 
@@ -99,6 +104,9 @@ class LeRobotWriter(Writer):
         fps: Any = self.fps
         if fps is not None and not (isinstance(fps, (int, float)) and 1 <= fps <= 1000):
             raise ConfigError(f"lerobot: fps must be steps in a second, 1 or more, got {fps!r:.60}")
+        points: Any = self.points
+        if isinstance(points, bool) or not isinstance(points, int) or not 0 <= points < 1 << 24:
+            raise ConfigError(f"lerobot: points must be a whole number from 0, got {points!r:.60}")
         for option, text in (("registered_to", self.registered_to), ("robot_type", self.robot_type)):
             if text is not None and not (isinstance(text, str) and text):
                 raise ConfigError(f"lerobot: {option} must be a text, got {text!r:.60}")
@@ -150,9 +158,7 @@ class _Dataset:
     ) -> None:
         self._options, self._captures, self._folder = options, captures, folder
         self._first_id, self._first = sample_id, first
-        self._fps = _rate(parts) if options.fps is None else max(1, round(options.fps))
-        if options.fps is not None and self._fps != options.fps:
-            raise ConfigError(f"lerobot: fps must be a whole number, got {options.fps:g}")
+        self._fps = self._rate(parts)
         self._signals = signal_columns(f"lerobot: {sample_id}", first.recorded_signals)
         self._derived: dict[str, Sequence[str]] = {}
         self._features: dict[str, dict[str, Any]] = signal_features(self._signals)
@@ -166,6 +172,8 @@ class _Dataset:
             self._features[_TIME] = number_feature("float64", [1])
         names = camera_names(first)
         self._views = [self._view(name, view) for view, name in enumerate(names)]
+        if options.points:
+            self._features |= point_features(first, options.points)
         self._features |= index_features()
         self._rows = RowsWriter(folder, self._features)
         self._tasks: dict[str, int] = {}
@@ -174,6 +182,19 @@ class _Dataset:
         self._all_stats = AllStats()
         self._count = 0  # steps so far
         self._check_partners()
+
+    def _rate(self, parts: Sequence[Episode]) -> int:
+        """Return the steps in a second, a whole number as LeRobot has them."""
+        fps = self._options.fps
+        if fps is not None:
+            if round(fps) != fps:
+                raise ConfigError(f"lerobot: fps must be a whole number, got {fps:g}")
+            return int(fps)
+        gaps = [later - time for one in parts for time, later in itertools.pairwise(one.times) if later > time]
+        if not gaps:
+            self._captures.note(f"captures have no times: {_USUAL_RATE} steps in a second (fps says another)")
+            return _USUAL_RATE
+        return max(1, round(1 / statistics.median(gaps)))
 
     # -- what is written -------------------------------------------------------------------------------------------
 
@@ -285,8 +306,12 @@ class _Dataset:
                 row[one.column] = signal_value(one, frame.recorded_signals[name])
         for column, names in self._derived.items():
             row[column] = derived_value(names, frame.recorded_signals)
+        self._off, self._beyond = 0.0, 0
         for view, written in enumerate(self._views):
             self._add_view(row, frame, view, written)
+        if self._off or self._beyond:
+            how = f"rounded to whole units of {self._views[0].unit:g} m; no reading where 16 bits do not hold it"
+            self._captures.lose("depth", how, metres=self._off, values=self._beyond, captures=1)
         task = self._task(frame.recorded_signals)
         self._tasks_of_episode[task] = None
         row |= {
@@ -296,6 +321,8 @@ class _Dataset:
             "index": np.array([self._count]),
             "task_index": np.array([self._tasks.setdefault(task, len(self._tasks))]),
         }
+        if self._options.points:
+            row |= point_columns(frame, self._options.points)
         if self._has_times:
             times = self._episode.times
             row[_TIME] = np.array([times[self._step] if times else self._step / self._fps])
@@ -333,20 +360,14 @@ class _Dataset:
             row[facts.world_from_camera] = frame.world_from_camera[view].numpy()
 
     def _units(self, metres: NDArray[np.float32], unit: float) -> NDArray[np.uint16]:
-        """Return depth in whole units; tell by how much that differs."""
+        """Return depth in whole units; keep by how much that differs."""
         units = np.rint(metres.astype(np.float64) / unit)
         beyond = (units > _HIGHEST) | ((units == 0) & (metres > 0))
         units[beyond] = 0
         stored: NDArray[np.uint16] = units.astype(np.uint16)
         off = np.abs(metres_of_value(unit)[stored].astype(np.float64) - metres)[~beyond]
-        if beyond.any() or (len(off) and off.max() > 0):
-            self._captures.lose(
-                "depth",
-                f"rounded to whole units of {unit:g} m, and none where beyond {_HIGHEST} of them",
-                metres=float(off.max(initial=0.0)),
-                values=int(beyond.sum()),
-                captures=1,
-            )
+        self._off = max(self._off, float(off.max(initial=0.0)))
+        self._beyond += int(beyond.sum())
         return stored
 
     def _task(self, signals: Mapping[str, Signal]) -> str:
@@ -435,6 +456,9 @@ class _Dataset:
             "video_path": VIDEO_PATH,
             "features": self._features,
         }
+        if self._options.points:
+            frame = self._first.frame_id or CAMERA_FRAME
+            (self._folder / "conversion_info.json").write_text(json.dumps({"frame_id": frame, "unit": "m"}) + "\n")
         facts = DatasetFacts(
             frame_id=self._first.frame_id,
             cameras=tuple(view.facts for view in self._views),
@@ -493,15 +517,3 @@ def _png(pixels: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG", compress_level=_COMPRESSION)
     return buffer.getvalue()
-
-
-def _rate(parts: Sequence[Episode]) -> int:
-    """Return the steps in a second.
-
-    Raises:
-        ConfigError: no episode has times.
-    """
-    gaps = [later - time for one in parts for time, later in zip(one.times, one.times[1:]) if later > time]
-    if not gaps:
-        raise ConfigError("lerobot: nothing states how many steps the captures have in a second; say fps=NUMBER")
-    return max(1, round(1 / statistics.median(gaps)))

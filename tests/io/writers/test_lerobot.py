@@ -1,0 +1,250 @@
+"""LeRobot datasets that are written: what stands in the files, read by pyarrow and PyAV alone, and by the package."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pcdata import open_source
+from pcdata.errors import CaptureError, ConfigError
+from pcdata.io import convert
+from pcdata.io.sources.capture_source import episodes_of
+from pcdata.io.writers import lerobot_tables, lerobot_videos
+from pcdata.structures import Episode, PointCloud, Signal
+from pcdata.synthetic import TeleopSource
+from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
+
+av = pytest.importorskip("av")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+ROWS, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+
+
+def decoded(path: Path, pixels: str) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name in ("ffv1", "h264")
+        return [frame.to_ndarray(format=pixels) for frame in container.decode(video=0)]
+
+
+def info(path: Path) -> Any:
+    return json.loads((path / "meta/info.json").read_text())
+
+
+def test_depth_is_lossless_video_that_others_decode_bit_for_bit(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures(views=2))
+    convert(made, "lerobot", tmp_path / "out")
+    for view in range(2):
+        stored = decoded(tmp_path / f"out/videos/depth.view{view}/chunk-000/file-000.mkv", "gray16le")
+        assert len(stored) == len(made)
+        for units, name in zip(stored, made.ids):
+            assert units.dtype == np.uint16
+            metres = (units.astype(np.float64) * 0.0001).astype(np.float32)
+            assert np.array_equal(metres, made.load(name).depth[view].numpy())
+    assert len(decoded(tmp_path / "out/videos/observation.images.view1/chunk-000/file-000.mp4", "rgb24")) == len(made)
+    assert not any(key.startswith("depth.") for key in info(tmp_path / "out")["features"])
+
+
+def test_rows_and_episodes_are_what_pyarrow_reads(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures())
+    convert(made, "lerobot", tmp_path / "out", state=["joints", "count"])
+    rows = parquet.read_table(tmp_path / "out" / ROWS).to_pylist()
+    assert [row["index"] for row in rows] == [*range(len(made))]
+    assert [row["frame_index"] for row in rows] == [step for one in made.episodes for step in range(one.length)]
+    for row, name in zip(rows, made.ids):
+        frame = made.load(name)
+        assert row["observation.joints"] == frame.signals["joints"][0].tolist()
+        assert row["action"] == frame.signals["action"][0].tolist()
+        assert row["observation.eef"] == frame.signals["eef"][0].tolist()
+        expected = [*frame.signals["joints"][0].float().tolist(), float(frame.signals["count"][0])]
+        assert row["observation.state"] == expected
+        assert row["camera.view0.intrinsics"] == frame.camera.intrinsics[0].tolist()
+        assert row["camera.view0.base_from_camera"] == frame.world_from_camera[0].tolist()
+    episodes = parquet.read_table(tmp_path / "out" / EPISODES).to_pylist()
+    fps = info(tmp_path / "out")["fps"]
+    for episode, own in zip(episodes, made.episodes):
+        assert (episode["dataset_from_index"], episode["length"]) == (own.first, own.length)
+        assert episode["videos/depth.view0/from_timestamp"] == pytest.approx(own.first / fps)
+        joints = np.stack([made.load(made.ids[place]).signals["joints"][0].numpy() for place in own.steps])
+        for name, value in (("min", joints.min(0)), ("mean", joints.mean(0)), ("std", joints.std(0))):
+            assert episode[f"stats/observation.joints/{name}"] == pytest.approx(value.tolist())
+        assert np.shape(episode["stats/observation.images.view0/mean"]) == (3, 1, 1)
+    stats = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    every = np.stack([made.load(name).signals["joints"][0].numpy() for name in made.ids])
+    assert stats["observation.joints"]["mean"] == pytest.approx(every.mean(0).tolist())
+    assert stats["observation.joints"]["std"] == pytest.approx(every.std(0).tolist())
+    assert stats["observation.joints"]["count"] == [len(made)]
+
+
+@pytest.mark.parametrize("depth", ["ffv1", "image", "array"])
+def test_every_way_to_store_depth_comes_back_bit_for_bit(depth: str, tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures(views=2))
+    report = convert(made, "lerobot", tmp_path / "out", depth=depth, color="image")
+    assert "depth" not in report.lost
+    source = open_source(tmp_path / "out")
+    for name, own in zip(made.ids, source.ids):
+        assert torch.equal(source.load(own).depth, made.load(name).depth)
+        assert torch.equal(source.load(own).colors, made.load(name).colors)
+
+
+def test_depth_that_is_rounded_is_told_in_metres_and_what_16_bits_do_not_hold_is_no_reading(tmp_path: Path) -> None:
+    first = made_frame(0)
+    first = replace(first, depth=first.depth.clone())
+    first.depth[0, 0, :2] = torch.tensor([0.0004, 66.0])
+    report = convert(MadeCaptures({"0": first}), "lerobot", tmp_path / "out", metres_per_unit=0.001)
+    read = open_source(tmp_path / "out").load("000000-000000").depth
+    assert read[0, 0, :2].tolist() == [0.0, 0.0]
+    off = (read.double() - first.depth.double()).abs()
+    off[0, 0, :2] = 0
+    assert report.lost["depth"].metres == pytest.approx(float(off.max()), abs=1e-9)
+    assert (report.lost["depth"].values, report.lost["depth"].captures) == (2, 1)
+    odd = replace(first, depth=first.depth * 1.00037)
+    with pytest.raises(ConfigError, match=r"metres_per_unit=0\.0001"):
+        convert(MadeCaptures({"0": odd}), "lerobot", tmp_path / "odd", depth="ffv1")
+
+
+def test_floats_of_a_simulator_are_kept_as_they_are(tmp_path: Path) -> None:
+    made = TeleopSource(num_episodes=1, size=(12, 16))
+    convert(made, "lerobot", tmp_path / "out")
+    source = open_source(tmp_path / "out")
+    assert source.episodes == made.episodes
+    for name, own in list(zip(made.ids, source.ids))[::6]:
+        before, after = made.load(name), source.load(own)
+        assert torch.equal(before.depth, after.depth)
+        assert torch.equal(before.world_from_camera, after.world_from_camera)
+        assert all(after.recorded_signals[key].same_bits(one) for key, one in before.recorded_signals.items())
+
+
+def test_captures_between_episodes_are_none_when_they_are_read_back(tmp_path: Path) -> None:
+    made = made_captures()
+    made.episodes = [Episode("only", 1, 2, [0.0, 0.125], {"task": "pick"})]
+    convert(made, "lerobot", tmp_path / "out")
+    source = open_source(tmp_path / "out")
+    assert len(source) == len(made)
+    found = episodes_of(source)
+    assert [(one.id, one.first, one.length, one.times) for one in found] == [("only", 1, 2, (0.0, 0.125))]
+    assert info(tmp_path / "out")["fps"] == 8
+
+
+def test_files_that_grow_large_are_followed_by_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot_videos, "FILE_MEGABYTES", 0)
+    monkeypatch.setattr(lerobot_tables, "FILE_MEGABYTES", 0)
+    monkeypatch.setattr(lerobot_tables, "_GROUP_BYTES", 1)
+    made = cut_to_episodes(made_captures())
+    convert(made, "lerobot", tmp_path / "out", color="image")
+    assert (tmp_path / "out/videos/depth.view0/chunk-000/file-001.mkv").exists()
+    assert (tmp_path / "out/data/chunk-000/file-001.parquet").exists()
+    source = open_source(tmp_path / "out")
+    for name, own in zip(made.ids[::-1], source.ids[::-1]):
+        assert torch.equal(source.load(own).depth, made.load(name).depth)
+        assert source.load(own).signals["joints"].tolist() == made.load(name).signals["joints"].tolist()
+
+
+def test_points_are_in_the_frame_of_the_poses_with_colors_and_a_mask(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures(views=2))
+    convert(made, "lerobot", tmp_path / "out", points=400)
+    clouds = open_source(tmp_path / "out", clouds=True)
+    cloud = clouds.load(clouds.ids[1])
+    assert isinstance(cloud, PointCloud)
+    frame = made.load(made.ids[1])
+    assert cloud.frame_id == "base"
+    assert cloud.num_points == min(400, int((frame.depth > 0).sum()))
+    assert cloud.colors is not None
+    few = made_captures()
+    convert(few, "lerobot", tmp_path / "few", points=50)
+    assert open_source(tmp_path / "few", clouds=True).load("000000-000000").num_points == 50
+
+
+def test_options_and_captures_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures())
+    for wrong, words in [
+        ({"depth": "png"}, "depth must be one of"),
+        ({"color": "jpeg"}, "color must be one of"),
+        ({"fps": 0}, "fps must be"),
+        ({"fps": 29.97}, "whole number"),
+        ({"points": -1}, "points must be"),
+        ({"state": ["jonts"]}, "did you mean 'joints'"),
+        ({"state": "joints"}, "must be a list"),
+        ({"action": ["joints"]}, "is the column action already"),
+        ({"depth": "array", "metres_per_unit": 0.001}, "leave out metres_per_unit"),
+        ({"robot_type": ""}, "robot_type must be"),
+    ]:
+        with pytest.raises(ConfigError, match=words):
+            convert(made, "lerobot", tmp_path / "out", **wrong)
+    first, second = made.load(made.ids[0]), made.load(made.ids[1])
+    for odd, words in [
+        (second.with_signal("more", torch.zeros(1, 2), "invariant"), "more differ"),
+        (second.with_signal("joints", torch.zeros(1, 7), "invariant"), "joints differ"),
+        (replace(second, colors=None), "has colors or not"),
+        (replace(second, frame_id="table", recorded_signals={}), "poses lead to 'table'"),
+        (made_frame(1, views=2), "has 2 views"),
+    ]:
+        with pytest.raises(CaptureError, match=words):
+            convert(MadeCaptures({"0": first, "1": odd}), "lerobot", tmp_path / "out")
+    twice = {"a b": Signal(torch.zeros(1, 2), "invariant"), "a_b": Signal(torch.zeros(1, 2), "invariant")}
+    with pytest.raises(CaptureError, match="both be the column"):
+        convert(MadeCaptures({"0": replace(first, recorded_signals=twice)}), "lerobot", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+OFFICIAL = """
+import json, sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+import torch
+data = LeRobotDataset("made/here", root=sys.argv[1], video_backend="pyav", depth_output_unit="mm")
+items = [data[n] for n in range(len(data))]
+batch = next(iter(torch.utils.data.DataLoader(data, batch_size=2, num_workers=1)))
+part = LeRobotDataset("made/here", root=sys.argv[1], episodes=[1], video_backend="pyav",
+                      delta_timestamps={"action": [0.0, 1 / data.fps]})
+print(json.dumps({
+    "frames": data.num_frames, "episodes": data.num_episodes, "fps": data.fps,
+    "action": [item["action"].tolist() for item in items], "task": [item["task"] for item in items],
+    "image": list(items[0]["observation.images.view0"].shape),
+    "depth": [item["observation.images.view0_depth"].tolist() for item in items],
+    "batch": list(batch["action"].shape), "windows": list(part[0]["action"].shape),
+    "mean": data.meta.stats["action"]["mean"].tolist(),
+}))
+"""
+
+
+def official_python() -> str:
+    """Return a Python that has the package lerobot: PCDATA_LEROBOT_PYTHON, or this one."""
+    python = os.environ.get("PCDATA_LEROBOT_PYTHON", sys.executable)
+    probe = subprocess.run([python, "-c", "import lerobot.datasets"], capture_output=True, check=False)
+    if probe.returncode:
+        pytest.skip(
+            "the package lerobot (Python 3.12) is not installed; PCDATA_LEROBOT_PYTHON names a Python that has it"
+        )
+    return python
+
+
+@pytest.mark.slow
+def test_the_package_lerobot_opens_what_is_written(tmp_path: Path) -> None:
+    python = official_python()
+    made = cut_to_episodes(made_captures())
+    convert(made, "lerobot", tmp_path / "out", depth="image", metres_per_unit=0.001, fps=20)
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
+    done = subprocess.run(
+        [python, "-c", OFFICIAL, str(tmp_path / "out")], capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    told = json.loads(done.stdout.splitlines()[-1])
+    frames = [made.load(name) for name in made.ids]
+    assert (told["frames"], told["episodes"], told["fps"]) == (len(made), len(made.episodes), 20)
+    assert told["action"] == [frame.signals["action"][0].tolist() for frame in frames]
+    assert told["task"] == [frame.signals["task"][0] for frame in frames]
+    assert told["image"] == [3, 12, 16]
+    assert told["batch"] == [2, 4]
+    assert told["windows"] == [2, 4]
+    for millimetres, frame in zip(told["depth"], frames):
+        assert np.abs(np.array(millimetres)[0] - 1000 * frame.depth[0].numpy()).max() <= 0.501
+    every = torch.cat([frame.signals["action"] for frame in frames])
+    assert told["mean"] == pytest.approx(every.mean(0).tolist(), abs=1e-6)
