@@ -23,7 +23,9 @@ each_camera = pytest.mark.parametrize("profile", CAMERAS, ids=lambda profile: pr
 def test_the_sensors_asked_for_are_there():
     assert set(sensor_profiles()) == {
         "realsense_d415", "realsense_d435", "realsense_d435i", "realsense_d455", "realsense_l515", "azure_kinect_nfov",
-        "azure_kinect_wfov", "kinect_v1", "photoneo_phoxi_m", "ouster_os1", "velodyne_vlp16",
+        "azure_kinect_wfov", "kinect_v1", "photoneo_phoxi_m", "ouster_os1", "velodyne_vlp16", "realsense_d405",
+        "realsense_d457", "realsense_d555", "femto_bolt_nfov", "femto_bolt_wfov", "femto_mega_nfov", "zed_2i",
+        "oak_d_pro", "zivid_2_plus_m130",
     }  # fmt: skip
     assert {profile.name for profile in PROFILES if not profile.is_organized} == {"ouster_os1", "velodyne_vlp16"}
 
@@ -34,6 +36,12 @@ def test_every_figure_has_a_source(profile: SensorProfile):
     assert set(profile.sources) == set(given)
     assert all(len(source) > 10 for source in profile.sources.values())
     assert set(profile.estimates) <= set(given)
+
+
+def test_the_d405_stores_tenths_of_a_millimetre_and_sees_near():
+    profile = sensor_profiles()["realsense_d405"]
+    assert profile.metres_per_unit[0] == 0.0001
+    assert profile.noise_at(0.3) == pytest.approx(0.3**2 * 0.08 / (427 * 0.018))
 
 
 @each
@@ -50,7 +58,7 @@ def test_the_figures_are_possible(profile: SensorProfile):
 
 @pytest.mark.parametrize(
     "profile",
-    [one for one in CAMERAS if not one.name.startswith("azure_kinect")],  # whose lens distorts: no pinhole
+    [one for one in CAMERAS if not one.name.startswith(("azure_kinect", "femto"))],  # whose lens distorts: no pinhole
     ids=lambda profile: profile.name,
 )
 def test_the_nominal_focal_length_agrees_with_the_field_of_view(profile: SensorProfile):
