@@ -284,7 +284,7 @@ def test_help_waits_for_no_torch(words):
         (["inspect", "X", "--kind", "foldr"], "did you mean 'folder'?; known: folder, rig"),
         (["export", "X", "--to", "dp33", "--out", "Y"], "did you mean 'dp3' or 'idp3'?"),
         (["check", "X", "--model", "nothing"], "known: 3d_diffuser_actor, anygrasp"),
-        (["validate", "X", "--sensor", "realsense_d453"], "did you mean 'realsense_d455' or 'realsense_d435'"),
+        (["validate", "X", "--sensor", "realsense_d453"], "did you mean 'realsense_d457' or 'realsense_d455'"),
         (["export", "X", "--to", "dp3", "--out", "Y", "--set", "colrs=1"], "did you mean 'colors'?; it has state"),
         (["export", "X", "--to", "dp3", "--out", "Y", "--set", "num_points=many"], "num_points: "),
         (["check", "X", "--model", "dp3_sim", "--set", "num_points=many"], "num_points must be 512, 1024, or any"),
