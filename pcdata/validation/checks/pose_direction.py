@@ -16,6 +16,7 @@ from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
     LEAST_COMPARED,
     Agreement,
+    advice_of,
     agreement,
     as_given,
     explains_more,
@@ -33,8 +34,9 @@ FINDINGS = {
         "readings of one view that another one confirms / readings both can see",
         f"{AGREE:.0%}",
         "when another convention agrees better by 10 points and resolves half of what contradicts",
-        "tries the inverse, transposed rotations, OpenGL axes, millimetres and centimetres, for all views together "
-        "and for each alone, and names the one that agrees and the view",
+        "tries the inverse, transposed rotations, axes of OpenGL, CoppeliaSim and bodies, millimetres and centimetres, "
+        "depth along the rays and rows from the bottom, for all views together and for each alone, and names the one "
+        "that agrees, the view, and the option that reads it",
     )
 }
 _SURE = 0.9  # when so many agree, no other convention can agree much better
@@ -75,16 +77,19 @@ def _explained(best: list[_Explanation], given: dict[Pair, Agreement]) -> Findin
     """Fail the poses of all views, or name the one whose pose alone is read wrongly; or those it may be."""
     name, blamed = best[0].convention, sorted({number for one in best for number in one.views})
     of_blamed = total(found for pair, found in given.items() if set(pair) & set(blamed))
+    subject = CONVENTIONS[name].subject
     would = f"{100 * best[0].share:.0f} % would"
     if len(best[0].views) > 1:
-        found = f"{_in_words('the views agree', of_blamed)}; {would} if the poses were {name}"
-        advice = f"the poses look like {name}: convert them to world_from_camera with OpenCV axes, in metres"
+        found = f"{_in_words('the views agree', of_blamed)}; {would} if {subject} were {name}"
+        advice = advice_of(name)
     else:
         whose = " or ".join(f"view {number}" for number in blamed)
-        found = f"{_in_words(f'{whose} and the others agree', of_blamed)}; {would} if this pose alone were {name}"
-        advice = (
-            f"the pose of {whose} looks like {name}, the others do not: convert this one to world_from_camera with "
-            "OpenCV axes, in metres"
+        one = "pose" if subject == "the poses" else "depth"
+        found = f"{_in_words(f'{whose} and the others agree', of_blamed)}; {would} if this {one} alone were {name}"
+        advice = f"the {one} of {whose} looks like {name}, the others do not: " + (
+            "convert this one to world_from_camera with OpenCV axes, in metres"
+            if one == "pose"
+            else "write this one as z in metres, the top row first"
         )
     return direction_check(Verdict.FAIL, of_blamed, found, advice, blamed[0] if len(blamed) == 1 else None)
 
@@ -132,8 +137,8 @@ def _explanations(views: dict[int, DepthFrame], given: dict[Pair, Agreement]) ->
     """Every convention for all views together, and for each alone, that explains clearly more than the poses given."""
     before = _shares(given)
     choices = [tuple(before), *((number,) for number in before if len(before) > 1)]
-    for (convention, read), turned in itertools.product(CONVENTIONS.items(), choices):
-        reads = {number: read if number in turned else as_given for number in views}
+    for (convention, said), turned in itertools.product(CONVENTIONS.items(), choices):
+        reads = {number: said.read if number in turned else as_given for number in views}
         after = _shares(
             {
                 (i, j): agreement(views[i], views[j], reads[i], reads[j]) if i in turned or j in turned else found

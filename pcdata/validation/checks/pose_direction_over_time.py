@@ -13,6 +13,7 @@ from pcdata.validation.checks.pose_direction import FINDINGS, direction_check, j
 from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
     Agreement,
+    advice_of,
     agreement,
     explains_more,
     has_moved,
@@ -61,7 +62,7 @@ def _judged_together(pairs: _Pairs, limits: CaptureLimits) -> list[Finding]:
     name = max(pairs.votes_for, key=lambda one: pairs.votes_for[one], default="")
     if name and pairs.establish(name, needed):
         count = f"{pairs.votes_for[name]} of {pairs.compared} pairs of captures"
-        return [_fails(pairs.agreement, f"{found}; {count} fit clearly better if the poses were {name}", name)]
+        return [_fails(pairs.agreement, f"{found}; {count} fit clearly better if {_were(name)}", name)]
     return [judged_as_given(pairs.agreement, found, who)]
 
 
@@ -92,13 +93,13 @@ def pose_direction_over_time(
     if earlier is None:
         return []
     given = agreement(earlier, now)
-    shares = {name: share(agreement(earlier, now, read, read)) for name, read in CONVENTIONS.items()}
+    shares = {name: share(agreement(earlier, now, said.read, said.read)) for name, said in CONVENTIONS.items()}
     better = pairs.add(given, shares)
     who = f"{earlier.sample_id!r} and this capture"
     found = f"{who} agree at {100 * share(given):.0f} % of {given[1]:,} readings that both can see"
     name = max(better, key=lambda one: shares[one], default="")
     if name and pairs.establish(name, _PAIRS):
-        return [_fails(given, f"{found}; {100 * shares[name]:.0f} % would if the poses were {name}", name)]
+        return [_fails(given, f"{found}; {100 * shares[name]:.0f} % would if {_were(name)}", name)]
     if name:
         found += "; they fit another convention better, but the other captures do not say so"
         advice = "see pose_direction (all captures); in one capture alone: was its depth, or its pose, of another time?"
@@ -107,5 +108,8 @@ def pose_direction_over_time(
 
 
 def _fails(given: Agreement, found: str, name: str) -> Finding:
-    advice = f"the poses look like {name}: convert them to world_from_camera with OpenCV axes, in metres"
-    return direction_check(Verdict.FAIL, given, found, advice)
+    return direction_check(Verdict.FAIL, given, found, advice_of(name))
+
+
+def _were(name: str) -> str:
+    return f"{CONVENTIONS[name].subject} were {name}"

@@ -1,23 +1,25 @@
-"""What poses may be instead of world_from_camera, and how far views agree when poses are read so."""
+"""What captures may be instead of ours: poses, depth and rows; and how far views agree when they are read so."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pcdata.alignment.view_agreement import view_agreement
+from pcdata.functional.depth.rendered import ray_lengths
 from pcdata.geometry import rigid
+from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.structures import DepthFrame
 from pcdata.structures.structure import derived
 
 Agreement = tuple[int, int]  # of readings carried from one view into another: that agree, that were compared
-Reading = Callable[[Tensor], Tensor]  # (4, 4) pose as given -> (4, 4) world_from_camera
+Reading = Callable[[DepthFrame], DepthFrame]  # one view as given -> as it is when read by a convention
 
 LEAST_COMPARED = 200  # readings that views must share before they can be said to agree or not
 AGREE = 0.5  # of the readings compared: under a wrong pose few agree, and those by chance
-_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
 _LEAST_GAIN = 0.1  # by which another convention must agree better
 _LEAST_MOTION = (0.02, 0.035)  # metres, radians: closer cameras agree under every convention
 
@@ -34,19 +36,69 @@ def _transposed_rotation(pose: Tensor) -> Tensor:
     return turned
 
 
-def as_given(pose: Tensor) -> Tensor:
-    """Return the pose itself."""
-    return pose
+def as_given(view: DepthFrame) -> DepthFrame:
+    """Return the view itself."""
+    return view
 
 
-# The mistake in words, and the poses set right.
-CONVENTIONS: dict[str, Reading] = {
-    "camera_from_world, the inverse of what is needed": rigid.invert_rigid,
-    "rotations stored transposed": _transposed_rotation,
-    "poses of OpenGL cameras (y up, z backwards)": lambda pose: pose @ _OPENGL.to(pose.device),
-    "translations in millimetres": lambda pose: _with_translation(pose, 1e-3),
-    "translations in centimetres": lambda pose: _with_translation(pose, 1e-2),
+def _of_pose(read: Callable[[Tensor], Tensor]) -> Reading:
+    """Return what reads the pose of a view by a function of (4, 4), and its depth as given."""
+    return lambda view: derived(view, world_from_camera=read(pose_of(view))[None])
+
+
+def _from_axes(name: str) -> Reading:
+    return _of_pose(lambda pose: pose @ CAMERA_AXES[name].to(pose.device))
+
+
+def _along_axis(view: DepthFrame) -> DepthFrame:
+    """Return a view whose lengths along rays are z."""
+    lengths = ray_lengths(view.size, view.camera.intrinsics, view.camera.distortion)
+    return derived(view, depth=(view.depth / lengths).nan_to_num(0.0).float())
+
+
+def _top_first(view: DepthFrame) -> DepthFrame:
+    return derived(view, depth=view.depth.flip(1))
+
+
+class Convention(NamedTuple):
+    """What a capture may be instead: the mistake in words, the captures set right, and how that is said."""
+
+    subject: str  # of the mistake
+    read: Reading
+    option: str  # what reads such captures; "" = they are to be written again
+
+
+# The mistake in words.
+CONVENTIONS: dict[str, Convention] = {
+    "camera_from_world, the inverse of what is needed": Convention(
+        "the poses", _of_pose(rigid.invert_rigid), "--option convention.poses=camera_from_world"
+    ),
+    "rotations stored transposed": Convention("the poses", _of_pose(_transposed_rotation), ""),
+    "poses of OpenGL cameras (y up, z backwards)": Convention("the poses", _from_axes("opengl"), "--convention opengl"),
+    "view matrices of OpenGL (camera_from_world with y up, z backwards)": Convention(
+        "the poses",
+        _of_pose(lambda pose: rigid.invert_rigid(pose) @ CAMERA_AXES["opengl"].to(pose.device)),
+        "--convention opengl --option convention.poses=camera_from_world",
+    ),
+    "poses of CoppeliaSim's cameras (x left, y up)": Convention(
+        "the poses", _from_axes("coppeliasim"), "--convention coppeliasim"
+    ),
+    "poses of bodies (x forward, y left, z up)": Convention("the poses", _from_axes("body"), "--convention body"),
+    "translations in millimetres": Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-3)), ""),
+    "translations in centimetres": Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-2)), ""),
+    "lengths along the rays": Convention("the depth", _along_axis, "--option convention.depth=ray"),
+    "images whose bottom row is first": Convention("the depth", _top_first, "--option convention.rows=bottom_first"),
 }
+
+
+def advice_of(name: str) -> str:
+    """Return what to do about captures of a convention."""
+    subject, _, option = CONVENTIONS[name]
+    advice = f"{subject} look{'s' if subject == 'the depth' else ''} like {name}: "
+    if subject == "the poses":
+        advice += "convert them to world_from_camera with OpenCV axes, in metres"
+        return f"{advice}, or read them so: {option}" if option else advice
+    return f"{advice}read them so: {option}"
 
 
 def posed_views(frame: DepthFrame) -> list[DepthFrame]:
@@ -64,8 +116,9 @@ def pose_of(view: DepthFrame) -> Tensor:  # (4, 4) world_from_camera
 
 
 def agreement(a: DepthFrame, b: DepthFrame, read_a: Reading = as_given, read_b: Reading = as_given) -> Agreement:
-    """Carry each of two frames of one view into the other, with their poses read so, and add up."""
-    pose_a, pose_b = read_a(pose_of(a)), read_b(pose_of(b))
+    """Carry each of two frames of one view into the other, read so, and add up."""
+    a, b = read_a(a), read_b(b)
+    pose_a, pose_b = pose_of(a), pose_of(b)
     found = []
     for one, other, other_from_one in (
         (a, b, rigid.invert_rigid(pose_b) @ pose_a),
