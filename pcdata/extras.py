@@ -38,7 +38,7 @@ EXTRAS = {
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
         _Extra("av", "av", "recordings of an Azure Kinect (.mkv) and videos of LeRobot datasets"),
         _Extra("pyarrow", "lerobot", "LeRobot datasets"),
-        _Extra("rosbags", "ros", "RealSense recordings (.bag), and ROS 2 recordings (.mcap)"),
+        _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
         _Extra("open3d", "open3d", "viewing and comparing with Open3D"),
         _Extra(
             "torch_cluster",

@@ -60,7 +60,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "type": float,
             "nargs": 4,
             "metavar": ("FX", "FY", "CX", "CY"),
-            "help": "pixels, where no file has them: seven_scenes, tum, nyu_raw, pairs, robomimic",
+            "help": "pixels, where no file has them: seven_scenes, tum, nyu_raw, pairs, robomimic, ros",
         },
     ),
     "registered": (
@@ -68,7 +68,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {
             "action": "store_const",
             "const": True,
-            "help": "depth as the color camera sees it: realsense_bag, azure_kinect, scannet, apc",
+            "help": "depth as the color camera sees it: realsense_bag, azure_kinect, ros, scannet, apc",
         },
     ),
     "labels_from": (
@@ -115,7 +115,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {
             "type": float,
             "metavar": "SECONDS",
-            "help": "between depth and color: realsense_bag, azure_kinect (default 0.034), tum (0.02), sun3d (0.05)",
+            "help": "between images: realsense_bag, azure_kinect, ros (default 0.034), tum (0.02), sun3d (0.05)",
         },
     ),
 }

@@ -17,9 +17,9 @@ from pcdata.errors import CaptureError
 from pcdata.io.images.reading import check_pixels, decoded_image
 from pcdata.io.messages.rvl import unpacked_rvl
 
-_CHANNELS = {
-    "rgb8": ((0, 1, 2), 3), "bgr8": ((2, 1, 0), 3), "rgba8": ((0, 1, 2), 4), "bgra8": ((2, 1, 0), 4),
-    "mono8": ((0, 0, 0), 1), "8UC1": ((0, 0, 0), 1),
+_CHANNELS: dict[str, tuple[Any, int]] = {  # the channels that are red, green and blue, and how many there are
+    "rgb8": (slice(0, 3), 3), "bgr8": (slice(None, None, -1), 3), "rgba8": (slice(0, 3), 4),
+    "bgra8": (slice(2, None, -1), 4), "mono8": ((0, 0, 0), 1), "8UC1": ((0, 0, 0), 1),
 }  # fmt: skip
 _WHOLE, _FLOAT = ("16UC1", "mono16"), "32FC1"
 _GRAY = ("mono8", "8UC1")
@@ -99,7 +99,7 @@ def color_pixels(message: Any) -> NDArray[np.uint8]:  # (H, W, 3)
     if message.encoding not in _CHANNELS:
         raise CaptureError(f"color must be encoded as {', '.join(_CHANNELS)}, not {message.encoding!r:.50}; convert it")
     order, count = _CHANNELS[message.encoding]
-    return np.ascontiguousarray(_rows(message, count).reshape(message.height, message.width, count)[..., order])
+    return np.array(_rows(message, count).reshape(message.height, message.width, count)[..., order], order="C")
 
 
 def _rows(message: Any, bytes_per_pixel: int) -> NDArray[np.uint8]:  # (H, W * bytes_per_pixel)

@@ -34,6 +34,7 @@ from pcdata.io.messages.statement import TOPIC, Statement, read_statement
 from pcdata.io.messages.transforms import FrameTree, TreeBuilder
 from pcdata.io.sources.joined_views import join_views
 from pcdata.io.sources.recording import READ_COLOR
+from pcdata.io.sources.stated_kinds import signal_of
 from pcdata.io.sources.synchronized import Joined, joined
 from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
@@ -292,7 +293,7 @@ class JoinedRecording:
         value = one.between(message, other, share)
         if isinstance(value, str):
             return Signal((value,), "text")
-        signal = Signal(one.tensor(value), one.kind, one.frame)
+        signal = signal_of(self._where, one.name, one.tensor(value), (one.kind, one.frame))
         if one.frame in (None, self.frame_id, "camera"):
             return signal
         assert self.frame_id is not None
