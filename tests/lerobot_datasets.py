@@ -108,7 +108,11 @@ def dataset(
         "fps": FPS,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-        "features": {"observation.state": number("float32", 2), **features, **index_features()},
+        "features": {
+            "observation.state": {**number("float32", 2), "names": ["arm", "hand"]},
+            **features,
+            **index_features(),
+        },
     } | changes
     write_json(root / "meta/info.json", info)
     for name in ("meta/episodes/chunk-000", "data/chunk-000"):

@@ -286,6 +286,7 @@ class _LeRobotSource(Source):
     def _read_episodes(self) -> list[Episode]:
         found, first = [], 0
         times = self._own_times()
+        names = self._column_names()
         for place, one in enumerate(self._index.episodes):
             facts = None
             if self._facts is not None:
@@ -297,12 +298,20 @@ class _LeRobotSource(Source):
                 attributes = {"tasks": tasks, "fps": self._index.fps, "episode_index": one.number}
                 robot = self._index.info.get("robot_type")
                 attributes |= {"robot_type": robot} if isinstance(robot, str) else {}
+                attributes |= {"names": names} if names else {}
                 found.append(Episode(f"episode_{one.number:06d}", first, one.length, one.seconds, attributes))
             elif facts.is_episode:
                 own = times[place] if times is not None else ()
                 found.append(Episode(facts.id, first, one.length, own, facts.attributes))
             first += one.length
         return found
+
+    def _column_names(self) -> dict[str, Any]:
+        """Return what the numbers of each signal are called, where the dataset says so."""
+        features = self._index.features
+        columns = {name: one.column for name, one in self._signals.items() if one.column is not None}
+        said = {name: features[column].get("names") for name, column in columns.items()}
+        return {name: names for name, names in said.items() if isinstance(names, (list, dict)) and names}
 
     def _own_times(self) -> list[list[float]] | None:
         """Return the seconds of every step as they were recorded, where the dataset keeps them."""

@@ -6,6 +6,8 @@ Source: LeRobot, ``datasets/utils.py``, ``dataset_metadata.py`` and ``dataset_re
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,6 +36,7 @@ _VIDEO = {3: VIDEO_PATH,
           2: "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"}  # fmt: skip
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 _VIDEO_COLUMN = re.compile(r"videos/(.+)/chunk_index")
+_VIDEO_PARTS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 _MAX_TEXT = 1 << 28
 _MOST = 1 << 40  # of any number in the index
 _LATEST = 1e9  # seconds into a video
@@ -49,7 +52,7 @@ class RecordedEpisode:
         row: of its first step.
         seconds: (length,) of every step, by which its videos are read.
         tasks: (length,) the text of each step's task.
-        videos: by key, the file and the second in it where the episode begins.
+        videos: by key, the file and the seconds in it where the episode begins and ends.
     """
 
     number: int
@@ -57,7 +60,7 @@ class RecordedEpisode:
     row: int
     seconds: tuple[float, ...]
     tasks: tuple[str, ...]
-    videos: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    videos: Mapping[str, tuple[str, float, float]] = field(default_factory=dict)
 
     @property
     def length(self) -> int:
@@ -213,9 +216,7 @@ def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]
             # Of more than the features: depth without loss may be a video that the format does not know as one.
             found = (_VIDEO_COLUMN.fullmatch(name) for name in table.names)
             videos = [match[1] for match in found if match]
-            parts = [
-                f"videos/{key}/{part}" for key in videos for part in ("chunk_index", "file_index", "from_timestamp")
-            ]
+            parts = [f"videos/{key}/{part}" for key in videos for part in _VIDEO_PARTS]
             columns = {name: table.numbers(name) for name in (*needed, *parts)}
         finally:
             table.close()
@@ -227,10 +228,15 @@ def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]
                     _whole(opened.where, part, columns[f"videos/{key}/{part}"][row])
                     for part in ("chunk_index", "file_index")
                 )
-                begin = float(columns[f"videos/{key}/from_timestamp"][row])
-                if not 0 <= begin < _LATEST:
-                    raise CaptureError(f"{opened.where}: videos/{key}/from_timestamp must be seconds, got {begin}")
-                at[key] = (opened.video(key, chunk_index=chunk, file_index=file), begin)
+                begin, end = (
+                    float(columns[f"videos/{key}/{part}"][row]) for part in ("from_timestamp", "to_timestamp")
+                )
+                if not 0 <= begin < end < _LATEST:
+                    raise CaptureError(
+                        f"{opened.where}: videos/{key}: from_timestamp and to_timestamp must be seconds, one after the "
+                        f"other, got {begin} and {end}"
+                    )
+                at[key] = (opened.video(key, chunk_index=chunk, file_index=file), begin, end)
             chunk, file = said["data/chunk_index"], said["data/file_index"]
             listed.append(
                 {
@@ -242,7 +248,24 @@ def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]
                 }
             )
     _check_apart(opened.where, listed)
+    _check_videos_apart(opened, listed)
     return listed, _tasks_v3(opened)
+
+
+def _check_videos_apart(opened: _Opened, listed: list[dict[str, Any]]) -> None:
+    """Require episodes that share no picture: each would show what the other did."""
+    half = 0.5 / _fps(opened.where, opened.info)
+    parts: dict[tuple[str, str], list[tuple[float, float, int]]] = {}
+    for one in listed:
+        for key, (file, begin, end) in one["videos"].items():
+            parts.setdefault((key, file), []).append((begin, end, one["number"]))
+    for (_, file), found in parts.items():
+        for (_, end, _), (begin, _, number) in itertools.pairwise(sorted(found)):
+            if begin < end - half:
+                raise CaptureError(
+                    f"{opened.where}: meta/episodes: episode {number} begins at {begin:g} s of {file}, before the end "
+                    f"of another at {end:g} s"
+                )
 
 
 def _check_apart(where: str, listed: list[dict[str, Any]]) -> None:
@@ -290,7 +313,7 @@ def _episodes_v2(opened: _Opened, keys: Sequence[str]) -> tuple[list[dict[str, A
                 "length": length,
                 "first": first,
                 "file": opened.path("data_path", _DATA, **fields),
-                "videos": {key: (opened.video(key, **fields), 0.0) for key in keys},
+                "videos": {key: (opened.video(key, **fields), 0.0, math.inf) for key in keys},
             }
         )
         first += length

@@ -87,9 +87,9 @@ class Pictures:
 
     def _stored(self, where: str, stream: DepthStream, episode: RecordedEpisode, step: int, row: Row) -> NDArray[Any]:
         if stream.storage == "video":
-            file, begin = self._video(stream, stream.key, episode)
+            file, seconds = self._video(where, stream, episode, step)
             with self._opened(file) as video:
-                values, kind = video.deep(begin + episode.seconds[step])
+                values, kind = video.deep(seconds)
             if kind == "gray16le" and stream.quantized is not None:
                 raise CaptureError(
                     f"{where}: is stored in 16 bits, but its feature says that it is quantized to 12; leave the flag "
@@ -116,19 +116,17 @@ class Pictures:
         """
         where = f"{self._where}: color {key} of episode {episode.number}, step {step}"
         if key in episode.videos:
-            file, begin = episode.videos[key]
+            file, seconds = _time(where, key, episode, step)
             with self._opened(file) as video:
-                return video.color(begin + episode.seconds[step])
+                return video.color(seconds)
         return decode_color(where, self._content(where, row(episode, step, [key])[key]))
 
-    def _video(self, stream: DepthStream, key: str, episode: RecordedEpisode) -> tuple[str, float]:
-        if stream.files:
-            if episode.number not in stream.files:
-                raise CaptureError(f"{self._where}: there is no depth {key} of episode {episode.number}; leave it out")
-            return stream.files[episode.number], 0.0
-        if key not in episode.videos:
-            raise CaptureError(f"{self._where}: meta/episodes does not say where the video {key} is")
-        return episode.videos[key]
+    def _video(self, where: str, stream: DepthStream, episode: RecordedEpisode, step: int) -> tuple[str, float]:
+        if not stream.files:
+            return _time(where, stream.key, episode, step)
+        if episode.number not in stream.files:
+            raise CaptureError(f"{where}: there is no video of this episode; leave it out")
+        return stream.files[episode.number], episode.seconds[step]
 
     def _opened(self, file: str) -> Any:
         return self._videos.using(file, lambda: VideoFile(self._where, self._root / file, self._inside))
@@ -163,6 +161,17 @@ class Pictures:
         if not isinstance(path, str) or not path:
             raise CaptureError(f"{where}: has neither the bytes of the image nor the path of its file")
         return read_bytes(where, self._root / path, max_bytes=_MAX_IMAGE, inside=self._inside)
+
+
+def _time(where: str, key: str, episode: RecordedEpisode, step: int) -> tuple[str, float]:
+    """Return the video that a step is in, and its second there."""
+    if key not in episode.videos:
+        raise CaptureError(f"{where}: meta/episodes does not say where its video is")
+    file, begin, end = episode.videos[key]
+    seconds = begin + episode.seconds[step]
+    if not seconds < end:  # what follows in the file is of another episode
+        raise CaptureError(f"{where}: is at {seconds:g} s of {file}, but the video of its episode ends at {end:g} s")
+    return file, seconds
 
 
 def _array(where: str, stream: DepthStream, values: Any) -> NDArray[Any]:

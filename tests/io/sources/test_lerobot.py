@@ -79,6 +79,7 @@ def test_episodes_have_times_tasks_and_attributes(tmp_path: Path) -> None:
     assert episodes[1].times == pytest.approx([0.0, 0.1, 0.2])
     assert episodes[1].attributes["tasks"] == ["pick it up"]
     assert episodes[1].attributes["robot_type"] == "made_up"
+    assert episodes[0].attributes["names"] == {"observation.state": ["arm", "hand"]}
 
 
 def test_what_nothing_states_is_asked_for_by_the_name_of_the_camera(tmp_path: Path) -> None:
@@ -393,7 +394,11 @@ ROWS, DEPTH = "data/chunk-000/file-000.parquet", "videos/depth.front/chunk-000/f
         (changed_episodes(length=[2, 1 << 40]), "whole number|should have"),
         (changed_episodes(**{"data/file_index": [0.5, 0.5]}), "whole number"),
         (changed_episodes(**{"videos/depth.front/from_timestamp": [float("nan")]}), "must be seconds"),
-        (changed_episodes(**{"videos/depth.front/from_timestamp": [50.0]}), "no picture"),
+        (changed_episodes(**{"videos/depth.front/from_timestamp": [50.0]}), "one after the other"),
+        (changed_episodes(**{"videos/depth.front/to_timestamp": [0.1]}), "ends at 0.1 s"),
+        (changed_episodes(**{"videos/depth.front/to_timestamp": [0.5]}), "before the end of another"),
+        (changed_episodes(**{"videos/depth.front/from_timestamp": [0.0, 9.0],
+                             "videos/depth.front/to_timestamp": [0.2, 9.3]}), "no picture"),
         (changed_episodes(**{"videos/depth.front/file_index": [7]}), "no such file"),
     ],
 )  # fmt: skip
