@@ -30,7 +30,7 @@ from pcdata.io.sources.lerobot_cameras import (
     with_partners,
 )
 from pcdata.io.sources.lerobot_clouds import CloudColumns, cloud_columns
-from pcdata.io.sources.lerobot_facts import DTYPES, FACTS, SignalFacts, facts_of_json
+from pcdata.io.sources.lerobot_facts import DTYPES, FACTS, IMAGES, SignalFacts, facts_of_json
 from pcdata.io.sources.lerobot_index import INDEX_COLUMNS, INFO, RecordedEpisode, read_index, read_json
 from pcdata.io.sources.lerobot_pictures import Pictures
 from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
@@ -392,11 +392,19 @@ class _LeRobotSource(Source):
                     f"{size[1]}x{size[0]}; they are of one size or not of one camera"
                 )
             colors = torch.from_numpy(color)[None]
+        beside = {
+            role: torch.from_numpy(self._pictures.beside(key, episode, step).astype(np.int64))[None]
+            for role, key in stream.images.items()
+        }
+        labels, mask, levels = (beside.get(role) for role in IMAGES)
         world = None if pose is None else (pose.matrix(where, row) @ turn)[None]
         return DepthFrame(
             depth=torch.from_numpy(depth)[None],
             camera=camera,
             colors=colors,
+            labels=None if labels is None else labels - 1,
+            mask=None if mask is None else mask != 0,
+            confidence=None if levels is None else levels.clamp(0, 255).to(torch.uint8),
             world_from_camera=world,
             frame_id=None if world is None else self.frame_id,
             sample_id=sample_id,

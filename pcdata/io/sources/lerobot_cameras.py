@@ -79,6 +79,8 @@ class DepthStream:
         is_window: whether the camera is cut from a larger image.
         extrinsics: the column.
         direction: where the extrinsics lead; None = nobody says it.
+        images: keys of lossless videos of the same pixels by role: labels (one more than the label, 0 = none), mask,
+            confidence.
         files: by the number of the episode, where they are no videos of a feature.
         facts: for the provenance.
     """
@@ -95,6 +97,7 @@ class DepthStream:
     is_window: bool = False
     extrinsics: str | None = None
     direction: Direction | None = None
+    images: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[int, str] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
 

@@ -17,6 +17,7 @@ from pcdata.io.sources.lerobot_cameras import DepthStream, Feature, Storage
 from pcdata.structures.signal_kinds import parse_kind
 
 FACTS = "meta/pcdata.json"
+IMAGES = ("labels", "mask", "confidence")
 SCHEMA = 1
 DTYPES = {
     str(dtype).removeprefix("torch."): dtype
@@ -42,6 +43,7 @@ class CameraFacts:
     distortion: str | None = None
     world_from_camera: str | None = None
     is_window: bool = False
+    images: Mapping[str, str] = field(default_factory=dict)  # see DepthStream
 
     def stream(self) -> DepthStream:
         """Return it as the reader has cameras."""
@@ -55,6 +57,7 @@ class CameraFacts:
             intrinsics=self.intrinsics,
             distortion=self.distortion,
             is_window=self.is_window,
+            images=self.images,
             extrinsics=self.world_from_camera,
             direction=None if self.world_from_camera is None else "camera_to_frame",
             facts={} if self.registered_to is None else {"registered_to": self.registered_to},
@@ -140,6 +143,8 @@ def _check(facts: DatasetFacts, features: Mapping[str, Feature]) -> None:
             raise CaptureError(f"camera {camera.name!r:.100}: metres_per_unit must be metres, got {unit!r:.60}")
         if not isinstance(camera.is_window, bool):
             raise CaptureError(f"camera {camera.name!r:.100}: is_window must be true or false")
+        if not set(camera.images) <= set(IMAGES) or not _texts(*camera.images.values()):
+            raise CaptureError(f"camera {camera.name!r:.100}: images must be keys of {', '.join(IMAGES)}")
         if camera.storage in ("image", "array"):
             columns.append(camera.depth)
         columns += [camera.intrinsics, camera.color, camera.distortion, camera.world_from_camera]

@@ -121,6 +121,20 @@ class Pictures:
                 return video.color(seconds)
         return decode_color(where, self._content(where, row(episode, step, [key])[key]))
 
+    def beside(self, key: str, episode: RecordedEpisode, step: int) -> NDArray[np.uint16]:  # (H, W)
+        """Return the whole numbers of a lossless video that is no feature, such as that of labels.
+
+        Raises:
+            CaptureError: it is missing or damaged, or has not 16 bits.
+        """
+        where = f"{self._where}: {key} of episode {episode.number}, step {step}"
+        file, seconds = _time(where, key, episode, step)
+        with self._opened(file) as video:
+            values, kind = video.deep(seconds)
+        if kind != "gray16le":
+            raise CaptureError(f"{where}: must be stored in 16 bits, but is {kind}")
+        return values
+
     def _video(self, where: str, stream: DepthStream, episode: RecordedEpisode, step: int) -> tuple[str, float]:
         if not stream.files:
             return _time(where, stream.key, episode, step)

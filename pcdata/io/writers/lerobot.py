@@ -25,7 +25,7 @@ from PIL import Image
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth.stored_depth import metres_of_value
-from pcdata.io.sources.lerobot_facts import FACTS, CameraFacts, DatasetFacts, EpisodeFacts
+from pcdata.io.sources.lerobot_facts import FACTS, IMAGES, CameraFacts, DatasetFacts, EpisodeFacts
 from pcdata.io.sources.lerobot_index import DATA_PATH, INFO, VIDEO_PATH
 from pcdata.io.writers.lerobot_columns import (
     camera_names,
@@ -43,7 +43,7 @@ from pcdata.io.writers.lerobot_tables import FILE_MEGABYTES, RowsWriter, write_e
 from pcdata.io.writers.lerobot_videos import FILE_MEGABYTES as VIDEO_MEGABYTES
 from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK, VideoWriter
 from pcdata.io.writers.registry import register_writer
-from pcdata.io.writers.writer import Captures, Writer
+from pcdata.io.writers.writer import KEPT, Captures, Writer
 from pcdata.structures import CAMERA_FRAME, DepthFrame, Episode, Signal
 
 DepthStorage = Literal["auto", "ffv1", "image", "array"]
@@ -79,7 +79,7 @@ class LeRobotWriter(Writer):
 
     kind: ClassVar[str] = "lerobot"
     layout: ClassVar[str] = "LeRobot v3.0: Parquet, videos, and depth without loss; needs pyarrow and av"
-    keeps: ClassVar[frozenset[str]] = frozenset({"color", "lens", "pose", "signals"})
+    keeps: ClassVar[frozenset[str]] = frozenset(KEPT)
     depth: DepthStorage = "auto"
     metres_per_unit: float | None = None
     color: ColorStorage = "video"
@@ -142,6 +142,7 @@ class _View:
     unit: float | None
     depth: VideoWriter | None
     color: VideoWriter | None
+    images: Mapping[str, VideoWriter]
 
 
 class _Dataset:
@@ -224,6 +225,7 @@ class _Dataset:
             )
             if options.color == "video":
                 color = VideoWriter(self._folder, color_key, self._fps, is_depth=False)
+        images = {role: f"{role}.{name}" for role in IMAGES if getattr(first, role) is not None}
         base = f"camera.{name}"
         self._features[f"{base}.intrinsics"] = number_feature("float64", [3, 3])
         lens, pose = None, None
@@ -245,8 +247,10 @@ class _Dataset:
             distortion=lens,
             world_from_camera=pose,
             is_window=first.camera.is_window,
+            images=images,
         )
-        return _View(facts, unit, depth, color)
+        videos = {role: VideoWriter(self._folder, key, self._fps, is_depth=True) for role, key in images.items()}
+        return _View(facts, unit, depth, color, videos)
 
     def _storage(self, view: int) -> tuple[str, float | None]:
         """Return how the depth of a view is stored, and its unit."""
@@ -353,6 +357,14 @@ class _Dataset:
             else:
                 row[facts.color] = _png(color)
             self._color_stats.setdefault(facts.color, ColorStats()).add(color)
+        for role, video in written.images.items():
+            values = getattr(frame, role)[view].numpy().astype(np.int64) + (role == "labels")
+            if values.min() < 0 or values.max() > _HIGHEST:
+                raise CaptureError(
+                    f"{frame.sample_id}: labels must lie in -1 .. {_HIGHEST - 1} to be written in 16 bits, got "
+                    f"{values.min() - 1} .. {values.max() - 1}; give them other ids"
+                )
+            video.add(values.astype(np.uint16))
         row[facts.intrinsics] = frame.camera.intrinsics[view].numpy()
         if facts.distortion is not None and frame.camera.distortion is not None:
             row[facts.distortion] = frame.camera.distortion[view].numpy()
@@ -384,7 +396,7 @@ class _Dataset:
                 f"{sample_id}: has {frame.num_views} views of {frame.size[1]}x{frame.size[0]}, {self._first_id} has "
                 f"{first.num_views} of {first.size[1]}x{first.size[0]}; write these apart (--only, --skip)"
             )
-        for name in ("colors", "world_from_camera"):
+        for name in ("colors", "world_from_camera", *IMAGES):
             if (getattr(frame, name) is None) != (getattr(first, name) is None):
                 raise CaptureError(f"{sample_id}: has {name} or not, unlike {self._first_id}; write these apart")
         if frame.frame_id != first.frame_id:
@@ -490,6 +502,7 @@ class _Dataset:
                 found.append(("depth", view.facts.depth, view.depth))
             if view.color is not None and view.facts.color is not None:
                 found.append(("color", view.facts.color, view.color))
+            found += [(role, view.facts.images[role], video) for role, video in view.images.items()]
         return found
 
 
