@@ -27,7 +27,7 @@ SCHEMA = "pcdata.inspection/1"
 _GAP = 1.5  # of the median step in time: a longer one is a gap
 _MOST_FILES = 20_000  # whose sizes are asked for
 _IMAGES = {"colors": "color", "labels": "labels", "confidence": "confidence", "mask": "mask"}
-_SENSOR = ("sensor", "sensor_name", "serial", "registered_to", "unit_source")
+_SENSOR = ("sensor", "sensor_name", "serial", "registered_to")
 
 
 def capture_facts(source: CaptureSource) -> dict[str, Any]:
@@ -93,6 +93,7 @@ def _frame_facts(frame: DepthFrame) -> dict[str, Any]:
         ],
         "depth": depth,
         "metres_per_unit": said.get("metres_per_unit"),
+        "unit_source": said.get("unit_source"),
         "depth_encoding": said.get("depth_encoding", "plain"),
         "images": [name for attribute, name in _IMAGES.items() if getattr(frame, attribute) is not None],
         "poses": frame.frame_id,

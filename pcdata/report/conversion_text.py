@@ -7,6 +7,8 @@ import shlex
 from pcdata.io import WrittenReport
 from pcdata.report.inspection_text import size_in_words, skipped_text
 
+_SHOWN = 8  # lines of what is not read
+
 
 def conversion_text(report: WrittenReport) -> str:
     """Tell what was written, what was lost of it, what was left out, and how to go on."""
@@ -15,7 +17,10 @@ def conversion_text(report: WrittenReport) -> str:
     lines = [f"written  {report.folder}  ({report.kind}: {captures})"]
     lines += [f"lost     {name}: {loss}" for name, loss in report.lost.items()]
     if not report.lost:
-        lines.append("lost     nothing: all that the captures hold comes back as it was")
+        lines.append("lost     nothing: all that was read comes back as it was")
+    lines += [f"not read {line}" for line in report.not_read[:_SHOWN]]
+    if len(report.not_read) > _SHOWN:
+        lines.append(f"not read and {len(report.not_read) - _SHOWN} more; 'pcdata inspect' of the captures tells all")
     lines += [f"note     {note}" for note in report.notes]
     if report.left_out:
         lines.append(skipped_text(report.left_out))

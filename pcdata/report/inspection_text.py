@@ -18,7 +18,7 @@ from pcdata.report.plain_table import text_table
 from pcdata.structures import PointCloud
 
 _SKIPPED_SHOWN = 20  # captures that were left out, in a summary
-_STREAMS_SHOWN = 40
+_COUNTS = ("dropped", "doubled", "interpolated", "missing")  # of a stream
 
 
 def build_text(report: BuildReport) -> str:
@@ -159,19 +159,29 @@ def _times_in_words(facts: Mapping[str, Any]) -> str:
 
 
 def _stream_table(streams: Sequence[Mapping[str, Any]]) -> str:
-    header = ["stream", "as", "Hz", "messages", "joined by", "dropped", "doubled", "interpolated", "missing", "gap"]
+    """Tell each topic once: of several recordings the messages of all, and the largest gap."""
+    header = ["stream", "as", "Hz", "messages", "joined by", *_COUNTS, "largest gap"]
+    topics: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for one in streams:
+        topics.setdefault((str(one["topic"]), str(one["role"])), []).append(one)
     rows = [
         [
-            "/".join(filter(None, (str(one.get("recording", "")), str(one["topic"]).strip("/")))),
-            str(one["role"]),
-            f"{one['rate_hz']:.4g}" if one.get("rate_hz") else "",
-            *(one.get(word, "") for word in ("messages", "rule", "dropped", "doubled", "interpolated", "missing")),
-            f"{one.get('largest_gap_s', 0.0):.3g} s",
+            topic,
+            role,
+            _rates([one["rate_hz"] for one in parts if one.get("rate_hz")]),
+            sum(one.get("messages", 0) for one in parts),
+            str(parts[0].get("rule", "")),
+            *(sum(one.get(word) or 0 for one in parts) for word in _COUNTS),
+            f"{max(one.get('largest_gap_s') or 0.0 for one in parts):.3g} s",
         ]
-        for one in streams[:_STREAMS_SHOWN]
+        for (topic, role), parts in topics.items()
     ]
-    more = len(streams) - len(rows)
-    return text_table(header, rows) + (f"\nand {more} more; --json FILE has all" if more else "")
+    return text_table(header, rows)
+
+
+def _rates(rates: Sequence[float]) -> str:
+    low, high = (f"{rate:.4g}" for rate in (min(rates, default=0.0), max(rates, default=0.0)))
+    return "" if not rates else low if low == high else f"{low} to {high}"
 
 
 def _left_out(skipped: Mapping[str, str]) -> list[str]:
@@ -217,6 +227,7 @@ def _unit(facts: Mapping[str, Any]) -> str:
     """Say how a stored number became metres, as the reader says it."""
     stored, order = facts["metres_per_unit"], facts["depth_encoding"]
     unit = "metres" if stored in (None, 1.0) else f"1 stored = {stored:.10g} m"
+    unit += f" ({facts['unit_source']})" if facts["unit_source"] else ""
     return unit if order == "plain" else f"{unit}, {order}"
 
 

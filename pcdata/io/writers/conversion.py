@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CacheError, ConfigError, PcdataError, write_fault
+from pcdata.errors import CacheError, ConfigError, PcdataError, add_note, write_fault
 from pcdata.files.whole_folders import complete_or_nothing, is_free
-from pcdata.io.sources.capture_source import all_within, skipped_of
+from pcdata.io.sources.capture_source import all_within, skipped_of, unread_of
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.writers.registry import writer_named
 from pcdata.io.writers.writer import Captures, WrittenReport
@@ -47,15 +47,17 @@ def convert(
     _check_outside(folder, opened)
     if not is_free(folder):
         raise CacheError(f"{_WHERE}: {folder} exists already, and nothing is written over; choose a new folder")
-    report = WrittenReport(folder, writer.kind, left_out=skipped_of(opened))
+    report = WrittenReport(folder, writer.kind, left_out=skipped_of(opened), not_read=unread_of(opened))
     captures = Captures(opened, writer.keeps, report, progress)
     report.episodes = len(captures.episodes)
     with complete_or_nothing(folder, note=captures.note) as partial:
         try:
             writer.write(captures, partial)
+        except PcdataError as error:
+            if error.sample_id is None and captures.latest:
+                add_note(error, f"while writing capture {captures.latest!r}", sample_id=captures.latest)
+            raise
         except OSError as error:
-            if isinstance(error, PcdataError):
-                raise
             raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
         captures.inputs.check(_WHERE)
         report.size = sum(file.stat().st_size for file in partial.rglob("*") if file.is_file())

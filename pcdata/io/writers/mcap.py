@@ -91,9 +91,9 @@ def _stamps(captures: Captures, ids: Sequence[str], episode: Episode | None) -> 
     """Return the nanoseconds of each capture, each later than the one before."""
     times = episode.times if episode is not None else ()
     start = episode.attributes.get(START) if episode is not None else None
-    if not times:
+    if not times and len(ids) > 1:
         captures.note(f"no times are known of some captures: they are {_STEP / 1e9:g} s apart in the recording")
-        times = [place * _STEP / 1e9 for place in range(len(ids))]
+    times = times or [place * _STEP / 1e9 for place in range(len(ids))]
     start = start if isinstance(start, int) and 0 < start < 1 << 62 else _NO_CLOCK
     stamps: list[int] = []
     for time in times:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pcdata.errors import CaptureError, NoReadingError, PcdataError, add_note
+from pcdata.errors import ConfigError, NoReadingError, PcdataError, add_note
 from pcdata.files.inputs import recording
 from pcdata.io.sources.capture_source import REFUSALS, checked_ids, episodes_of, inputs_of
 from pcdata.progress import Progress
@@ -64,6 +64,7 @@ class WrittenReport:
         size: bytes on disk.
         lost: what does not come back as it was, by name: depth, color, ...
         left_out: id of a capture that was left out -> why.
+        not_read: what lies in the captures but is not read, so not written either.
         notes: what else to know.
     """
 
@@ -74,6 +75,7 @@ class WrittenReport:
     size: int = 0
     lost: dict[str, Loss] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    not_read: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -89,6 +91,7 @@ class Captures:
         self.episodes: list[Episode] = episodes_of(source)
         self.name = str(getattr(source, "name", "captures"))
         self._report, self._progress = report, progress
+        self.latest = ""  # the capture that was loaded last
         self.inputs = inputs_of(source)
 
     def __len__(self) -> int:
@@ -101,7 +104,8 @@ class Captures:
         """Load captures one after another, on the CPU; an id and what it holds at a time.
 
         Raises:
-            CaptureError: one is no depth image, or no pixel of one has a reading, which no layout could give back.
+            ConfigError: one is no depth image.
+        NoReadingError: no pixel of one has a reading, which no layout could give back.
             PcdataError: one cannot be read.
         """
         for sample_id in ids:
@@ -114,6 +118,7 @@ class Captures:
                 add_note(error, f"sample {sample_id!r} of {self.source!r}{hint}", sample_id=sample_id)
                 raise
             self.inputs.check_latest("convert")
+            self.latest = sample_id
             yield sample_id, frame
             self._report.samples += 1
             for name, has in self._left_behind.items():
@@ -165,9 +170,9 @@ class Writer(ABC):
 
 def _depth_frame(data: Any) -> DepthFrame:
     if not isinstance(data, DepthFrame):
-        raise CaptureError(
-            f"is no depth image but a {type(data).__name__}: convert writes depth images with their cameras; "
-            "'pcdata build' stores clouds and 'pcdata export' writes them for others"
+        raise ConfigError(
+            f"convert: a capture is no depth image but a {type(data).__name__}, and depth images with their cameras "
+            "are what is written; 'pcdata build' stores clouds, 'pcdata export' writes them for others"
         )
     frame = data.cpu()
     for view in range(frame.num_views):
