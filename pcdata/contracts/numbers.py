@@ -9,6 +9,7 @@ belongs to one operation alone stands beside that operation.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -138,6 +139,21 @@ def require_count(where: str, name: str, value: int, *, minimum: int = 1, maximu
     if value < minimum or (maximum is not None and value > maximum):
         allowed = f"at least {minimum}" if maximum is None else f"{minimum} to {maximum}"
         raise ConfigError(f"{where}: {name} must be {allowed}, got {value}")
+
+
+def whole_number(where: str, name: str, value: Any) -> int:
+    """Return a whole number of Python, NumPy or torch as an int; a boolean is none.
+
+    Raises:
+        DTypeError: it is none.
+    """
+    is_flag = isinstance(value, bool) or str(getattr(value, "dtype", "")) in ("bool", "torch.bool")
+    try:
+        if not is_flag:
+            return operator.index(value)
+    except TypeError:
+        pass
+    raise DTypeError(f"{where}: {name} must be a whole number, got {value!r:.100}")
 
 
 def require_length(where: str, name: str, value: float) -> None:

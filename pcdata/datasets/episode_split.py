@@ -5,6 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
+from pcdata.contracts.numbers import whole_number
 from pcdata.errors import ConfigError
 from pcdata.structures import Episode
 
@@ -16,12 +19,14 @@ def split_episodes(
 
     Raises:
         ConfigError: there are no episodes or too few, or the parts leave some out without saying so.
+        DTypeError: a seed that is no whole number.
     """
     recorded = list(dict.fromkeys(episode.whole for episode in episodes))
     if not recorded:
         raise ConfigError(
             f"split_episodes: {where} has no episodes; say in episodes.json beside the captures which follow each other"
         )
+    seed = whole_number("split_episodes", "seed", seed)
     counts = _counts(parts, len(recorded))
     # Sorted by a hash of each: an episode more or less moves few others from part to part.
     drawn = iter(sorted(recorded, key=lambda name: hashlib.sha256(f"{seed}\0{name}".encode()).digest()))
@@ -36,6 +41,7 @@ def _counts(parts: Mapping[str, float | int | None], total: int) -> dict[str, in
     told = f"of {total} episodes, got {dict(parts) if isinstance(parts, Mapping) else parts!r:.200}"
     if not isinstance(parts, Mapping) or not parts:
         raise ConfigError(f"split_episodes: parts must map names to how much {told}")
+    parts = {name: part.item() if isinstance(part, np.generic) else part for name, part in parts.items()}
     counts: dict[str, int] = {}
     rest = [name for name, part in parts.items() if part is None]
     shares = 0.0

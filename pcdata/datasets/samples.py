@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ from torch import Generator
 from torch.utils.data import Dataset, get_worker_info
 
 from pcdata.contracts.dispatch import warn_if_slow
+from pcdata.contracts.numbers import whole_number
 from pcdata.datasets.episode_split import split_episodes
 from pcdata.datasets.errors_in_workers import for_the_parent
 from pcdata.datasets.passes import PassWatch, shared
@@ -37,7 +37,9 @@ class SampleDataset(Dataset[PointCloud]):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
         if len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
-        if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+        where = type(self).__name__
+        seed, repeats = whole_number(where, "seed", seed), whole_number(where, "repeats", repeats)
+        if repeats < 1:
             raise ConfigError(f"repeats must be how often every sample is in the dataset, 1 or more, got {repeats!r}")
         warn_if_slow()  # workers stay silent
         self.ids = list(ids)
@@ -56,8 +58,14 @@ class SampleDataset(Dataset[PointCloud]):
         """Change the random draws; call it before each pass over the data, also with persistent workers.
 
         A second pass without it repeats the draws of the first and warns once (:class:`RepeatedEpochWarning`).
+
+        Raises:
+            DTypeError, ConfigError: it is no whole number, or one of more than 63 bits.
         """
-        self._epoch.fill_(operator.index(epoch))
+        number = whole_number("set_epoch", "epoch", epoch)
+        if not -(1 << 63) <= number < 1 << 63:
+            raise ConfigError(f"set_epoch: epoch must be a number of 63 bits, got {number:.6g}")
+        self._epoch.fill_(number)
         self._passes.restart()
 
     @property
@@ -99,10 +107,8 @@ class SampleDataset(Dataset[PointCloud]):
     def __getitem__(self, index: int | tuple[int, int] | slice) -> PointCloud:
         if isinstance(index, slice):
             raise DTypeError("a dataset gives one sample per index; for several use torch.utils.data.Subset")
-        place, more = index if isinstance(index, tuple) else (index, 0)
-        if not -len(self) <= place < len(self):
-            raise IndexError(f"there is no sample {place}: {self!r} has indices 0 to {len(self) - 1}")
-        place = operator.index(place) % len(self)
+        given, more = index if isinstance(index, tuple) else (index, 0)
+        place = self._place(given)
         copy, number = divmod(place, len(self.ids))
         sample_id = self.ids[number]
         try:
@@ -117,6 +123,18 @@ class SampleDataset(Dataset[PointCloud]):
             if get_worker_info() is not None:
                 raise for_the_parent(error) from error.__cause__
             raise
+
+    def _place(self, index: Any) -> int:
+        """Return an index as one from 0.
+
+        Raises:
+            DTypeError: it is no whole number.
+            IndexError: there is no such sample.
+        """
+        place = whole_number(type(self).__name__, "the index of a sample (ids names them in order)", index)
+        if not -len(self) <= place < len(self):
+            raise IndexError(f"there is no sample {place}: {self!r} has indices 0 to {len(self) - 1}")
+        return place % len(self)
 
     def _made(self, number: int, generator: Generator | None) -> PointCloud:
         """Load a sample and run the transform on it."""

@@ -126,8 +126,9 @@ class EpisodeWindows(SampleDataset):
         """Return the signals of the samples of ``dataset``; ``steps`` says which of them a window has."""
         return self.dataset.signal_table()
 
-    def steps(self, number: int) -> NDArray[np.int64]:
+    def steps(self, index: int) -> NDArray[np.int64]:
         """Return the places (horizon,) of a window's steps among the ids of ``dataset``, repeated ones as they are."""
+        number = self._place(index) % len(self.ids)
         episode = self._episodes[int(self.places.episode[number])]
         return episode.first + window_steps(int(self.places.start[number]), episode.length, self.horizon)
 

@@ -84,6 +84,8 @@ def checked_episodes(where: str, episodes: Iterable[Episode], num_samples: int) 
         DTypeError: one is no :class:`Episode`.
         CaptureError: two have one name, overlap or stand in another order, or one reaches beyond the samples.
     """
+    if isinstance(episodes, Episode) or not isinstance(episodes, Iterable):
+        raise DTypeError(f"{where}: episodes must be a list of pcdata.Episode, got {type(episodes).__name__}")
     episodes = list(episodes)
     end, seen = 0, set[str]()
     for episode in episodes:

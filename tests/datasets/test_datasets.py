@@ -7,6 +7,7 @@ import json
 import pickle
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import Subset
@@ -340,3 +341,35 @@ def test_the_repr_tells_what_it_is(caches, source):
     assert "8 samples" in repr(CachedCloudDataset(caches["hdf5"]))
     assert "hdf5" in repr(CachedCloudDataset(caches["hdf5"]))
     assert "8 samples" in repr(CloudDataset(source))
+
+
+# -- numbers that are none -----------------------------------------------------------------------------------------
+
+NO_NUMBERS = ["s0", None, 1.5, True, np.True_, torch.tensor(True), [0, 1], torch.tensor([0, 1])]
+
+
+@pytest.mark.parametrize("given", NO_NUMBERS, ids=repr)
+def test_what_is_no_whole_number_is_neither_index_nor_seed_nor_epoch_nor_repeats(given, source, config):
+    dataset = CloudDataset(source, config.pipeline)
+    for wrong in (
+        lambda: dataset[given],
+        lambda: dataset.set_epoch(given),
+        lambda: CloudDataset(source, config.pipeline, seed=given),
+        lambda: CloudDataset(source, config.pipeline, repeats=given),
+    ):
+        with pytest.raises(DTypeError, match="must be a whole number, got"):
+            wrong()
+
+
+def test_whole_numbers_of_numpy_and_torch_are_those_of_python(source, config):
+    wanted = CloudDataset(source, config.pipeline, seed=3)[1].points
+    for number in (np.int64(3), np.uint8(3), torch.tensor(3)):
+        dataset = CloudDataset(source, config.pipeline, seed=number, repeats=np.int32(1))
+        dataset.set_epoch(number)
+        dataset.set_epoch(np.int64(0))
+        assert torch.equal(dataset[torch.tensor(1)].points, wanted)
+
+
+def test_an_epoch_of_more_bits_than_are_kept_is_refused(source):
+    with pytest.raises(ConfigError, match="epoch must be a number of 63 bits"):
+        CloudDataset(source).set_epoch(1 << 63)

@@ -539,3 +539,28 @@ def test_the_page_on_episodes_runs_as_it_stands(capsys):
     shapes = block.rsplit("# ", 1)[1].strip()
     printed = capsys.readouterr().out
     assert re.findall(r"\[(.*?)\]", printed) == re.findall(r"\((.*?)\)", shapes)
+
+
+def test_steps_of_a_copy_are_those_of_its_window_and_places_count_from_the_end():
+    windows = EpisodeWindows(CloudDataset(Cloudy((3, 2)), repeats=2), 2, 3)
+    assert windows.steps(6).tolist() == windows.steps(1).tolist() == windows.steps(np.int64(-4)).tolist()
+    with pytest.raises(IndexError, match="there is no sample 10"):
+        windows.steps(10)
+    with pytest.raises(DTypeError, match="must be a whole number, got 'e0@1'"):
+        windows.steps("e0@1")
+
+
+@pytest.mark.parametrize("given", [3, Episode("a", 0, 1), None], ids=repr)
+def test_episodes_that_are_no_list_are_refused(given):
+    from pcdata.structures.episodes import checked_episodes
+
+    with pytest.raises(DTypeError, match=r"episodes must be a list of pcdata\.Episode, got"):
+        checked_episodes("here", given, 3)
+
+
+def test_a_split_takes_numbers_of_numpy_and_refuses_a_seed_that_is_none():
+    dataset = CloudDataset(Cloudy((1,) * 6))
+    plain = dataset.split_episodes({"train": 0.5, "val": 2, "rest": None}, seed=1)
+    assert dataset.split_episodes({"train": np.float32(0.5), "val": np.int64(2), "rest": None}, np.int64(1)) == plain
+    with pytest.raises(DTypeError, match="seed must be a whole number, got None"):
+        dataset.split_episodes({"train": None}, seed=None)
