@@ -136,7 +136,7 @@ def source_settings(document: Document, node: Any, folder: Path | None) -> Sourc
         return SourceSettings()
     for key in _FILES:
         if isinstance(values.get(key), str) and folder is not None:
-            values[key] = str(folder / Path(values[key]).expanduser())
+            values[key] = os.path.join(folder, os.path.expanduser(values[key]))  # a Path drops a pattern's last slash
     skip = list(values.pop("skip", None) or ())
     skip_file = values.pop("skip_file", None)
     skip += read_skip_file(skip_file) if skip_file else []

@@ -37,8 +37,9 @@ class SampleDataset(Dataset[PointCloud]):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
         if len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
-        where = type(self).__name__
-        seed, repeats = whole_number(where, "seed", seed), whole_number(where, "repeats", repeats)
+        if not (type(seed) is type(repeats) is int):  # of NumPy, or no numbers at all
+            where = type(self).__name__
+            seed, repeats = whole_number(where, "seed", seed), whole_number(where, "repeats", repeats)
         if repeats < 1:
             raise ConfigError(f"repeats must be how often every sample is in the dataset, 1 or more, got {repeats!r}")
         warn_if_slow()  # workers stay silent

@@ -268,7 +268,8 @@ class DepthFrame(Structure):
             known = [CAMERA_FRAME] if self.frame_id is None else [CAMERA_FRAME, self.frame_id]
             raise FrameError(
                 f"{where}: is in {signal.frame!r:.100}, but the capture knows the frames {known}; give it its poses "
-                "(world_from_camera and frame_id), or the signal in one of these"
+                "(world_from_camera) and the name of the frame that they lead to (frame_id; --frame, or frame_id in "
+                "intrinsics.json), or the signal in one of these"
             )
 
     def _tensors(self) -> dict[str, Tensor | None]:

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CaptureError, ConfigError, locates_path, near_matches
+from pcdata.errors import CaptureError, ConfigError, PcdataError, add_note, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
 from pcdata.io.sources.capture_source import kinds_of, refused_captures
@@ -39,7 +39,8 @@ def open_source(
 
     Args:
         path: a folder, or a single ``.pcd``, ``.ply`` or ``.bag`` file; or a pattern such as ``scenes/*``, of which
-            every match is opened by itself and all are joined: the sample ``NAME/ID`` is ``ID`` of the match ``NAME``.
+            every match is opened by itself and all are joined: the sample ``NAME/ID`` is ``ID`` of the match ``NAME``;
+            ``scenes/*/`` fits folders alone.
         kind: the layout, one of :data:`LAYOUTS`; None = found by its signs.
         only: keep the samples whose ids match this pattern, or one of these, such as ``frame_00*``.
         limit: keep the first so many of the samples that are not left out by ``only`` and ``skip``.
@@ -100,12 +101,26 @@ def _open(path: str | os.PathLike[str], kind: str | None, options: dict[str, Any
     if not glob.has_magic(str(given)):
         raise CaptureError(f"{_WHERE}: {given}: no such file or folder; check the path (relative to {Path.cwd()})")
     fixed = Path(*_before_pattern(given.parts))
-    found = [Path(match) for match in glob.glob(str(given))]
+    found = [Path(match) for match in glob.glob(str(given) + _folders_alone(path))]
     names = {match.relative_to(fixed).as_posix(): match for match in found if not is_litter(match.name)}
     if not names:
         raise CaptureError(f"{_WHERE}: {given}: no file or folder fits this pattern (relative to {Path.cwd()})")
     check_links(names.values())
-    return JoinedSource({name: _open_one(names[name], kind, options) for name in in_order(names)})
+    return JoinedSource({name: _open_match(given, names[name], kind, options) for name in in_order(names)})
+
+
+def _folders_alone(path: str | os.PathLike[str]) -> str:
+    """Return the slash that a pattern of folders ends with, which a Path drops, or nothing."""
+    return "/" if os.fspath(path).endswith(("/", os.sep)) else ""
+
+
+def _open_match(pattern: Path, path: Path, kind: str | None, options: dict[str, Any]) -> Source:
+    try:
+        return _open_one(path, kind, options)
+    except PcdataError as error:
+        fix = "" if path.is_dir() else f"; {pattern.as_posix()}/ fits folders alone"
+        add_note(error, f"{path.name} fits the pattern {pattern}, so it must be a capture{fix}")
+        raise
 
 
 def _open_one(path: Path, kind: str | None, options: dict[str, Any]) -> Source:
@@ -129,7 +144,12 @@ def _told(
     fixed = len(_before_pattern(given.parts))
     is_pattern = fixed < len(given.parts) and not given.exists()
     place = given.parts[max(fixed - 1, 0) :] if is_pattern else [absolute(given).name]
-    told = {"path": Path(*place).as_posix(), **{name: value for name, value in others.items() if value}, **options}
+    pattern = _folders_alone(path) if is_pattern else ""
+    told = {
+        "path": Path(*place).as_posix() + pattern,
+        **{name: value for name, value in others.items() if value},
+        **options,
+    }
     if isinstance(told.get("only"), str):
         told["only"] = [told["only"]]
     if "calibration" in told:

@@ -38,6 +38,7 @@ from pcdata.io.sources.registry import fields_of, options_of
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import SyntheticSource, TeleopSource
 from tests.captures import CAPTURES, OPTIONS, folder_capture, graspnet_capture, seven_scenes_capture
+from tests.messages import told
 from tests.warm import run_python
 
 COMBINED: dict[str, dict[str, Any]] = {  # by combinator: how it is said of a capture of three frames
@@ -254,6 +255,19 @@ def test_a_pattern_joins_what_fits_it_in_order(tmp_path: Path) -> None:
         open_source(tmp_path / "captures" / "scene_*")
     literal = folder_capture(tmp_path / "captures [1]")
     assert open_source(literal).ids == ["a_1", "a_2", "a_10"]
+
+
+def test_a_pattern_with_a_slash_at_its_end_fits_folders_alone(tmp_path: Path) -> None:
+    folder_capture(tmp_path / "demos" / "pick_0")
+    (tmp_path / "demos" / "camera.npz").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"camera\.npz: no known layout") as caught:
+        open_source(tmp_path / "demos" / "*")
+    assert "demos/*/ fits folders alone" in told(caught.value)
+    source = open_source(f"{tmp_path}/demos/*/")
+    assert source.ids == ["pick_0/a_1", "pick_0/a_2", "pick_0/a_10"]
+    assert source.opened["path"] == "demos/*/"
+    config = config_from_yaml("depth: [Deproject]\nsource: {path: demos/*/}\n", folder=tmp_path)
+    assert config.source.open().ids == source.ids
 
 
 def test_nothing_is_averaged_or_compared_from_one_recording_to_the_next(tmp_path: Path) -> None:
