@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from pcdata.datasets import CachedCloudDataset
@@ -52,15 +53,19 @@ class DrawnClouds:
         by_episode: bool = False,
     ) -> None:
         for name, value, least in (("seed", seed, None), ("epoch", epoch, 0), ("copies", copies, 1)):
-            number = isinstance(value, int) and not isinstance(value, bool) and (least is None or value >= least)
+            number = (
+                isinstance(value, (int, np.integer))
+                and not isinstance(value, bool)
+                and (least is None or value >= least)
+            )
             if value is not None and not number:
                 wanted = "a whole number" if least is None else f"a whole number, {least} or more"
                 raise ConfigError(f"export: {name} must be {wanted}, got {value!r:.100}")
         self._dataset = dataset
         self.moved = False  # whether the transform moved the cloud that was loaded last
-        self.seed = dataset.seed if seed is None else seed
-        self.epoch = dataset.epoch if epoch is None else epoch
-        self.copies = dataset.repeats if copies is None else copies
+        self.seed = dataset.seed if seed is None else int(seed)
+        self.epoch = dataset.epoch if epoch is None else int(epoch)
+        self.copies = dataset.repeats if copies is None else int(copies)
         if not self.is_random and (copies or 1) > 1:
             raise ConfigError(f"export: {dataset!r} draws nothing, so {copies} copies would be alike; leave out copies")
         self._place = {

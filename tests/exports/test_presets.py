@@ -173,7 +173,7 @@ def test_what_says_nothing_about_the_draws_is_refused(built, tmp_path):
 
 def test_a_continued_export_keeps_its_draws(built, tmp_path):
     export_dataset(built, "pointcept", tmp_path / "out", resume=True, seed=1)
-    assert export_dataset(built, "pointcept", tmp_path / "out", resume=True, seed=1).kept == 3
+    assert export_dataset(built, "pointcept", tmp_path / "out", resume=True, seed=np.int64(1)).kept == 3
     with pytest.raises(CacheError, match="its draws are"):
         export_dataset(built, "pointcept", tmp_path / "out", resume=True, seed=2)
 
