@@ -21,6 +21,14 @@ def rotations_of(num_clouds: int, *, seed: int = 0) -> Tensor:
     return rotation * torch.linalg.det(rotation)[..., None, None]
 
 
+EULER = {"euler_xyz_fixed": "xyz", "euler_xyz_moving": "XYZ", "euler_zyx_moving": "ZYX"}  # as SciPy calls them
+
+
+def has_position(layout: str) -> bool:
+    """Whether a layout has x, y and z: told by its name."""
+    return layout == "matrix" or layout.startswith("xyz_")
+
+
 def written(layout: str, position: Tensor, rotation: Tensor) -> Tensor:
     """Poses of a layout, float64, from positions and rotations, by SciPy and by plain indexing."""
     from scipy.spatial.transform import Rotation
@@ -31,36 +39,46 @@ def written(layout: str, position: Tensor, rotation: Tensor) -> Tensor:
         pose = torch.eye(4, dtype=torch.float64).repeat(*free, 1, 1)
         pose[..., :3, :3], pose[..., :3, 3] = rotation, position
         return pose
+    if layout == "rotation":
+        return rotation.clone()
+    name = layout.removeprefix("xyz_")
     part = {
-        "xyz_quat_xyzw": lambda: torch.from_numpy(turned.as_quat()),
-        "xyz_quat_wxyz": lambda: torch.from_numpy(turned.as_quat()).roll(1, -1),
-        "xyz_rot6d_rows": lambda: rotation[..., :2, :].flatten(-2),
-        "xyz_rot6d_columns": lambda: torch.cat([rotation[..., 0], rotation[..., 1]], dim=-1),
-        "xyz_axis_angle": lambda: torch.from_numpy(turned.as_rotvec()),
-    }[layout]()
-    return torch.cat([position, part.reshape(*free, -1)], dim=-1)
+        "quat_xyzw": lambda: torch.from_numpy(turned.as_quat()),
+        "quat_wxyz": lambda: torch.from_numpy(turned.as_quat()).roll(1, -1),
+        "rot6d_rows": lambda: rotation[..., :2, :].flatten(-2),
+        "rot6d_columns": lambda: torch.cat([rotation[..., 0], rotation[..., 1]], dim=-1),
+        "axis_angle": lambda: torch.from_numpy(turned.as_rotvec()),
+        **{euler: lambda order=order: torch.from_numpy(turned.as_euler(order)) for euler, order in EULER.items()},
+    }[name]()
+    part = part.reshape(*free, -1)
+    return torch.cat([position, part], dim=-1) if has_position(layout) else part
 
 
-def read(layout: str, values: Tensor) -> tuple[Tensor, Tensor]:
-    """The positions and rotations of poses, by SciPy and by plain indexing."""
+def read(layout: str, values: Tensor) -> tuple[Tensor | None, Tensor]:
+    """The positions, if any, and rotations of poses, by SciPy and by plain indexing."""
     from scipy.spatial.transform import Rotation
 
     values = values.double()
     if layout == "matrix":
         return values[..., :3, 3], values[..., :3, :3]
-    free, part = values.shape[:-1], values[..., 3:]
+    if layout == "rotation":
+        return None, values
+    name = layout.removeprefix("xyz_")
+    position, part = (values[..., :3], values[..., 3:]) if has_position(layout) else (None, values)
     flat = part.reshape(-1, part.shape[-1])
-    if "rot6d" in layout:
+    if "rot6d" in name:
         first, second = flat[:, :3], flat[:, 3:]
         lines = torch.stack([first, second, torch.linalg.cross(first, second)], dim=-2)
-        rotation = lines if layout.endswith("rows") else lines.mT
-    elif "quat" in layout:
+        rotation = lines if name.endswith("rows") else lines.mT
+    elif "quat" in name:
         rotation = torch.from_numpy(
-            Rotation.from_quat(flat if layout.endswith("xyzw") else flat.roll(-1, -1)).as_matrix()
+            Rotation.from_quat(flat if name.endswith("xyzw") else flat.roll(-1, -1)).as_matrix()
         )
+    elif name in EULER:
+        rotation = torch.from_numpy(Rotation.from_euler(EULER[name], flat.numpy()).as_matrix())
     else:
         rotation = torch.from_numpy(Rotation.from_rotvec(flat).as_matrix())
-    return values[..., :3], rotation.reshape(*free, 3, 3)
+    return position, rotation.reshape(*part.shape[:-1], 3, 3)
 
 
 def markers(num_clouds: int, *, seed: int = 0) -> dict[str, tuple[Any, str]]:

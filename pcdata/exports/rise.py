@@ -32,6 +32,7 @@ from pcdata.geometry import rigid, rotations
 from pcdata.io.images.writing import depth_units, write_color, write_depth
 from pcdata.io.store.manifest import key_of
 from pcdata.structures import CAMERA_FRAME, DepthFrame, Episode, PointCloud
+from pcdata.structures.pose_layouts import LAYOUTS
 
 # Of dataset/constants.py: the camera at the tool, and where it is mounted. The projector goes by way of it.
 _INHAND_CAMERA = "043322070878"
@@ -159,6 +160,10 @@ class _Rise(Target):
             )
         values = signal.values[0].double()
         position, quaternion = _position_and_quaternion(layout, values)
+        if position is None:
+            raise CaptureError(
+                f"{where}: tcp must be a pose, but the signal {self.tcp!r} is a rotation alone: {signal!r}"
+            )
         pose = torch.cat([position, quaternion]).numpy()
         if pose.shape != (7,):
             raise CaptureError(f"{where}: tcp must be one pose, but the signal {self.tcp!r} is {signal!r}")
@@ -236,19 +241,15 @@ def _units_per_metre(camera: str) -> int:
     return 4000 if "f" in camera else 1000
 
 
-def _position_and_quaternion(layout: str, values: Tensor) -> tuple[Tensor, Tensor]:
+def _position_and_quaternion(name: str, values: Tensor) -> tuple[Tensor | None, Tensor]:
     """Return x y z and the quaternion w x y z of one pose; a quaternion stays as it was recorded."""
-    if layout == "matrix":
-        return values[..., :3, 3], rotations.quaternion_from_rotation(values[..., :3, :3])
-    position, rest = values[..., :3], values[..., 3:]
-    if layout == "xyz_quat_wxyz":
-        return position, rest
-    if layout == "xyz_quat_xyzw":
-        return position, rest.roll(1, -1)
-    if layout == "xyz_axis_angle":
-        return position, rotations.quaternion_from_rotation_vector(rest)
-    rotation = rotations.rotation_from_two_vectors(rest[..., :3], rest[..., 3:])
-    return position, rotations.quaternion_from_rotation(rotation.mT if layout == "xyz_rot6d_rows" else rotation)
+    layout = LAYOUTS[name]
+    position, part = layout.parts(values)
+    if name.endswith("quat_wxyz"):
+        return position, part
+    if name.endswith("quat_xyzw"):
+        return position, part.roll(1, -1)
+    return position, rotations.quaternion_from_rotation(layout.rotation(part))
 
 
 def _stamps(episode: Episode) -> list[int]:

@@ -1,4 +1,4 @@
-"""Rotations written as quaternions, as two vectors (6D) and as rotation vectors; all computed in float64.
+"""Rotations written as quaternions, as two vectors (6D), as rotation vectors and as Euler angles; all in float64.
 
 Quaternions are (w, x, y, z) here; those that files hold in another order are turned around where they are read.
 """
@@ -83,6 +83,35 @@ def rotation_from_two_vectors(first: Tensor, second: Tensor) -> Tensor:
     y = second - (x * second).sum(-1, keepdim=True) * x
     y = y / y.norm(dim=-1, keepdim=True)
     return torch.stack([x, y, torch.linalg.cross(x, y, dim=-1)], dim=-1)
+
+
+def rotation_from_euler(angles: Tensor, axes: str) -> Tensor:
+    """Return (..., 3, 3) rotations of (..., 3) angles in radians about fixed axes, one after the other.
+
+    ``axes`` is an order of "xyz": with "xyz" the first angle turns about x, the next about y, the last about z.
+    """
+    x, y, z = torch.eye(3, dtype=torch.float64, device=angles.device).unbind(0)
+    turns = [
+        quaternion_from_rotation_vector(angle[..., None] * {"x": x, "y": y, "z": z}[axis])
+        for axis, angle in zip(axes, angles.double().unbind(-1), strict=True)
+    ]
+    return rotation_from_unit_quaternion(multiplied(turns[2], multiplied(turns[1], turns[0])))
+
+
+def euler_from_rotation(rotation: Tensor, axes: str) -> Tensor:
+    """Return (..., 3) angles of (..., 3, 3) rotations as :func:`rotation_from_euler` takes them.
+
+    The middle one is at most a quarter turn. Where it is one, the other two are not unique; they give the rotation too,
+    since the last is read off what the first two leave of it.
+    """
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    r = rotation.double()
+    middle = torch.atan2(-sign * r[..., k, i], torch.hypot(r[..., i, i], r[..., j, i]))
+    first = torch.atan2(sign * r[..., k, j], r[..., k, k])
+    column = first.cos()[..., None] * r[..., :, j] - sign * first.sin()[..., None] * r[..., :, k]
+    last = torch.atan2(-sign * column[..., i], column[..., j])
+    return torch.stack([first, middle, last], dim=-1)
 
 
 def closest_rotation(linear: Tensor) -> Tensor:

@@ -96,34 +96,62 @@ Fault = tuple[Tensor, str]  # (B, ...) bool where rows are at fault, and what mu
 
 @dataclass(frozen=True, kw_only=True)
 class PoseLayout:
-    """One way to write a rotation beside a position: x, y, z and then its columns, or both in a 4x4."""
+    """One way to write a rotation: beside a position, x, y, z and then its columns, or both in a 4x4; or alone."""
 
     row: tuple[int, ...]  # shape of one pose
     holds: str  # in words
+    rotation: Callable[[Tensor], Tensor]  # rotation part -> R (..., 3, 3), float64
     turned: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q (..., 3, 3), quaternion (..., 4) -> Q R
     conjugated: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q, handedness (..., 1) -> Q R Q^T
-    faults: Callable[[Tensor], list[Fault]]
+    faults: Callable[[Tensor], list[Fault]]  # of rotation parts; of poses that are 4x4, of those
+    has_position: bool = True
 
     @property
     def is_matrix(self) -> bool:
-        """Whether poses are 4x4."""
+        """Whether its rows are matrices, 4x4 or 3x3."""
         return len(self.row) == 2
 
-    def parts(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the positions (..., 3) and the rotation parts."""
+    def parts(self, values: Tensor) -> tuple[Tensor | None, Tensor]:
+        """Return the positions (..., 3), None where there are none, and the rotation parts."""
+        if not self.has_position:
+            return None, values
         if self.is_matrix:
             return values[..., :3, 3], values[..., :3, :3]
         return values[..., :3], values[..., 3:]
 
-    def joined(self, values: Tensor, position: Tensor, rotation: Tensor) -> Tensor:
+    def joined(self, values: Tensor, position: Tensor | None, rotation: Tensor) -> Tensor:
         """Return the poses with other positions and rotation parts."""
+        if position is None:
+            return rotation
         if not self.is_matrix:
             return torch.cat([position, rotation], dim=-1)
         top = torch.cat([rotation, position[..., None]], dim=-1)
         return torch.cat([top, values[..., 3:, :].expand(*top.shape[:-2], 1, 4)], dim=-2)
 
+    def faults_of(self, values: Tensor) -> list[Fault]:
+        """Return what can be wrong with (..., row) float64 poses, and where it is."""
+        return self.faults(values if self.is_matrix else self.parts(values)[1])
 
-def _quaternion(w_last: bool) -> dict[str, Callable[..., Tensor | list[Fault]]]:
+
+Ways = dict[str, Callable[..., Tensor | list[Fault]]]
+
+
+def _by_matrix(rotation: Callable[[Tensor], Tensor], written: Callable[[Tensor], Tensor]) -> Ways:
+    """Return how a rotation part is moved by way of its matrix."""
+
+    def turned(part: Tensor, matrix: Tensor, quaternion: Tensor) -> Tensor:
+        return written(_product(matrix, rotation(part)))
+
+    def conjugated(part: Tensor, matrix: Tensor, handedness: Tensor) -> Tensor:
+        return written(_product(_product(matrix, rotation(part)), matrix.mT))
+
+    return {"rotation": rotation, "turned": turned, "conjugated": conjugated}
+
+
+def _quaternion(w_last: bool) -> Ways:
+    def rotation_of(part: Tensor) -> Tensor:
+        return rotations.rotation_from_quaternion(part.roll(1, -1) if w_last else part)
+
     def turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
         if w_last:
             return rotations.multiplied(quaternion, part.roll(1, -1)).roll(-1, -1)
@@ -146,10 +174,10 @@ def _quaternion(w_last: bool) -> dict[str, Callable[..., Tensor | list[Fault]]]:
             ),
         ]
 
-    return {"turned": turned, "conjugated": conjugated, "faults": faults}
+    return {"rotation": rotation_of, "turned": turned, "conjugated": conjugated, "faults": faults}
 
 
-def _two_vectors(rows: bool) -> dict[str, Callable[..., Tensor | list[Fault]]]:
+def _two_vectors(rows: bool) -> Ways:
     def matrix(part: Tensor) -> Tensor:
         found = rotations.rotation_from_two_vectors(part[..., :3], part[..., 3:])
         return found.mT if rows else found
@@ -158,12 +186,6 @@ def _two_vectors(rows: bool) -> dict[str, Callable[..., Tensor | list[Fault]]]:
         first, second = (rotation if rows else rotation.mT).unbind(-2)[:2]
         return torch.cat([first, second], dim=-1)
 
-    def turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
-        return written(_product(rotation, matrix(part)))
-
-    def conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
-        return written(_product(_product(rotation, matrix(part)), rotation.mT))
-
     def faults(part: Tensor) -> list[Fault]:
         first, second = part[..., :3], part[..., 3:]
         area = torch.linalg.cross(first, second, dim=-1).norm(dim=-1)
@@ -171,62 +193,112 @@ def _two_vectors(rows: bool) -> dict[str, Callable[..., Tensor | list[Fault]]]:
         which = "rows" if rows else "columns"
         return [(flat, f"the two {which} of the rotation must not be 0 nor parallel; leave the sample out")]
 
-    return {"turned": turned, "conjugated": conjugated, "faults": faults}
+    return {**_by_matrix(matrix, written), "faults": faults}
 
 
-def _vector_turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
-    turned = rotations.multiplied(quaternion, rotations.quaternion_from_rotation_vector(part))
-    return rotations.rotation_vector_from_quaternion(turned)
+def _euler(order: str, *, intrinsic: bool) -> Ways:
+    """Angles in radians, one per column, about the axes that the order names: fixed ones, or ones that turn along."""
+
+    def turned_round(angles: Tensor) -> Tensor:
+        # Turns about axes that turn along are turns about fixed ones, the last one first.
+        return angles.flip(-1) if intrinsic else angles
+
+    axes = order[::-1] if intrinsic else order
+
+    def matrix(part: Tensor) -> Tensor:
+        return rotations.rotation_from_euler(turned_round(part), axes)
+
+    def written(rotation: Tensor) -> Tensor:
+        return turned_round(rotations.euler_from_rotation(rotation, axes))
+
+    return {**_by_matrix(matrix, written), "faults": _no_faults}
 
 
-def _vector_conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
-    return handedness * applied(rotation, part)
+def _rotation_vector() -> Ways:
+    def matrix(part: Tensor) -> Tensor:
+        return rotations.rotation_from_quaternion(rotations.quaternion_from_rotation_vector(part))
 
+    def turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
+        moved = rotations.multiplied(quaternion, rotations.quaternion_from_rotation_vector(part))
+        return rotations.rotation_vector_from_quaternion(moved)
 
-def _matrix_turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
-    return _product(rotation, part)
+    def conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
+        return handedness * applied(rotation, part)
 
-
-def _matrix_conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
-    return _product(_product(rotation, part), rotation.mT)
+    return {"rotation": matrix, "turned": turned, "conjugated": conjugated, "faults": _no_faults}
 
 
 def _no_faults(part: Tensor) -> list[Fault]:
     return []
 
 
-def _matrix_faults(pose: Tensor) -> list[Fault]:
-    linear = pose[..., :3, :3]
-    identity = torch.eye(3, dtype=torch.float64, device=pose.device)
-    skewed = (_product(linear, linear.mT) - identity).abs().amax(dim=(-2, -1)) > _UNIT
+def _rotation_faults(rotation: Tensor) -> list[Fault]:
+    identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    skewed = (_product(rotation, rotation.mT) - identity).abs().amax(dim=(-2, -1)) > _UNIT
+    return [
+        (skewed, f"the matrix must be rigid, R R^T the identity to {_UNIT:g}; is there a scale in it?"),
+        (torch.linalg.det(rotation) < 0, "the matrix is a mirror (determinant -1), not a pose; check the axes"),
+    ]
+
+
+def _pose_faults(pose: Tensor) -> list[Fault]:
     last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
     return [
         (
             (pose[..., 3, :] - last).abs().amax(dim=-1) > 1e-6,
             "the matrix must have the last row 0 0 0 1; is it transposed?",
         ),
-        (skewed, f"the matrix must be rigid, R R^T the identity to {_UNIT:g}; is there a scale in it?"),
-        (torch.linalg.det(linear) < 0, "the matrix is a mirror (determinant -1), not a pose; check the axes"),
+        *_rotation_faults(pose[..., :3, :3]),
     ]
 
 
+def _same(matrix: Tensor) -> Tensor:
+    return matrix
+
+
+_MATRIX = _by_matrix(lambda part: part.double(), _same)
+# Rotations in columns: name, columns, what they are, how they move.
+_ROTATIONS: tuple[tuple[str, int, str, Ways], ...] = (
+    ("quat_wxyz", 4, "quaternion w x y z", _quaternion(w_last=False)),
+    ("quat_xyzw", 4, "quaternion x y z w", _quaternion(w_last=True)),
+    ("rot6d_rows", 6, "the first two rows of R", _two_vectors(rows=True)),
+    ("rot6d_columns", 6, "the first two columns of R", _two_vectors(rows=False)),
+    ("axis_angle", 3, "axis times angle in radians", _rotation_vector()),
+    (
+        "euler_xyz_fixed",
+        3,
+        "radians about the fixed axes x, then y, then z (roll pitch yaw; SciPy's xyz)",
+        _euler("xyz", intrinsic=False),
+    ),
+    (
+        "euler_xyz_moving",
+        3,
+        "radians about x, then the y and then the z that turned along (SciPy's XYZ)",
+        _euler("xyz", intrinsic=True),
+    ),
+    (
+        "euler_zyx_moving",
+        3,
+        "radians about z, then the y and then the x that turned along (yaw pitch roll; SciPy's ZYX)",
+        _euler("zyx", intrinsic=True),
+    ),
+)
+
 LAYOUTS = {
-    "matrix": PoseLayout(
-        row=(4, 4),
-        holds="the 4x4 frame_from_pose",
-        turned=_matrix_turned,
-        conjugated=_matrix_conjugated,
-        faults=_matrix_faults,
+    "matrix": PoseLayout(row=(4, 4), holds="the 4x4 frame_from_pose", **_MATRIX, faults=_pose_faults),  # type: ignore[arg-type]
+    **{
+        f"xyz_{name}": PoseLayout(row=(3 + width,), holds=f"x y z, {holds}", **ways)  # type: ignore[arg-type]
+        for name, width, holds, ways in _ROTATIONS
+    },
+    "rotation": PoseLayout(
+        row=(3, 3),
+        holds="a rotation alone: the 3x3 R",
+        has_position=False,
+        **_MATRIX,  # type: ignore[arg-type]
+        faults=_rotation_faults,
     ),
-    "xyz_quat_wxyz": PoseLayout(row=(7,), holds="x y z, quaternion w x y z", **_quaternion(w_last=False)),  # type: ignore[arg-type]
-    "xyz_quat_xyzw": PoseLayout(row=(7,), holds="x y z, quaternion x y z w", **_quaternion(w_last=True)),  # type: ignore[arg-type]
-    "xyz_rot6d_rows": PoseLayout(row=(9,), holds="x y z, the first two rows of R", **_two_vectors(rows=True)),  # type: ignore[arg-type]
-    "xyz_rot6d_columns": PoseLayout(row=(9,), holds="x y z, the first two columns of R", **_two_vectors(rows=False)),  # type: ignore[arg-type]
-    "xyz_axis_angle": PoseLayout(
-        row=(6,),
-        holds="x y z, axis times angle in radians",
-        turned=_vector_turned,
-        conjugated=_vector_conjugated,
-        faults=_no_faults,
-    ),
+    **{
+        name: PoseLayout(row=(width,), holds=f"a rotation alone: {holds}", has_position=False, **ways)  # type: ignore[arg-type]
+        for name, width, holds, ways in _ROTATIONS
+    },
 }

@@ -47,7 +47,7 @@ def _moved_pose(values: Tensor, motion: Motion, layout: PoseLayout | None) -> Te
     turned = layout.turned(
         rotation, per_cloud(motion.rotation, values, axes), per_cloud(motion.quaternion, values, axes)
     )
-    return layout.joined(values, _moved_position(position, motion, None), turned)
+    return layout.joined(values, None if position is None else _moved_position(position, motion, None), turned)
 
 
 def _moved_delta(values: Tensor, motion: Motion, layout: PoseLayout | None) -> Tensor:
@@ -56,7 +56,7 @@ def _moved_delta(values: Tensor, motion: Motion, layout: PoseLayout | None) -> T
     axes = len(layout.row)
     handedness = per_cloud(motion.handedness[:, None], values, axes)
     turned = layout.conjugated(rotation, per_cloud(motion.rotation, values, axes), handedness)
-    return layout.joined(values, _moved_displacement(position, motion, None), turned)
+    return layout.joined(values, None if position is None else _moved_displacement(position, motion, None), turned)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,8 +137,7 @@ def pose_faults(values: Tensor, parts: Sequence[_Part]) -> Iterator[Fault]:
     """Yield what can be wrong with the poses among (B, ..., row) values, and where it is."""
     for part, own in zip(parts, _columns(values, parts)):
         if part.layout is not None:
-            own = own.double()
-            yield from part.layout.faults(own if part.layout.is_matrix else own[..., 3:])
+            yield from part.layout.faults_of(own.double())
 
 
 def _columns(values: Tensor, parts: Sequence[_Part]) -> Sequence[Tensor]:
