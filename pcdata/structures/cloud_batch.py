@@ -14,6 +14,7 @@ from pcdata.errors import DTypeError, FrameError, OutOfRangeError, UnitError
 from pcdata.geometry import rigid
 from pcdata.structures.image_layout import ImageLayout, joined_layout
 from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
+from pcdata.structures.pose_layouts import motion_by
 from pcdata.structures.signal_joining import joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, attached, refuse_mirror, signals_now
 from pcdata.structures.structure import Structure, derived
@@ -60,17 +61,26 @@ class CloudBatch(Structure):
     def frame_from_cloud(self, frame: str) -> Tensor:
         """Return (B, 4, 4) float64 from the present coordinates to a frame that the clouds know, in metres.
 
+        Not by the name of the frame they are in: clouds that were turned, scaled or shifted in "base" still bear its
+        name, and this leads back to where they lay. It is the identity where they lie there.
+
         Raises:
             FrameError: the clouds do not know the frame.
         """
-        if frame == self.frame_id and self.unit == METRE:
-            return torch.eye(4, dtype=torch.float64, device=self.source_from_cloud.device).repeat(self.num_clouds, 1, 1)
+        here = torch.eye(4, dtype=torch.float64, device=self.source_from_cloud.device).expand(self.num_clouds, 4, 4)
         if frame == self.source_frame:
-            return self.source_from_cloud
-        if frame not in self.frames:
+            matrix = self.source_from_cloud
+        elif frame in self.frames:
+            matrix = self.frames[frame] @ self.source_from_cloud
+        elif frame == self.frame_id and self.unit == METRE:  # of no other frame is it known where it lies
+            return here.clone()
+        else:
             known = sorted({self.source_frame, *self.frames})
             raise FrameError(f"the clouds know the frames {known}, not {frame!r}; give the captures their poses")
-        return self.frames[frame] @ self.source_from_cloud
+        if frame != self.frame_id:
+            return matrix
+        # What float64 leaves of going there and back would round every point.
+        return torch.where(motion_by(matrix).rests[:, None, None], here, matrix)
 
     @property
     def signals(self) -> Mapping[str, Any]:

@@ -241,9 +241,9 @@ class DepthFrame(Structure):
             FrameError: the capture does not know the frame, or the kind has none.
             ShapeError, DTypeError, DeviceError, NonFiniteError, PoseError: the values are not of that kind.
         """
-        where = "DepthFrame.with_signal"
+        where = f"DepthFrame.with_signal({name!r:.200})"
         signal = checked_signal(where, name, values, kind, frame)
-        self._check_signal(f"{where}({name!r})", name, signal)
+        self._check_signal(where, name, signal)
         return derived(self, recorded_signals={**self.recorded_signals, name: signal})
 
     def without_signal(self, *names: str) -> DepthFrame:

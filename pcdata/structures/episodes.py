@@ -176,7 +176,8 @@ def episodes_from_json(where: str, entries: Any, num_samples: int, *, error: typ
     try:
         return checked_episodes(where, [Episode(**one) for one in entries], num_samples)
     except (PcdataError, TypeError, ValueError, RecursionError, OverflowError) as cause:
-        raise error(f"{where}: {cause!s:.500}") from cause
+        told = str(cause).removeprefix(f"{where}: ")
+        raise error(f"{where}: {told:.500}") from cause
 
 
 def _is_whole(value: object) -> bool:

@@ -166,9 +166,11 @@ def cloud_from_frame(clouds: CloudBatch, frame: str) -> Tensor:
 
 
 def is_frame_of_camera(clouds: CloudBatch, frame: str) -> bool:
-    """Whether a frame goes where the camera goes: its own, also after views were merged, else that of the source."""
-    camera = CAMERA_FRAME if CAMERA_FRAME in {clouds.source_frame, *clouds.frames} else clouds.source_frame
-    return frame == camera
+    """Whether a frame goes where the camera goes: its own, also after views were merged.
+
+    A frame with a name of its own stays where it is, also that of a source: what moves in it, such as a hand, moves.
+    """
+    return frame == CAMERA_FRAME and CAMERA_FRAME in {clouds.source_frame, *clouds.frames}
 
 
 def _frame_from_cloud(clouds: CloudBatch, frame: str) -> Tensor:
@@ -191,8 +193,7 @@ def attached(where: str, clouds: CloudBatch, name: str, values: Values, kind: st
 
 
 def checked_signal(where: str, name: str, values: Values, kind: str, frame: str | None) -> Signal:
-    """Return a signal with its name in whatever is wrong with it."""
-    where = f"{where}({name!r:.{_LONGEST_NAME}})"
+    """Return a signal; ``where`` is the place of this one in whatever is wrong with it."""
     check_signal_name(where, name)
     return _checked(where, values, kind, frame)
 

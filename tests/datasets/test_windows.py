@@ -373,6 +373,25 @@ def test_a_camera_that_moves_and_comes_back_is_noticed_and_one_beside_actions_in
     assert windows[1].signals["action"][1, :, 0].tolist() == [place, 1 + place, 2 + place]
 
 
+class Base(Cloudy):
+    """Clouds recorded in the robot's frame, which also know where its hand is; that moves."""
+
+    def load(self, sample_id):
+        place = self.ids.index(sample_id)
+        hand = torch.eye(4, dtype=torch.float64)[None].clone()
+        hand[:, 0, 3] = place
+        cloud = PointCloud(points=torch.rand(4, 3), frame_id="base", frames={"hand": hand})
+        for name, signal in self.signals(sample_id).items():
+            cloud = cloud.with_signal(name, signal.values, signal.kind, signal.frame)
+        return cloud.with_meta([{"sample_id": sample_id}])
+
+
+def test_actions_in_the_frame_of_the_source_are_given_whatever_moves_in_it():
+    windows = EpisodeWindows(CloudDataset(Base((5,), frame="base")), 2, 3)
+    assert windows[1].signals["action"].shape == (2, 3, 3)
+    assert torch.equal(windows[1].signals["action"][0], windows[1].signals["action"][1])
+
+
 def test_numbers_of_numpy_make_windows_and_absurd_ones_are_refused():
     data = CloudDataset(Cloudy())
     assert len(EpisodeWindows(data, np.int64(2), np.int32(2), num_actions=np.int64(1), stride=np.int8(1))) == 3

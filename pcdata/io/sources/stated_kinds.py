@@ -62,7 +62,7 @@ def signal_of(where: str, name: str, values: Values, kind: KindAndFrame) -> Sign
         CaptureError: the values are not of that kind.
     """
     try:
-        return checked_signal(where, name, values, *kind)
+        return checked_signal(f"{where}({name!r:.200})", name, values, *kind)
     except PcdataError as error:
         told = str(error)
         raise CaptureError(

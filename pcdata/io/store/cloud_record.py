@@ -28,6 +28,7 @@ SCHEMA = "pcdata.cloud/1"
 SIGNALS_SCHEMA = "pcdata.signals/1"
 
 _CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
+_BFLOAT16 = "bfloat16"
 EXTRA, _FRAMES, _SIGNALS = "extra.", "frames.", "signals."
 DERIVED = ("intrinsics", "extrinsics")  # repeat the facts, for other tools
 
@@ -211,10 +212,15 @@ def _check_info(info: Mapping[str, Any]) -> None:
 def _signal_arrays(signals: Mapping[str, Signal]) -> dict[str, np.ndarray]:
     names = _array_names(_SIGNALS, signals)
     return {
-        names[name]: _array(f"signal {name!r}", signal.values)
+        names[name]: _array(f"signal {name!r}", _bits(signal.values))
         for name, signal in signals.items()
         if isinstance(signal.values, Tensor)
     }
+
+
+def _bits(values: Tensor) -> Tensor:
+    """Return values as NumPy knows them: of bfloat16, which it does not, the bits."""
+    return values.detach().view(torch.int16) if values.dtype is torch.bfloat16 else values
 
 
 def _array_names(prefix: str, names: Iterable[str]) -> dict[str, str]:
@@ -232,7 +238,17 @@ def _array_names(prefix: str, names: Iterable[str]) -> dict[str, str]:
 def _told(name: str, signal: Signal) -> dict[str, Any]:
     """Return what the facts say of a signal: a list keeps the order, and texts are no array."""
     told = {"name": name, "kind": signal.kind, "frame": signal.frame}
-    return told if isinstance(signal.values, Tensor) else {**told, "texts": list(signal.values)}
+    if not isinstance(signal.values, Tensor):
+        return {**told, "texts": list(signal.values)}
+    return {**told, "dtype": _BFLOAT16} if signal.values.dtype is torch.bfloat16 else told
+
+
+def _bfloat16(where: str, dtype: Any, values: Any) -> Tensor:
+    """Return numbers whose bits were stored."""
+    if dtype != _BFLOAT16 or not isinstance(values, Tensor) or values.dtype is not torch.int16:
+        found = values.dtype if isinstance(values, Tensor) else "texts"
+        raise CacheError(f"{where}: dtype must be {_BFLOAT16!r}, whose bits are int16, got {dtype!r:.60} and {found}")
+    return values.view(torch.bfloat16)
 
 
 def _signals(told: Any, arrays: dict[str, Tensor]) -> dict[str, Signal]:
@@ -247,7 +263,10 @@ def _signals(told: Any, arrays: dict[str, Tensor]) -> dict[str, Signal]:
         values: Any = arrays.pop(name, None) if texts is None else texts
         if values is None:
             raise CacheError(f"signal {name!r:.100} has no array")
-        signals[name] = checked_signal("signal", name, values, entry.get("kind"), entry.get("frame"))
+        where = f"signal {name!r:.200}"
+        if entry.get("dtype") is not None:
+            values = _bfloat16(where, entry["dtype"], values)
+        signals[name] = checked_signal(where, name, values, entry.get("kind"), entry.get("frame"))
     if arrays:
         raise CacheError(f"nothing says what the signals {sorted(arrays)} are")
     return signals

@@ -104,7 +104,9 @@ class Manifest:
                 listed["imports"] = tuple(content["imports"])
             if "episodes" in content:
                 count = len(listed["samples"])
-                listed["episodes"] = tuple(episodes_from_json("it", content["episodes"], count, error=CacheError))
+                listed["episodes"] = tuple(
+                    episodes_from_json("the dataset", content["episodes"], count, error=CacheError)
+                )
             manifest = cls(**{**content, **listed})
             _check(manifest)
             if found is not None and found != checksum_of(content):

@@ -194,3 +194,18 @@ def test_an_absurdly_large_file_is_refused_unread(tmp_path):
         file.truncate(2**40)  # sparse: reading it would never end
     with pytest.raises(CacheError, match="more than the limit"):
         Manifest.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "episodes",
+    [
+        3,
+        [{"id": "a"}],
+        [{"id": "a", "first": 0, "length": 9, "times": [], "attributes": {}}],
+        [{"id": "a", "first": -1, "length": 1, "times": [], "attributes": {}}],
+        [{"id": "a", "first": 0, "length": 1, "times": [], "attributes": {}}] * 2,
+    ],
+)
+def test_what_is_wrong_with_episodes_is_told_without_a_word_twice(tmp_path, episodes):
+    told = _refused(tmp_path, {**GOOD, "episodes": episodes})
+    assert not re.search(r"\b(\w[\w ]*): \1:", told), told
