@@ -24,8 +24,8 @@ from pcdata.structures.signals import checked_signal
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (
-        torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64,
-        torch.bool,
+        torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.uint8, torch.int8, torch.int16, torch.int32,
+        torch.int64, torch.bool,
     )
 }  # fmt: skip
 _KEYS = ("kind", "frame", "dtype", "values")
