@@ -240,6 +240,11 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
             "pcdata.load_config(path) reads one"
         )
     checked_ids("build_dataset", source)
+    if config.loader.windows is not None and not episodes_of(source):
+        raise ConfigError(
+            f"build_dataset: loader.windows: {source!r} has no episodes to cut windows from; say in episodes.json "
+            "beside the captures which follow each other (pcdata.write_episodes), or leave windows out"
+        )
     stored, on_the_fly = config.pipeline.split()
     if on_the_fly.takes is not PointCloud:
         raise ConfigError(

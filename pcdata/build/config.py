@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 
 from pcdata.build.model_section import preset_of_section, stored_preset
 from pcdata.build.source_section import SourceSettings, source_settings
 from pcdata.datasets.collate import COLLATES
+from pcdata.datasets.windows import checked_numbers
 from pcdata.errors import ConfigError, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.io.store.manifest import FILE_NAME, Manifest
@@ -51,6 +52,24 @@ class _Output(BaseModel):
     keep_raw: bool = False  # also deliver depth, color and calibration beside the clouds
 
 
+class Windows(BaseModel):
+    """Windows over the episodes of the dataset, as :class:`pcdata.EpisodeWindows` cuts them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    num_obs: int
+    horizon: int
+    num_actions: int | None = None
+    stride: int = 1
+    pad: Literal["repeat", "drop"] = "repeat"
+    actions: tuple[str, ...] = ("action",)
+
+    @model_validator(mode="after")
+    def _make_windows(self) -> Windows:
+        checked_numbers(self.num_obs, self.horizon, self.num_actions, self.stride, self.pad)
+        return self
+
+
 class Loader(BaseModel):
     """What the loading script written into the dataset does."""
 
@@ -58,8 +77,21 @@ class Loader(BaseModel):
 
     batch_size: Annotated[int, Ge(1)] = 8
     num_workers: Annotated[int, Ge(0)] = 2
-    collate: Collate = "packed"
+    collate: Collate = "packed"  # of windows: "windows"
     seed: int = 0
+    windows: Windows | None = None  # of clouds and actions, where the source has episodes; None = single clouds
+
+    @model_validator(mode="before")
+    @classmethod
+    def _stack_windows(cls, values: Any) -> Any:
+        """Let windows be stacked where nothing else is said."""
+        return {"collate": "windows", **values} if isinstance(values, dict) and values.get("windows") else values
+
+    @model_validator(mode="after")
+    def _have_windows(self) -> Loader:
+        if self.collate == "windows" and self.windows is None:
+            raise ValueError("collate: windows stacks windows; say which: windows: {num_obs: 2, horizon: 16}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -84,8 +116,9 @@ class BuildConfig:
             raise ConfigError(
                 f"the configuration has steps of its own, and the preset of {made.contract.name} has its own; drop one"
             )
-        if "collate" in self.loader.model_fields_set:
-            raise ConfigError("loader.collate: the model's preset makes its own batches; leave it out")
+        for name in ("windows", "collate"):
+            if name in self.loader.model_fields_set:
+                raise ConfigError(f"loader.{name}: the model's preset makes its own batches; leave it out")
         return replace(self, pipeline=stored_preset(made).pipeline, model=made)
 
     def stored_as(self, format: str) -> BuildConfig:
@@ -184,7 +217,7 @@ def _settings(document: Document, model: type[BaseModel], node: Any) -> Any:
         return model(**values)
     except ValidationError as error:
         for fault in error.errors():
-            name = str(fault["loc"][0])
+            name = str(fault["loc"][0]) if fault["loc"] else "collate"  # the one rule of several settings
             if fault["type"] == "extra_forbidden":
                 hint = near_matches(name, model.model_fields) or f"; known: {', '.join(model.model_fields)}"
                 document.fault(entries[name][0], f"{model.__name__.lower()}.{name}: no such setting{hint}")

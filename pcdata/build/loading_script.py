@@ -21,14 +21,14 @@ from pcdata import CachedCloudDataset, {names}
 def main() -> None:
 {imports}    dataset = CachedCloudDataset(Path(__file__).parent, seed={seed})
 {preset}    loader = DataLoader(
-        dataset,
+        {samples},
         batch_size={batch_size},
         shuffle=True,
         num_workers={num_workers},
         collate_fn={collate},
     )
     for epoch in range(2):
-        dataset.set_epoch(epoch)  # new random draws for every epoch, the same for any number of workers
+        {samples}.set_epoch(epoch)  # new random draws for every epoch, the same for any number of workers
         for batch in loader:
             print(f"epoch {{epoch}}: {{batch}}{shapes}")
 
@@ -54,8 +54,8 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         made: the preset of the model that the dataset was built for: batches are the model's tensors.
         imports: names of the files that define steps of the dataset: the script asks for their paths.
     """
-    settings = loader.model_dump(exclude={"collate"})
-    settings |= {"usage": "", "argparse": "", "imports": ""}
+    settings = loader.model_dump(exclude={"collate", "windows"})
+    settings |= {"usage": "", "argparse": "", "imports": "", "samples": "dataset"}
     if imports:
         files = ", ".join(imports)
         missing = f"this dataset has steps of its own; say where they are: --import FILE.py, for {files}"
@@ -66,11 +66,18 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         if not hasattr(pcdata.datasets, name):  # one of the user's own
             name, collate = "COLLATES", f"COLLATES[{loader.collate!r}]"
         shapes = ", points {tuple(batch.points.shape)}"
-        return _TEMPLATE.format(**settings, names=_names(name, imports), collate=collate, preset="", shapes=shapes)
+        line, names = "", [name]
+        if loader.windows is not None:
+            said = ", ".join(f"{key}={value!r}" for key, value in loader.windows.model_dump().items())
+            line = f"    windows = EpisodeWindows(dataset, {said})\n"
+            names.append("EpisodeWindows")
+            settings["samples"] = "windows"
+        shown = _names(names, imports)
+        return _TEMPLATE.format(**settings, names=shown, collate=collate, preset=line, shapes=shapes)
     line = f"    model = {made!r}  # what the dataset was built for\n"
-    names = _names("preset", imports)
-    return _TEMPLATE.format(**settings, names=names, collate="model.collate", preset=line, shapes="")
+    shown = _names(["preset"], imports)
+    return _TEMPLATE.format(**settings, names=shown, collate="model.collate", preset=line, shapes="")
 
 
-def _names(name: str, imports: Sequence[str]) -> str:
-    return ", ".join(sorted([name, "import_file"])) if imports else name
+def _names(names: Sequence[str], imports: Sequence[str]) -> str:
+    return ", ".join(sorted([*names, *(["import_file"] if imports else [])]))

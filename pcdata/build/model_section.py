@@ -22,8 +22,9 @@ def preset_of_section(document: Document, entries: dict[str, Any]) -> Preset | N
         if section in entries:
             document.fault(entries[section][0], f"section {section}: the model's preset has its own steps; drop one")
     loader = document.mapping(entries["loader"][1], "loader") if "loader" in entries else {}
-    if "collate" in loader:
-        document.fault(loader["collate"][0], "loader.collate: the model's preset makes its own batches; leave it out")
+    for name in ("windows", "collate"):
+        if name in loader:
+            document.fault(loader[name][0], f"loader.{name}: the model's preset makes its own batches; leave it out")
     if _NAME not in values:
         document.fault(key, "model: needs the model's name, such as {name: dp3_sim, frame: base, crop: null}")
     if document.faults:

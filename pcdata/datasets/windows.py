@@ -74,7 +74,7 @@ class EpisodeWindows(SampleDataset):
                 f"EpisodeWindows: dataset must be a CloudDataset or CachedCloudDataset, got {type(dataset).__name__}; "
                 "choose episodes by episodes=, not by a Subset"
             )
-        num_obs, horizon, num_actions, stride = _checked_numbers(num_obs, horizon, num_actions, stride, pad)
+        num_obs, horizon, num_actions, stride = checked_numbers(num_obs, horizon, num_actions, stride, pad)
         own = dataset.episodes if episodes is None else checked_episodes(repr(dataset), episodes, len(dataset.ids))
         if not own:
             raise ConfigError(
@@ -256,7 +256,12 @@ def _all_at(poses: Mapping[str, Tensor], frames: Mapping[str, Tensor]) -> bool:
     return all(torch.allclose(frames[name], poses[name], rtol=0, atol=_STILL) for name in poses.keys() & frames.keys())
 
 
-def _checked_numbers(num_obs: Any, horizon: Any, num_actions: Any, stride: Any, pad: Any) -> tuple[int, int, int, int]:
+def checked_numbers(num_obs: Any, horizon: Any, num_actions: Any, stride: Any, pad: Any) -> tuple[int, int, int, int]:
+    """Return the numbers that make windows.
+
+    Raises:
+        ConfigError: they make none.
+    """
     for name, value in {"num_obs": num_obs, "horizon": horizon, "stride": stride}.items():
         if not (_is_whole(value) and 1 <= value <= _MOST):
             raise ConfigError(f"EpisodeWindows: {name} must be a whole number, 1 to {_MOST}, got {value!r:.100}")

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import runpy
+
 import pytest
 
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.build.config import Loader
 from pcdata.build.loading_script import loading_script
+from pcdata.datasets import CachedCloudDataset, EpisodeWindows
+from pcdata.errors import ConfigError
+from pcdata.models import preset
+from pcdata.synthetic import TeleopSource
 from tests.warm import run_script
 
 
@@ -39,3 +45,36 @@ def test_the_settings_arrive_in_the_script():
     compile(text, "load.py", "exec")
     for part in ("batch_size=17", "num_workers=0", "collate_fn=collate_fixed", "seed=99"):
         assert part in text
+
+
+WINDOWS = "{num_obs: 2, horizon: 4, stride: 2, pad: drop, actions: [action]}"
+
+
+def test_windows_of_the_configuration_arrive_in_the_script_and_run(tmp_path, capsys):
+    source = TeleopSource(num_episodes=2, num_views=1, size=(12, 16))
+    text = (
+        "depth: [Deproject]\ncloud: [ToFrame: {frame: base}]\n"
+        "augment: [RandomSample: {num_points: 16, if_short: repeat}]\n"
+        f"loader: {{batch_size: 3, num_workers: 0, windows: {WINDOWS}}}\n"
+    )
+    config = config_from_yaml(text)
+    assert config.loader.collate == "windows"
+    build_dataset(config, source, tmp_path / "data")
+    runpy.run_path(str(tmp_path / "data" / "load.py"), run_name="__main__")
+    told = capsys.readouterr().out
+    windows = EpisodeWindows(CachedCloudDataset(tmp_path / "data"), 2, 4, stride=2, pad="drop")
+    assert told.count("epoch 0: ") == told.count("epoch 1: ") == -(-len(windows) // 3)
+    assert "points (3, 2, 16, 3)" in told
+    packed = loading_script(config_from_yaml(f"loader: {{windows: {WINDOWS}, collate: packed}}").loader)
+    assert "collate_fn=collate_packed" in packed
+
+
+def test_windows_without_episodes_are_refused_before_anything_is_built(tmp_path, source):
+    config = config_from_yaml(f"depth: [Deproject]\nloader: {{windows: {WINDOWS}}}\n")
+    with pytest.raises(ConfigError, match=r"has no episodes to cut windows from.*write_episodes"):
+        build_dataset(config, source, tmp_path / "data")
+    made = preset("dp3_sim", frame="base", crop=None)
+    with pytest.raises(ConfigError, match=r"loader\.windows: the model's preset makes its own batches"):
+        config_from_yaml(f"loader: {{windows: {WINDOWS}}}").for_model(made)
+    with pytest.raises(ConfigError, match=r"loader\.windows: the model's preset makes its own batches"):
+        config_from_yaml(f"model: {{name: dp3_sim, frame: base, crop: null}}\nloader: {{windows: {WINDOWS}}}\n")
