@@ -41,6 +41,7 @@ from pcdata.io.sources.capture_source import (
     kinds_of,
     reason_of,
     skipped_of,
+    streams_of,
 )
 from pcdata.io.store.cloud_record import record_from_cloud, record_from_signals
 from pcdata.io.store.manifest import SIGNALS_KEY, Manifest, Sample, key_of
@@ -128,6 +129,7 @@ def build_dataset(
             episodes=tuple(_episodes(source, samples)),
             signals=signals,
             skipped=report.skipped,
+            streams=tuple(streams_of(source)),
             model=_model_of(config),
             source={**getattr(source, "opened", {}), **({"skip_refused": True} if skip_refused else {})},
             imports=[file.to_json() for file in imports],

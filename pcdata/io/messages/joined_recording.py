@@ -153,23 +153,14 @@ class JoinedRecording:
         return int(found.before[number]), int(found.after[number]), float(found.share[number])
 
     def _counted(self) -> list[str]:
-        """Say in words what of the joined streams was dropped, doubled or interpolated."""
+        """Say in words what of the joined streams was dropped, and what lacked a partner."""
         lines = []
         for stream in self.streams[1:]:
-            parts = [
-                f"{stream[word]} {text}"
-                for word, text in (
-                    ("dropped", "belong to no depth image"),
-                    ("doubled", "serve a second one"),
-                    ("interpolated", "values were interpolated"),
-                    ("missing", "depth images have none"),
-                )
-                if stream[word] and word in ("dropped", "missing")
-            ]
-            if parts:
-                lines.append(
-                    f"{stream['role']} {stream['topic']}: of {stream['messages']} messages " + ", ".join(parts)
-                )
+            name = f"{stream['role']} {stream['topic']}"
+            if stream["dropped"] and stream["rule"] == "nearest":  # of faster streams most are passed over
+                lines.append(f"{name}: {stream['dropped']} of {stream['messages']} messages belong to no depth image")
+            if stream["missing"]:
+                lines.append(f"{name}: {stream['missing']} depth images have none")
         return lines
 
     # -- frames --------------------------------------------------------------------------------------------------------

@@ -143,6 +143,11 @@ def unread_of(source: Any) -> list[str]:
     return unread() if callable(unread) else []
 
 
+def streams_of(source: Any) -> list[dict[str, Any]]:
+    """Return the streams that recordings were joined of, JSON-able: what was dropped, doubled and interpolated."""
+    return [dict(stream) for one in all_within(source) for stream in getattr(one, "streams", ())]
+
+
 def refused_captures(source: CaptureSource) -> dict[str, str]:
     """Load every capture once and return those that are refused, with the reason of each.
 

@@ -59,6 +59,7 @@ class Manifest:
     ] = ()  # files with steps or the reader that were used: name, hash, what is in it
     episodes: Sequence[Episode] = ()  # over the samples
     signals: Mapping[str, str] = field(default_factory=dict)  # "digest" of the record of all, or the "fault" they have
+    streams: Sequence[Mapping[str, Any]] = ()  # of the recordings: how each was joined, and what that left
     schema: str = SCHEMA
 
     def write(self, folder: Path) -> None:
@@ -102,6 +103,8 @@ class Manifest:
             listed: dict[str, Any] = {"samples": [Sample(**sample) for sample in content["samples"]]}
             if isinstance(content.get("imports"), list):
                 listed["imports"] = tuple(content["imports"])
+            if isinstance(content.get("streams"), list):
+                listed["streams"] = tuple(content["streams"])
             if "episodes" in content:
                 count = len(listed["samples"])
                 listed["episodes"] = tuple(
@@ -160,6 +163,8 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"imports must list files with their sha256 and names, got {manifest.imports!r:.100}")
     if set(manifest.signals) - {"digest", "fault"} or not all(isinstance(t, str) for t in manifest.signals.values()):
         raise CacheError(f"signals must have a digest or a fault, got {manifest.signals!r:.100}")
+    if not isinstance(manifest.streams, tuple) or not all(isinstance(one, dict) for one in manifest.streams):
+        raise CacheError(f"streams must list objects, got {manifest.streams!r:.100}")
     if not manifest.samples:
         raise CacheError("it lists no samples; rebuild the dataset")
     for sample in manifest.samples:

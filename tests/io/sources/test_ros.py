@@ -13,9 +13,11 @@ import pytest
 import torch
 
 from pcdata import open_source
+from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CaptureError, ConfigError, FrameError, IntrinsicsError, PcdataError, UnitError
 from pcdata.geometry import rigid
 from pcdata.io import refused_captures
+from pcdata.io.store.manifest import Manifest
 from tests.ros_recordings import (
     EPOCH,
     SIZE,
@@ -506,6 +508,18 @@ def test_images_written_out_of_order_or_twice_stand_in_the_order_of_their_stamps
     assert [
         torch.equal(source.load(one).depth[0], metres(depth_of(n))) for one, n in zip(source.ids, (1, 2, 3, 0))
     ] == [True] * 4
+
+
+def test_a_build_keeps_how_the_streams_were_joined(tmp_path: Path) -> None:
+    path = mcap(tmp_path, [entry for entry in without() if entry[0] != COLOR or entry[1] > EPOCH + 2 * STEP])
+    source = open_source(path)
+    build_dataset(config_from_yaml("depth: [Deproject]\n"), source, tmp_path / "set")
+    manifest = Manifest.read(tmp_path / "set")
+    assert list(manifest.streams) == source.streams
+    color = next(one for one in manifest.streams if one["role"] == "color")
+    assert (color["messages"], color["missing"]) == (2, 2)
+    assert list(manifest.skipped) == ["000000", "000001"]
+    assert f"color {COLOR}: 2 depth images have none" in source.unread()
 
 
 # -- damage ------------------------------------------------------------------------------------------------------------

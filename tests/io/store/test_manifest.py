@@ -133,6 +133,7 @@ def test_two_samples_of_one_key_are_refused(tmp_path):
     [
         ({"schema": "pcdata.dataset/999"}, "rebuild"),
         ({"schema": None}, "schema"),
+        ({"streams": [3]}, "streams"),
         ({"format": "parquet"}, "hdf5, npz, packed, pt"),
         ({"format": ["npz"]}, ""),
         ({"format": None}, "format"),
