@@ -22,6 +22,7 @@ KINDS = (
     "maniskill",
     "pairs",
     "realsense_bag",
+    "ros",
     "azure_kinect",
     "lerobot",
     "clouds",

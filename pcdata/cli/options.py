@@ -82,7 +82,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "type": lambda text: name_and_value(text),
             "metavar": "NAME=KIND",
             "help": "kind of a recorded stream, such as 'eef=pose xyz_quat_xyzw in base' or joints=invariant; NAME= "
-            "leaves it out; repeatable: robomimic, maniskill, lerobot",
+            "leaves it out; repeatable: robomimic, maniskill, lerobot, ros",
         },
     ),
     "depth_values": (
@@ -105,6 +105,35 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
     "clouds": (
         "--clouds",
         {"action": "store_const", "const": True, "help": "read point clouds where there is depth too: lerobot"},
+    ),
+    "depth": ("--depth-topic", {"action": "append", "metavar": "TOPIC", "help": "depth images; repeatable: ros"}),
+    "color": ("--color-topic", {"action": "append", "metavar": "TOPIC", "help": "color, for each depth or all: ros"}),
+    "camera_info": (
+        "--camera-info",
+        {
+            "action": "append",
+            "type": lambda text: name_and_value(text),
+            "metavar": "IMAGES=TOPIC",
+            "help": "what describes the camera of a topic of images, where it does not lie beside it; repeatable: ros",
+        },
+    ),
+    "cloud": ("--cloud-topic", {"metavar": "TOPIC", "help": "clouds, to be read instead of depth images: ros"}),
+    "poses": (
+        "--pose",
+        {
+            "action": "append",
+            "type": lambda text: name_and_value(text),
+            "metavar": "NAME=FRAME",
+            "help": "signal NAME: the pose of this frame of tf in that of --frame; repeatable: ros",
+        },
+    ),
+    "clock": (
+        "--clock",
+        {"choices": ("header", "recorded"), "help": "whose times streams are joined by (default: header): ros"},
+    ),
+    "max_gap": (
+        "--max-gap",
+        {"type": float, "metavar": "SECONDS", "help": "to messages that are interpolated: ros (default 0.1)"},
     ),
     "links_to": (
         "--links-to",
@@ -230,6 +259,7 @@ def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
             given[name] = value
     if "folders" in given:
         given["folders"] = {role: folder or None for role, folder in given["folders"]}
+    given |= {name: dict(given[name]) for name in ("camera_info", "poses") if name in given}
     if "signals" in given:
         given["signals"] = {name: _stated_kind(said) for name, said in given["signals"]}
     for name, (field, _) in _COMBINED.items():

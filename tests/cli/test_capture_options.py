@@ -76,6 +76,13 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "rows": (["bottom_first"], "bottom_first"),
         "extrinsics": (["frame_to_camera"], "frame_to_camera"),
         "clouds": ([], True),
+        "depth": (["/cam/depth"], ["/cam/depth"]),
+        "color": (["/cam/color"], ["/cam/color"]),
+        "camera_info": (["/cam/depth=/cam/info"], {"/cam/depth": "/cam/info"}),
+        "cloud": (["/points"], "/points"),
+        "poses": (["eef=gripper"], {"eef": "gripper"}),
+        "clock": (["recorded"], "recorded"),
+        "max_gap": (["0.2"], 0.2),
     }
     for name, (flag, _) in _FLAGS.items():
         text, value = words[name]

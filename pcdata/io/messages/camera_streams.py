@@ -159,7 +159,7 @@ def _depths(
     fitting = _preferred(depths)
     if len(fitting) == 1:
         return [(_camera_name(fitting[0].topic.name, ()), fitting[0])]
-    how = "depth=TOPIC (--option depth=TOPIC), or a list of topics for views of one frame"
+    how = "depth=TOPIC (--depth-topic TOPIC), or a list of topics for views of one frame"
     if fitting:
         raise CaptureError(
             f"{where}: holds {len(fitting)} topics of depth; say which by {how}:"
@@ -362,7 +362,7 @@ def _color(
     if choice.registered or same:
         raise CaptureError(
             f"{where}: {len(fitting)} topics of color may belong to {depth.topic.name}; say which by color=TOPIC "
-            "(--option color=TOPIC), or color=[] for none:" + "".join(f"\n  {told(one.topic)}" for one in fitting)
+            "(--color-topic TOPIC), or color=[] for none:" + "".join(f"\n  {told(one.topic)}" for one in fitting)
         )
     return None
 

@@ -35,7 +35,7 @@ def on_clock(log: MessageLog, topic: Topic, clock: Clock) -> Topic:
             times[number] = stamp(decoded(topic, read(topic, number))) if time is None else time
     if not times.any():
         raise CaptureError(
-            f"topic {topic.name}: the headers of its messages hold no time; clock='recorded' (--option clock=recorded) "
+            f"topic {topic.name}: the headers of its messages hold no time; clock='recorded' (--clock recorded) "
             "takes the times of recording"
         )
     order = np.argsort(times, kind="stable")
