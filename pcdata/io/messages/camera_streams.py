@@ -196,7 +196,7 @@ def _camera_name(name: str, all_names: Sequence[str]) -> str:
     """Return what a depth topic's camera is called: what its name begins with, before what is said of the image."""
     words = [word for word in name.split("/") if word]
     start = next((place for place, word in enumerate(words) if "depth" in word.lower()), 1)
-    short = "/".join(words[:start]) or words[0]
+    short = "/".join(words[:start]) or next(iter(words), "camera")
     others = [other for other in all_names if other != name]
     return name.strip("/") if any(other.strip("/").startswith(f"{short}/") for other in others) else short
 

@@ -569,3 +569,8 @@ def test_a_recording_is_sent_to_workers_without_its_messages(tmp_path: Path) -> 
     content = pickle.dumps(source)
     assert len(content) < 20_000
     assert torch.equal(pickle.loads(content).load("000003").depth, source.load("000003").depth)
+
+
+def test_a_topic_without_a_name_is_read_too(tmp_path: Path) -> None:
+    entries = [(topic.replace(DEPTH, "/"), *rest) for topic, *rest in without(COLOR, "/cam/color/camera_info")]
+    assert torch.equal(open_source(mcap(tmp_path, entries)).load("000001").depth[0], metres(depth_of(1)))
