@@ -56,6 +56,23 @@ def _meta(folder: Path) -> Any:
     return frame.depth, frame.camera, facts
 
 
+def _recording(pattern: str) -> tuple[str, Callable[[Path], Any]]:
+    def read(folder: Path) -> Any:
+        from pcdata import open_source
+
+        source = open_source(next(folder.glob(pattern)))
+        frame = source.load(source.ids[0])
+        return frame.depth, frame.camera, frame.recorded_signals
+
+    return pattern, read
+
+
+def _pickle(folder: Path) -> Any:
+    from pcdata.io.arrays.plain_pickles import read_plain_pickle
+
+    return read_plain_pickle("pickle", next(folder.glob("*.pkl")).read_bytes())
+
+
 def _dataset(folder: Path) -> Any:
     from pcdata import CachedCloudDataset
 
@@ -133,6 +150,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "intrinsics_json": _capture("cap/intrinsics.json"),
     "label_png": _image("labels", "*.png"),
     "manifest": ("ds/dataset.json", _dataset),
+    "maniskill_h5": _recording("*.h5"),
     "mask_png": _image("mask", "*.png"),
     "meta_mat": ("meta.mat", _meta),
     "npy_foreign": _foreign("*.npy", ""),
@@ -141,6 +159,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "pcd_ascii": _cloud("pcd"),
     "pcd_binary": _cloud("pcd"),
     "pcd_binary_compressed": _cloud("pcd"),
+    "pickle": ("*.pkl", _pickle),
     "pipeline_yaml": ("p.yaml", _pipeline),
     "ply_ascii": _cloud("ply"),
     "ply_binary": _cloud("ply"),
@@ -148,6 +167,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "pose_npy": _capture("cap/poses/*.npy"),
     "pose_txt": _capture("cap/poses/*.txt"),
     "pt_dataset": ("ds/clouds/*.pt", _dataset),
+    "robomimic_hdf5": _recording("*.hdf5"),
     "robot_poses_csv": _robot("*.csv"),
     "robot_poses_yaml": _robot("*.yaml"),
     "timestamps_json": _capture("cap/timestamps.json"),
@@ -158,5 +178,6 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 # Formats that unpack: a small file may stand for much more.
 PACKED = {
     "bag", "color_jpg", "color_png", "confidence_png", "depth_png", "depth_tiff", "h5_dataset", "h5_foreign",
-    "label_png", "mask_png", "meta_mat", "npz_dataset", "npz_foreign", "pcd_binary_compressed", "zarr_foreign",
+    "label_png", "maniskill_h5", "mask_png", "meta_mat", "npz_dataset", "npz_foreign", "pcd_binary_compressed",
+    "robomimic_hdf5", "zarr_foreign",
 }  # fmt: skip

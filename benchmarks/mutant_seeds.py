@@ -31,6 +31,7 @@ def write_seeds(folder: Path) -> None:
     _write_clouds(folder)
     _write_texts(folder)
     _write_volume(_new(folder, "tsdf_npz") / "v.npz")
+    _write_demonstrations(folder, depth[:6, :8], color[:6, :8])
     with suppress(ImportError):
         _write_bags(folder, depth[:9, :12], color[:9, :12])
 
@@ -141,6 +142,34 @@ def _write_foreign(folder: Path, clouds: np.ndarray) -> None:
         (array / ".zarray").write_text(json.dumps({**head, "filters": None, "order": "C", "fill_value": 0.0}))
         for chunk in range(2):
             (array / f"{chunk}.0.0").write_bytes(pack(clouds[4 * chunk : 4 * chunk + 4].tobytes()))
+
+
+def _write_demonstrations(folder: Path, depth: np.ndarray, color: np.ndarray) -> None:
+    """Write two steps as robomimic and as ManiSkill store them, and metadata as a pickle of arrays."""
+    import pickle
+
+    import h5py
+
+    matrix, pose = np.array([[10, 0, 4], [0, 10, 3], [0, 0, 1.0]]), np.eye(4)
+    steps = np.stack([depth, depth + 1])
+    with h5py.File(_new(folder, "robomimic_hdf5") / "demo.hdf5", "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo.attrs["camera_info"] = json.dumps({"front": {"intrinsics": matrix.tolist(), "extrinsics": pose.tolist()}})
+        demo.create_dataset("obs/front_depth", data=(steps / 1000).astype(np.float32)[..., None], compression="gzip")
+        demo["obs/front_image"], demo["obs/robot0_eef_pos"] = np.stack([color, color]), np.zeros((2, 3))
+        demo["actions"] = np.zeros((2, 7))
+    with h5py.File(_new(folder, "maniskill_h5") / "traj.h5", "w") as file:
+        file.create_dataset(
+            "traj_0/obs/sensor_data/c/depth", data=steps.astype(np.int16)[..., None], compression="gzip"
+        )
+        file["traj_0/obs/sensor_data/c/rgb"] = np.stack([color, color])
+        file["traj_0/obs/sensor_param/c/intrinsic_cv"] = np.stack([matrix, matrix]).astype(np.float32)
+        file["traj_0/obs/sensor_param/c/extrinsic_cv"] = np.stack([pose[:3], pose[:3]]).astype(np.float32)
+        file["traj_0/obs/agent/qpos"], file["traj_0/actions"] = np.zeros((2, 9)), np.zeros((1, 7))
+    for protocol in (2, 4):
+        said = {"intrinsics": matrix, "near": 0.01, "poses": [pose, pose], "text": "take it", "count": np.int64(3)}
+        made = _new(folder, "pickle", f"protocol_{protocol}") / "meta.pkl"
+        made.write_bytes(pickle.dumps(said, protocol=protocol))
 
 
 def _cloud_of(count: int) -> Any:

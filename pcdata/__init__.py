@@ -87,6 +87,7 @@ _HOMES = {
         "refused_captures",
         "register_combinator",
         "register_layout",
+        "with_droid_extrinsics",
         "write_calibration",
         "write_capture",
         "write_episodes",

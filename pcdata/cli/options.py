@@ -71,6 +71,14 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
             "help": "depth as the color camera sees it: realsense_bag, azure_kinect, ros, scannet, apc",
         },
     ),
+    "color_from_depth": (
+        "--color-from-depth",
+        {
+            "type": lambda text: [float(number) for number in text.replace(",", " ").split()],
+            "metavar": "'M00 M01 ... M33'",
+            "help": "depth-to-color matrix, 16 numbers row by row, where no file has it: apc",
+        },
+    ),
     "labels_from": (
         "--labels-from",
         {"metavar": "COLUMN", "help": "column of cloud files that holds the labels; of bop, object or instance"},

@@ -10,6 +10,7 @@ from pcdata.io.calibration.capture_camera import (
     write_capture_camera,
     write_pose,
 )
+from pcdata.io.calibration.droid import with_droid_extrinsics
 from pcdata.io.clouds.pcd import read_pcd, write_pcd
 from pcdata.io.clouds.ply import read_ply, write_ply
 from pcdata.io.images.confidence import read_confidence, write_confidence
@@ -68,6 +69,7 @@ __all__ = [
     "register_layout",
     "register_store",
     "register_writer",
+    "with_droid_extrinsics",
     "write_calibration",
     "write_capture",
     "write_capture_camera",

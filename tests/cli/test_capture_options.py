@@ -66,6 +66,7 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "folders": (["color=rgb"], {"color": "rgb"}),
         "intrinsics": (["585", "585", "320", "240"], [585, 585, 320, 240]),
         "registered": ([], True),
+        "color_from_depth": (["1 0 0 0.02, 0 1 0 0"], [1, 0, 0, 0.02, 0, 1, 0, 0]),
         "labels_from": (["scalar_Label"], "scalar_Label"),
         "links_to": (["/store"], ["/store"]),
         "max_time_apart": (["0.05"], 0.05),

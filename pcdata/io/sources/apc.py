@@ -7,13 +7,14 @@ ICRA 2017; apc-vision-toolbox: bits of depth rotated by three, 1/10000 m, poses 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, ConfigError
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
 from pcdata.io.calibration.foreign_cameras import matrix_of, numbers_of, pinhole_of_matrix
@@ -31,7 +32,8 @@ _COLOR, _DEPTH = "Color camera intrinsic matrix", "Depth camera intrinsic matrix
 _MOTION, _POSE = "Depth-to-color camera extrinsic matrix", re.compile(r".*camera pose.* for (?P<id>frame-\d+)")
 MISSING_MOTION = (
     f"{_INFO} has no '{_MOTION}': the poses are of the color camera and are used for the depth camera as they stand, "
-    "so points are off by the distance between the two (some millimetres to centimetres); add that matrix to it"
+    "so points are off by the distance between the two (some millimetres to centimetres); add that matrix to it, or "
+    "give it as color_from_depth (--color-from-depth)"
 )
 
 
@@ -51,6 +53,7 @@ class _ApcSource(ListedSource):
         path: Path,
         *,
         registered: bool = False,
+        color_from_depth: Sequence[float] | None = None,
         frame_id: str = "world",
         links_to: LinkTargets = (),
     ) -> None:
@@ -58,13 +61,15 @@ class _ApcSource(ListedSource):
 
         Args:
             path: the folder of one scan.
+            color_from_depth: the depth-to-color matrix, 16 numbers row by row, where the file lacks it.
             registered: register depth to the color images; without it they are left out.
             frame_id: the frame that the poses lead to.
             links_to: folders outside that links in the capture may lead to.
 
         Raises:
-            CaptureError: a part of the layout is missing, a frame has no pose where others have, or ``registered``
-                without the depth-to-color matrix.
+            CaptureError: a part of the layout is missing, a frame has no pose where others have, ``registered``
+                without the depth-to-color matrix, or two of these.
+            PoseError: the matrix is not rigid.
         """
         path = checked_folder(self.kind, path, self.needs, _INFO)
         where = f"{self.kind} source {path}"
@@ -77,7 +82,10 @@ class _ApcSource(ListedSource):
         poses = {match["id"]: rows for title, rows in blocks.items() if (match := _POSE.fullmatch(title))}
         if lacking := {*found["depth"]} - {*poses} if poses else set():
             raise CaptureError(f"{info}: has no pose for {name_some(lacking)}; add it, or move the frame out")
-        motion = matrix_of(f"{info}: {_MOTION}", blocks[_MOTION]) if _MOTION in blocks else None
+        if color_from_depth is not None and _MOTION in blocks:
+            raise CaptureError(f"{info}: has '{_MOTION}', and color_from_depth says it too; drop one")
+        stated = blocks.get(_MOTION, color_from_depth)
+        motion = None if stated is None else matrix_of(f"{info}: {_MOTION}", _listed(where, stated))
         if registered and (motion is None or _COLOR not in blocks or not found["color"]):
             raise CaptureError(
                 f"{where}: registered needs color images, and '{_COLOR}' and '{_MOTION}' in {_INFO}; leave it out"
@@ -146,6 +154,12 @@ def _camera(file: Path, blocks: dict[str, list[float]], title: str) -> Any:
     if len(numbers) != 9:
         raise CaptureError(f"{file}: needs '{title}' with nine numbers, found {len(numbers)}")
     return pinhole_of_matrix(f"{file}: {title}", [numbers[:3], numbers[3:6], numbers[6:]])
+
+
+def _listed(where: str, numbers: Any) -> Sequence[float]:
+    if not isinstance(numbers, (list, tuple)):
+        raise ConfigError(f"{where}: color_from_depth must be 16 numbers, row by row, got {numbers!r:.100}")
+    return numbers
 
 
 def _pose(where: str, numbers: list[float], motion: Tensor | None) -> Tensor:  # (4, 4) float64, world from depth camera

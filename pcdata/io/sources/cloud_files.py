@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from pcdata.errors import CaptureError
+from pcdata.files.opening import check_inside
 from pcdata.io.clouds.pcd import read_pcd
 from pcdata.io.clouds.ply import read_ply
-from pcdata.io.sources.listing import LinkTargets, absolute, entries, is_folder, unread_entries, visible_files
+from pcdata.io.sources.listing import (
+    LinkTargets,
+    absolute,
+    entries,
+    has_file,
+    is_folder,
+    unread_entries,
+    visible_files,
+)
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
+from pcdata.io.sources.timestamps import TIMESTAMPS, read_timestamps
 from pcdata.structures import PointCloud
 
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
@@ -20,7 +31,7 @@ class CloudFilesSource(Source):
     """``NAME.pcd`` and ``NAME.ply`` files, each one cloud called NAME; other files in the folder do not matter."""
 
     kind = "clouds"
-    needs = "one .pcd or .ply file, or a folder with such files in it"
+    needs = "one .pcd or .ply file, or a folder with such files in it; optional timestamps.json (seconds by NAME)"
 
     def __init__(
         self,
@@ -51,6 +62,11 @@ class CloudFilesSource(Source):
                 raise CaptureError(f"{path}: {self._files[file.stem].name} and {file.name} are both {file.stem!r}")
             self._files[file.stem] = file
         super().__init__(path, self._files, links_to)
+        self.timestamps: dict[str, float] = {}  # seconds by id
+        times = path / TIMESTAMPS
+        if is_folder(path) and has_file(times):
+            check_inside(str(self), times, [path, *self.links_to])
+            self.timestamps = read_timestamps(times, self._ids)
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -66,13 +82,19 @@ class CloudFilesSource(Source):
 
     def unread(self) -> list[str]:
         """Name what is in the folder besides the clouds."""
-        return unread_entries(self.path, set(self._files.values())) if is_folder(self.path) else []
+        used = {*self._files.values(), self.path / TIMESTAMPS}
+        return unread_entries(self.path, used) if is_folder(self.path) else []
+
+    def _times(self) -> dict[str, float]:
+        return self.timestamps
 
     def _load(self, sample_id: str) -> PointCloud:
         file = self._files[sample_id]
         read = _READERS[file.suffix.lower()]
         cloud = read(file, frame_id=self.frame_id, metres_per_unit=self.metres_per_unit, labels_from=self.labels_from)
-        facts = {**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit or 1.0}
+        facts: dict[str, Any] = {**self.provenance(sample_id), "metres_per_unit": self.metres_per_unit or 1.0}
+        if self.timestamps:
+            facts["timestamps"] = [self.timestamps[sample_id]]
         return cloud.with_meta([{"sample_id": sample_id, "provenance": facts}])
 
 

@@ -33,12 +33,11 @@ from pcdata.io.sources.option_checks import check_invalid_values, check_label, c
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source, check_partners
 from pcdata.io.sources.stated import one_calibration, one_naming, one_unit, one_value, opened_calibration
-from pcdata.io.sources.timestamps import read_timestamps
+from pcdata.io.sources.timestamps import TIMESTAMPS, read_timestamps
 from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame, Signal
 from pcdata.structures.calibration import Calibration
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
-_TIMESTAMPS = "timestamps.json"
 
 
 @register_layout
@@ -140,7 +139,7 @@ class FolderSource(Source):
         if "pose" in self._files and self.frame_id == CAMERA_FRAME:
             raise CaptureError(f"{self}: frame_id names where the poses lead to, it cannot be {CAMERA_FRAME!r}")
         self._positions = positions(self._ids)
-        times = path / _TIMESTAMPS
+        times = path / TIMESTAMPS
         self.timestamps: dict[str, float] = {}  # seconds by id
         if has_file(times):
             check_inside(str(path), times, allowed)

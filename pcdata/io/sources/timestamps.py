@@ -11,6 +11,7 @@ from pcdata.files.opening import read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.io.sources.source import check_partners
 
+TIMESTAMPS = "timestamps.json"
 _MAX_BYTES = 1 << 26  # two million names
 LONGEST = 1e12  # seconds, 30,000 years: more are microseconds or nanoseconds
 

@@ -7,17 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from pcdata import Episode, JoinedSource, SubsetSource, open_source
 from pcdata.errors import CaptureError, DTypeError
-from pcdata.io import CaptureSource, write_episodes
+from pcdata.io import CaptureSource, write_episodes, write_ply
 from pcdata.io.sources.capture_source import episodes_of, recordings_of
+from pcdata.structures import PointCloud
 from pcdata.structures.episodes import checked_episodes, kept_episodes, num_outside
 from pcdata.synthetic import SyntheticSource
 from tests.captures import CAPTURES, OPTIONS, K, depth_of, folder_capture, image, seven_scenes_capture
 
 NAMES = [f"{number:02d}" for number in range(10)]
 RECORDINGS = ("realsense_bag", "azure_kinect")  # one file each
+WITH_EPISODES = ("lerobot", "robomimic", "maniskill")  # the files themselves say them
 TWO = [Episode("pick", 0, 4, attributes={"task": "cup"}), Episode("place", 5, 4)]
 
 
@@ -46,7 +49,7 @@ def test_a_folder_says_its_episodes_with_their_times(tmp_path):
     assert source.unread() == []
 
 
-@pytest.mark.parametrize("kind", [name for name in CAPTURES if name not in RECORDINGS])
+@pytest.mark.parametrize("kind", [name for name in CAPTURES if name not in (*RECORDINGS, *WITH_EPISODES)])
 def test_every_layout_that_is_a_folder_reads_them(kind, tmp_path):
     said = OPTIONS.get(kind, {})
     ids = open_source(CAPTURES[kind](tmp_path / "made"), kind=kind, **said).ids
@@ -170,3 +173,19 @@ def test_an_episode_file_is_not_written_over(tmp_path):
     with pytest.raises(CaptureError, match="cannot be written"):
         write_episodes(tmp_path, TWO, NAMES)
     assert checked_episodes("here", TWO, 10) == TWO
+
+
+def test_cloud_files_in_a_row_have_times_and_episodes(tmp_path: Path) -> None:
+    for number in range(3):
+        write_ply(tmp_path / f"scan_{number}.ply", PointCloud(points=torch.rand(4, 3), frame_id="base"))
+    times = {f"scan_{number}": 10.0 + number / 2 for number in range(3)}
+    (tmp_path / "timestamps.json").write_text(json.dumps(times))
+    source = open_source(tmp_path)
+    assert source.unread() == []
+    assert source.load("scan_1").meta[0]["provenance"]["timestamps"] == [10.5]
+    write_episodes(tmp_path, [Episode("take", 0, 3)], source.ids)
+    (episode,) = open_source(tmp_path).episodes
+    assert episode.times == (10.0, 10.5, 11.0)
+    (tmp_path / "timestamps.json").write_text(json.dumps({"scan_0": 1.0}))
+    with pytest.raises(CaptureError, match="timestamp is missing for"):
+        open_source(tmp_path)

@@ -278,6 +278,16 @@ def test_a_missing_depth_to_color_matrix_is_named_and_not_made_up(tmp_path: Path
     assert found
     with pytest.raises(CaptureError, match="registered needs"):
         open_source(tmp_path, registered=True)
+    assert "--color-from-depth" in found[0].advice
+    given = open_source(tmp_path, color_from_depth=COLOR_FROM_DEPTH.ravel().tolist()).load("frame-000001")
+    assert pose(given) == pytest.approx(turned(1) @ COLOR_FROM_DEPTH)
+    assert "missing" not in given.provenance
+    with pytest.raises(ConfigError, match="16 numbers"):
+        open_source(tmp_path, color_from_depth="no")
+    with pytest.raises(PoseError, match="not rigid"):
+        open_source(tmp_path, color_from_depth=[2.0 * value for value in COLOR_FROM_DEPTH.ravel()])
+    with pytest.raises(CaptureError, match="drop one"):
+        open_source(made.apc(tmp_path / "whole"), color_from_depth=COLOR_FROM_DEPTH.ravel().tolist())
 
 
 def test_bop_poses_units_and_intrinsics_are_of_each_image(tmp_path: Path) -> None:
