@@ -44,8 +44,8 @@ def with_droid_extrinsics(
         PoseError: a matrix is not rigid.
     """
     where = f"with_droid_extrinsics: {path}"
-    said = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES), error=CaptureError)
-    said = _of_episode(where, said, episode)
+    stored = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES), error=CaptureError)
+    said = _of_episode(where, stored, episode)
     transforms = dict(calibration.transforms)
     found = [serial for serial in calibration.cameras if serial in said]
     if not found:
@@ -58,8 +58,8 @@ def with_droid_extrinsics(
         name = FramePair(frame_id, serial).name
         transforms = {key: value for key, value in transforms.items() if not _joins(key, frame_id, serial)}
         transforms[name] = _pose(f"{where}: {serial}", said[serial])
-    known = {*transforms, *calibration.cameras}
-    kept = {name: told for name, told in calibration.evidence.items() if name in known}
+    kept_names = {*transforms, *calibration.cameras}
+    kept = {name: told for name, told in calibration.evidence.items() if name in kept_names}
     return replace(calibration, transforms=transforms, evidence=kept)
 
 
