@@ -36,10 +36,18 @@ def child_seed(generator: Generator) -> int:
 
 
 class Streams:
-    """One random stream per cloud of a batch; every method draws the same amount from each, in order."""
+    """One random stream per cloud of a batch; every method draws the same amount from each, in order.
+
+    Clouds that are given the same generator get the same draws.
+    """
 
     def __init__(self, generators: Sequence[Generator]) -> None:
         self.generators = list(generators)
+        self._distinct = list(dict.fromkeys(self.generators))
+        self._which: list[int] | None = None  # of the distinct ones each cloud has; None = its own
+        if len(self._distinct) != len(self.generators):
+            numbers = {one: number for number, one in enumerate(self._distinct)}
+            self._which = [numbers[one] for one in self.generators]
 
     @classmethod
     def of(cls, generator: Generator | Sequence[Generator], num_clouds: int) -> Streams:
@@ -69,18 +77,22 @@ class Streams:
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """Draw (B, *shape) float64 values in [low, high)."""
-        unit = [torch.rand(shape, generator=one, dtype=torch.float64, device="cpu") for one in self.generators]
-        return low + (high - low) * _stack(unit, shape)
+        unit = [torch.rand(shape, generator=one, dtype=torch.float64, device="cpu") for one in self._distinct]
+        return low + (high - low) * self._given(unit, shape)
 
     def normal(self, *shape: int) -> Tensor:
         """Draw (B, *shape) float64 standard normal values."""
-        values = [torch.randn(shape, generator=one, dtype=torch.float64, device="cpu") for one in self.generators]
-        return _stack(values, shape)
+        values = [torch.randn(shape, generator=one, dtype=torch.float64, device="cpu") for one in self._distinct]
+        return self._given(values, shape)
 
     def seeds(self) -> Tensor:
         """Draw (B,) int64 seeds, for decisions too large to keep (per-point noise, permutations)."""
-        return torch.tensor([child_seed(one) for one in self.generators], dtype=torch.int64, device="cpu")
+        seeds = torch.tensor([child_seed(one) for one in self._distinct], dtype=torch.int64, device="cpu")
+        return seeds if self._which is None else seeds[self._which]
 
-
-def _stack(values: list[Tensor], shape: tuple[int, ...]) -> Tensor:
-    return torch.stack(values) if values else torch.empty((0, *shape), dtype=torch.float64, device="cpu")
+    def _given(self, drawn: list[Tensor], shape: tuple[int, ...]) -> Tensor:
+        """Give each cloud what its generator drew."""
+        if not drawn:
+            return torch.empty((0, *shape), dtype=torch.float64, device="cpu")
+        values = torch.stack(drawn)
+        return values if self._which is None else values[self._which]

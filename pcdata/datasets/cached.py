@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from pcdata.datasets.samples import SampleDataset
-from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning, ShapeError
+from torch import Generator
+
+from pcdata.datasets.first_touch import FirstTouch
+from pcdata.datasets.samples import SampleDataset, runs_on_batches
+from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning, ShapeError, locate
 from pcdata.imports import imported_files
 from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
 from pcdata.io.store.manifest import FILE_NAME, SIGNALS_KEY, Manifest
 from pcdata.io.store.stores import STORES
+from pcdata.rng import child_seed, seeded
 from pcdata.structures import Episode, PointCloud, Signal
+from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Compose, Transform
+
+_MOST_POINTS = (
+    1 << 18
+)  # that go through the steps at once: some megabytes, and memory that many large clouds do not raise
 
 
 class CachedCloudDataset(SampleDataset):
@@ -68,6 +77,7 @@ class CachedCloudDataset(SampleDataset):
         transform = wanted.split()[1] if isinstance(augment, str) else augment
         super().__init__([sample.id for sample in self.manifest.samples], transform, seed, repeats)
         self._store = STORES[self.manifest.format](self.folder)
+        self._touched = FirstTouch(len(self.ids))
 
     def _stored_pipeline(self) -> Compose:
         try:
@@ -129,20 +139,80 @@ class CachedCloudDataset(SampleDataset):
 
     def _load(self, index: int) -> PointCloud:
         sample = self.manifest.samples[index]
-        record = self._store.read(sample.key)
-        path = self._store.path_of(sample.key)
-        if record.digest() != sample.digest:
-            raise CacheError(f"{path}: sample {sample.id!r} differs from what was written; rebuild the dataset")
+        record = None
+        if (identity := self._store.identity()) is None:
+            record = self._store.read(sample.key)
+            self._check_digest(index, record.digest())
+        else:
+            for fresh in self._touched.fresh([index], identity):
+                self._check_digest(fresh, self._store.digest(sample.key))
+                self._touched.note(fresh)
+            record = self._store.read_joined([sample.key]) or self._store.read(sample.key)
         try:
             cloud = cloud_from_record(record)
         except CacheError as error:
-            raise CacheError(f"{path}: sample {sample.id!r}: {error}; rebuild the dataset") from error
+            raise self._fault(index, f": {error}") from error
         if cloud.num_points != sample.num_points:
-            raise CacheError(
-                f"{path}: sample {sample.id!r} has {cloud.num_points} points, but {FILE_NAME} says "
-                f"{sample.num_points}; rebuild the dataset"
-            )
+            raise self._fault(index, f" has {cloud.num_points} points, but {FILE_NAME} says {sample.num_points}")
         return cloud
+
+    def _check_digest(self, index: int, digest: str) -> None:
+        if digest != self.manifest.samples[index].digest:
+            raise self._fault(index, " differs from what was written")
+
+    def _fault(self, index: int, what: str) -> CacheError:
+        sample = self.manifest.samples[index]
+        path = self._store.path_of(sample.key)
+        error = CacheError(f"{path}: sample {sample.id!r}{what}; rebuild the dataset")
+        locate(error, path=path)
+        return error
+
+    def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
+        """Return the clouds of some samples as one batch; None where that of one by one would be another."""
+        samples = [self.manifest.samples[number] for number in numbers]
+        record = None
+        if (identity := self._store.identity()) is not None:
+            for fresh in self._touched.fresh(numbers, identity):
+                self._check_digest(fresh, self._store.digest(self.manifest.samples[fresh].key))
+                self._touched.note(fresh)
+            record = self._store.read_joined([sample.key for sample in samples])
+        if record is None:
+            single = [self._load(number) for number in numbers]
+            if any(one.frames.keys() != single[0].frames.keys() for one in single):
+                return None
+            clouds = PointCloud.cat(single)
+        else:
+            clouds = cloud_from_record(record)
+        # One cloud each, since none has fewer.
+        fits = clouds.num_clouds == len(samples) and clouds.counts.tolist() == [one.num_points for one in samples]
+        return clouds if fits else None
+
+    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+        if not runs_on_batches(self.transform):
+            return None
+        batches = []
+        for part in self._parts(numbers):
+            clouds = self._load_at_once(numbers[part])
+            if clouds is None:
+                return None
+            streams = None if generators is None else [seeded(child_seed(one)) for one in generators[part]]
+            batches.append(self._transformed(clouds, streams))
+        return Unbatched(batches)
+
+    def _parts(self, numbers: Sequence[int], each: int = 1) -> Iterator[slice]:
+        """Cut samples, ``each`` of which belong together, into parts that the memory of a processor can hold."""
+        begin = points = 0
+        counts = [self.manifest.samples[number].num_points for number in numbers]
+        if sum(counts) <= _MOST_POINTS:
+            yield slice(0, len(numbers))
+            return
+        for place in range(0, len(numbers), each):
+            own = sum(counts[place : place + each])
+            if points and points + own > _MOST_POINTS:
+                yield slice(begin, place)
+                begin, points = place, 0
+            points += own
+        yield slice(begin, len(numbers))
 
     def __repr__(self) -> str:
         return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples, {self.manifest.format})"

@@ -9,6 +9,7 @@ from pcdata.datasets.window_batch import WindowBatch, window_batch
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.registry import Registry
 from pcdata.structures import PaddedClouds, PointCloud
+from pcdata.structures.unbatched import Unbatched
 
 Collate = Callable[[Sequence[PointCloud]], Any]
 
@@ -76,6 +77,8 @@ def collate_windows(windows: Sequence[PointCloud]) -> WindowBatch:
 
 
 def _check(where: str, clouds: Sequence[PointCloud]) -> None:
+    if isinstance(clouds, Unbatched):
+        return
     for cloud in clouds:
         if not isinstance(cloud, PointCloud):
             raise DTypeError(

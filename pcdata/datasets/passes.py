@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -58,6 +59,17 @@ class PassWatch:
             RepeatedEpochWarning,
             stacklevel=4,
         )
+
+    def note_all(self, indices: Sequence[int], what: str) -> None:
+        """Note that several samples are read, as :meth:`note` does one after another."""
+        if int(self._again) < 0:
+            return
+        which = torch.tensor(indices, dtype=torch.int64, device="cpu")
+        if len({*indices}) == len(indices) and not bool(self._seen[which].any()):
+            self._seen[which] = True
+            return
+        for index in indices:
+            self.note(index, what)
 
     def __setstate__(self, state: dict[str, Tensor]) -> None:
         self.__dict__.update({name: shared(tensor) for name, tensor in state.items()})

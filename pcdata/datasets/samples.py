@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Generator
@@ -18,7 +18,17 @@ from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.rng import generator_for
 from pcdata.structures import Episode, PointCloud, Signal
+from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Transform
+
+
+class _Asked(NamedTuple):
+    """What an index means."""
+
+    place: int  # among the samples and their repeats
+    number: int  # of the sample
+    copy: int  # which of its draws
+    again: int  # how often a sampler has asked for it before
 
 
 class SampleDataset(Dataset[PointCloud]):
@@ -108,17 +118,15 @@ class SampleDataset(Dataset[PointCloud]):
     def __getitem__(self, index: int | tuple[int, int] | slice) -> PointCloud:
         if isinstance(index, slice):
             raise DTypeError("a dataset gives one sample per index; for several use torch.utils.data.Subset")
-        given, more = index if isinstance(index, tuple) else (index, 0)
-        place = self._place(given)
-        copy, number = divmod(place, len(self.ids))
-        sample_id = self.ids[number]
+        asked = self._asked(index)
+        sample_id = self.ids[asked.number]
         try:
             generator = None
             if self.transform is not None:
-                if self.transform.is_random and not more:
-                    self._passes.note(place, repr(self))
-                generator = generator_for(self.seed, self.epoch, sample_id, copy=copy + more * self.repeats)
-            return self._made(number, generator)
+                if self.transform.is_random and not asked.again:
+                    self._passes.note(asked.place, repr(self))
+                generator = self._generator(asked)
+            return self._made(asked.number, generator)
         except Exception as error:
             add_note(error, f"sample {sample_id!r} of {self!r}", sample_id=sample_id)
             if get_worker_info() is not None:
@@ -136,6 +144,38 @@ class SampleDataset(Dataset[PointCloud]):
         if not -len(self) <= place < len(self):
             raise IndexError(f"there is no sample {place}: {self!r} has indices 0 to {len(self) - 1}")
         return place % len(self)
+
+    def __getitems__(self, indices: Sequence[int | tuple[int, int]]) -> Sequence[PointCloud]:
+        """Return several samples, as a ``DataLoader`` asks for those of a batch: the same as one by one.
+
+        Stored clouds are read at once and go through the steps as one batch, each with its own draws.
+        """
+        asked = [self._asked(index) for index in indices]
+        is_random = self.transform is not None and self.transform.is_random
+        try:
+            made = self._made_at_once(
+                [one.number for one in asked], [self._generator(one) for one in asked] if is_random else None
+            )
+        except Exception:  # a sample is at fault: read by itself, it is named
+            made = None
+        if made is None:
+            return [self[index] for index in indices]
+        if is_random and (places := [one.place for one in asked if not one.again]):
+            self._passes.note_all(places, repr(self))
+        return made
+
+    def _asked(self, index: int | tuple[int, int]) -> _Asked:
+        given, again = index if isinstance(index, tuple) else (index, 0)
+        place = self._place(given)
+        copy, number = divmod(place, len(self.ids))
+        return _Asked(place, number, copy + again * self.repeats, again)
+
+    def _generator(self, asked: _Asked) -> Generator:
+        return generator_for(self.seed, self.epoch, self.ids[asked.number], copy=asked.copy)
+
+    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+        """Return what :meth:`_made` does for each, or None where that must be done; None = nothing is drawn."""
+        return None
 
     def _made(self, number: int, generator: Generator | None) -> PointCloud:
         """Load a sample and run the transform on it."""
@@ -161,6 +201,14 @@ class SampleDataset(Dataset[PointCloud]):
     def _load(self, index: int) -> Any:
         """Load the sample before the transform."""
         raise NotImplementedError
+
+
+def runs_on_batches(transform: Transform | None) -> bool:
+    """Whether a batch is known to come out as its samples would: the laws of pcdata's own steps say so."""
+    return transform is None or (
+        transform.gives is PointCloud
+        and all(part.keeps_clouds and type(part).__module__.startswith("pcdata.") for part in transform.parts())
+    )
 
 
 def _empty(files: tuple[ImportedFile, ...], cls: type[SampleDataset]) -> SampleDataset:

@@ -14,6 +14,7 @@ from pcdata.errors import DTypeError, ShapeError
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.signals import cloud_from_frame
 from pcdata.structures.structure import Structure
+from pcdata.structures.unbatched import Unbatched
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,23 +72,28 @@ def window_batch(where: str, windows: Sequence[PointCloud]) -> WindowBatch:
         ShapeError: they differ in their number of clouds, or in their actions.
     """
     clouds = PointCloud.cat_padded(windows)
-    told = [dict(window.meta[0].get(WINDOW, {})) for window in windows]
-    num_obs = windows[0].num_clouds
+    if isinstance(windows, Unbatched):
+        sizes, num_obs = [windows.each] * len(windows), windows.each
+        told = [dict(meta.get(WINDOW, {})) for meta in clouds.meta[::num_obs]]
+    else:
+        sizes, num_obs = [window.num_clouds for window in windows], windows[0].num_clouds
+        told = [dict(window.meta[0].get(WINDOW, {})) for window in windows]
     actions = told[0].get("actions", [])
-    for number, (window, its) in enumerate(zip(windows, told, strict=True)):
-        if window.num_clouds != num_obs or its.get("actions", []) != actions:
+    for number, (size, its) in enumerate(zip(sizes, told, strict=True)):
+        if size != num_obs or its.get("actions", []) != actions:
             raise ShapeError(
-                f"{where}: window {number} has {window.num_clouds} clouds and the actions {its.get('actions', [])}, "
+                f"{where}: window {number} has {size} clouds and the actions {its.get('actions', [])}, "
                 f"window 0 {num_obs} and {actions}; give it samples of one EpisodeWindows"
             )
     newest = torch.arange(num_obs - 1, len(clouds), num_obs, dtype=torch.int64, device=clouds.device)
     signals: dict[str, Any] = {}
+    now = clouds.signals
     for name, signal in clouds.recorded_signals.items():
         if name in actions:
             way = None if signal.frame is None else cloud_from_frame(clouds, signal.frame)[newest]
             signals[name] = signal.rows(newest).values if way is None else signal.rows(newest).moved(way)
         elif isinstance(signal.values, Tensor):
-            signals[name] = clouds.signals[name].unflatten(0, (-1, num_obs))
+            signals[name] = now[name].unflatten(0, (-1, num_obs))
         else:
             signals[name] = tuple(signal.values[num_obs - 1 :: num_obs])
     horizon = signals[actions[0]].shape[1] if actions else 0

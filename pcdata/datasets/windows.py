@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from pcdata.datasets.samples import SampleDataset
+from pcdata.datasets.cached import CachedCloudDataset
+from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.datasets.window_places import window_places, window_steps
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataWarning, ShapeError, near_matches
 from pcdata.rng import child_seed, seeded
@@ -19,6 +20,7 @@ from pcdata.structures import CAMERA_FRAME, Episode, PointCloud, Signal
 from pcdata.structures.episodes import checked_episodes
 from pcdata.structures.signals import is_frame_of_camera
 from pcdata.structures.structure import derived
+from pcdata.structures.unbatched import Unbatched
 
 WINDOW = "window"  # in the meta of a window's clouds: what collate_windows must know
 
@@ -86,6 +88,7 @@ class EpisodeWindows(SampleDataset):
         self.actions = _checked_actions(actions)
         self._episodes = own
         self._lengths = np.array([episode.length for episode in own], dtype=np.int64)
+        self._firsts = np.array([episode.first for episode in own], dtype=np.int64)
         pads = (num_obs - 1, num_actions - 1) if pad == "repeat" else (0, 0)
         self.places = window_places(
             self._lengths.tolist(), horizon=horizon, pad_before=pads[0], pad_after=pads[1], stride=stride
@@ -128,9 +131,12 @@ class EpisodeWindows(SampleDataset):
 
     def steps(self, index: int) -> NDArray[np.int64]:
         """Return the places (horizon,) of a window's steps among the ids of ``dataset``, repeated ones as they are."""
-        number = self._place(index) % len(self.ids)
-        episode = self._episodes[int(self.places.episode[number])]
-        return episode.first + window_steps(int(self.places.start[number]), episode.length, self.horizon)
+        return self._steps([self._place(index) % len(self.ids)])[0]
+
+    def _steps(self, numbers: Sequence[int]) -> NDArray[np.int64]:
+        episode = self.places.episode[numbers]
+        steps = window_steps(self.places.start[numbers], self._lengths[episode], self.horizon)
+        return self._firsts[episode][:, None] + steps
 
     def set_epoch(self, epoch: int) -> None:
         """Change the random draws, of the windows and of the dataset that they are cut from."""
@@ -146,14 +152,32 @@ class EpisodeWindows(SampleDataset):
         clouds = self._clouds(shown.tolist(), generator)
         if len(shown) < self.num_obs:
             clouds = PointCloud.cat([clouds[int(place)] for place in again.tolist()])
-        return self._with_actions(clouds, number, steps)
+        return self._with_actions(clouds, [number], steps[None])
+
+    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+        if not isinstance(self.dataset, CachedCloudDataset) or not runs_on_batches(self.transform):
+            return None
+        steps = self._steps(numbers)
+        shown = steps[:, : self.num_obs].ravel().tolist()
+        batches = []
+        for part in self.dataset._parts(shown, self.num_obs):
+            clouds = self.dataset._load_at_once(shown[part])
+            if clouds is None:
+                return None
+            windows = slice(part.start // self.num_obs, part.stop // self.num_obs)
+            streams = None
+            if generators is not None:  # the clouds of a window get the same draws
+                streams = [one for given in generators[windows] for one in [seeded(child_seed(given))] * self.num_obs]
+            made = self._transformed(clouds, streams)
+            batches.append(self._with_actions(made, numbers[windows], steps[windows]))
+        return Unbatched(batches, self.num_obs)
 
     def _clouds(self, shown: Sequence[int], generator: Generator | None) -> PointCloud:
         """Return one cloud for each of these samples, all with the same draws."""
         seed = None if generator is None else child_seed(generator)
 
         def streams(count: int) -> list[Generator] | None:
-            return None if seed is None else [seeded(seed) for _ in range(count)]
+            return None if seed is None else [seeded(seed)] * count
 
         data = [self.dataset._load(place) for place in shown]
         if all(isinstance(one, PointCloud) and one.num_clouds == 1 for one in data):
@@ -168,9 +192,11 @@ class EpisodeWindows(SampleDataset):
             )
         return made[0] if len(made) == 1 else PointCloud.cat(made)
 
-    def _with_actions(self, clouds: PointCloud, number: int, steps: NDArray[np.int64]) -> PointCloud:
+    def _with_actions(self, clouds: PointCloud, numbers: Sequence[int], steps: NDArray[np.int64]) -> PointCloud:
+        """Give the clouds of W windows, ``num_obs`` each, the actions of their (W, horizon) steps."""
         recorded = dict(clouds.recorded_signals)
         index = torch.from_numpy(steps)
+        shown = index[:, : self.num_obs].flatten()
         for name, table in self._table.items():
             own = recorded.get(name)
             if own is None:
@@ -178,7 +204,7 @@ class EpisodeWindows(SampleDataset):
                     f"EpisodeWindows: a step of {self.transform!r} drops the signal {name!r}; keep it, or leave it out "
                     "of actions"
                 )
-            if not own.same_bits(table.rows(index[: self.num_obs])):
+            if not own.same_bits(table.rows(shown)):
                 cause = (
                     "a step changed it, which the actions of the other steps would miss: change it where it is recorded"
                     if own.frame == table.frame
@@ -190,18 +216,23 @@ class EpisodeWindows(SampleDataset):
                 )
             others = clouds.frames.keys() - {table.frame}
             if table.frame is not None and is_frame_of_camera(clouds, table.frame) and others:
-                self._check_still(name, int(self.places.episode[number]), clouds)
+                for place, number in enumerate(numbers):
+                    own_clouds = clouds[place * self.num_obs : (place + 1) * self.num_obs]
+                    self._check_still(name, int(self.places.episode[number]), own_clouds)
             values = table.rows(index).values
             assert isinstance(values, Tensor)
-            recorded[name] = derived(table, values=values.expand(self.num_obs, *values.shape))
-        start, length = int(self.places.start[number]), int(self._lengths[self.places.episode[number]])
-        window = {
-            "id": self.ids[number],
-            "num_obs": self.num_obs,
-            "actions": list(self._table),
-            "real": [max(0, -start), min(self.horizon, length - start)],  # of the horizon's steps, those of the episode
-        }
-        return derived(clouds.with_meta([{WINDOW: window}] * self.num_obs), recorded_signals=recorded)
+            recorded[name] = derived(table, values=values.repeat_interleave(self.num_obs, dim=0))
+        told: list[dict[str, Any]] = []
+        for number in numbers:
+            start, length = int(self.places.start[number]), int(self._lengths[self.places.episode[number]])
+            window: dict[str, Any] = {
+                "id": self.ids[number],
+                "num_obs": self.num_obs,
+                "actions": list(self._table),
+                "real": [max(0, -start), min(self.horizon, length - start)],  # of the horizon's steps, the episode's
+            }
+            told += [{WINDOW: window}] * self.num_obs
+        return derived(clouds.with_meta(told), recorded_signals=recorded)
 
     def _check_still(self, name: str, number: int, clouds: PointCloud) -> None:
         """Require that a camera, in whose frame actions were recorded, stands still throughout an episode."""

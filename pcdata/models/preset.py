@@ -16,6 +16,7 @@ from pcdata.models.contract import ModelContract
 from pcdata.models.model_check import require
 from pcdata.models.steps import pipeline_of
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Compose
 from pcdata.yaml_nodes import YamlDocument, yaml_text
 
@@ -43,7 +44,7 @@ class Preset:
             ContractError: the clouds are in another frame or unit, or of another count than the model takes.
         """
         kind = self._sample_type()
-        if not isinstance(samples, (list, tuple)) or not samples:
+        if not isinstance(samples, (list, tuple, Unbatched)) or not samples:
             raise DTypeError(f"{self!r}: collate takes a list of {kind.__name__}, got {type(samples).__name__}")
         wrong = [type(sample).__name__ for sample in samples if not isinstance(sample, kind)]
         if wrong:

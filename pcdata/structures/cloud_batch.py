@@ -17,9 +17,9 @@ from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
 from pcdata.structures.pose_layouts import motion_by
 from pcdata.structures.signal_joining import joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, attached, refuse_mirror, signals_now
+from pcdata.structures.stored_steps import Histories, Step
 from pcdata.structures.structure import Structure, derived
 
-Step = dict[str, Any]
 Clouds = TypeVar("Clouds", bound="CloudBatch")
 
 
@@ -51,7 +51,7 @@ class CloudBatch(Structure):
     frames: Mapping[str, Tensor] = field(default_factory=dict)
     layout: ImageLayout | None = None
     meta: Sequence[Mapping[str, Any]] = ()
-    history: Sequence[Sequence[Step]] = ()
+    history: Sequence[Sequence[Step]] = Histories()  # type: ignore[assignment]
     recorded_signals: Mapping[str, Signal] = field(default_factory=dict)
 
     def kind(self, name: str) -> Kind:
@@ -169,7 +169,7 @@ class CloudBatch(Structure):
             "source_from_cloud": self.source_from_cloud[clouds],
             "frames": {name: matrix[clouds] for name, matrix in self.frames.items()},
             "meta": self.meta[clouds],
-            "history": self.history[clouds],
+            "history": vars(self)["history"][clouds],
             "recorded_signals": signals,
         }
 
@@ -210,7 +210,7 @@ def joined_facts(clouds: Sequence[CloudBatch]) -> dict[str, Any]:
         "source_from_cloud": torch.cat([cloud.source_from_cloud for cloud in clouds]),
         "frames": {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in shared},
         "meta": tuple(entry for cloud in clouds for entry in cloud.meta),
-        "history": tuple(steps for cloud in clouds for steps in cloud.history),
+        "history": tuple(steps for cloud in clouds for steps in vars(cloud)["history"]),
         "recorded_signals": joined_signals([cloud.recorded_signals for cloud in clouds])
         if clouds[0].recorded_signals
         else {},

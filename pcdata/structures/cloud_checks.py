@@ -32,7 +32,7 @@ def check_cloud(
         check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
     _check_extra(extra, cloud.kinds, sizes["N"], ptr)
     for name in ("meta", "history"):
-        if (entries := len(getattr(cloud, name))) != sizes["B"]:
+        if (entries := len(vars(cloud)[name])) != sizes["B"]:
             raise ShapeError(f"PointCloud: {name} needs an entry per cloud, {sizes['B']}, got {entries}")
     check_names("PointCloud", cloud.frame_id, cloud.unit)
     if cloud.recorded_signals:

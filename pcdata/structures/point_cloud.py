@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import cloud_of_rows, join_rows, pad_rows, pick_rows, ptr_from_counts
-from pcdata.structures.cloud_batch import CloudBatch, Step, joined_facts
+from pcdata.structures.cloud_batch import CloudBatch, joined_facts
 from pcdata.structures.cloud_checks import check_cloud
 from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
@@ -23,7 +23,9 @@ from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, f
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
 from pcdata.structures.signals import told_signals
-from pcdata.structures.structure import derived
+from pcdata.structures.stored_steps import Step, StoredSteps
+from pcdata.structures.structure import checked_copy, derived
+from pcdata.structures.unbatched import Unbatched
 
 _SELECTED = {"points": "N 3", "ptr": "ptr N B"}
 
@@ -76,7 +78,8 @@ class PointCloud(CloudBatch):
             )
         fill(self, "source_frame", self.source_frame or self.frame_id)
         fill(self, "meta", tuple(self.meta) or tuple([{} for _ in range(num_clouds)]))
-        fill(self, "history", tuple(map(tuple, self.history)) or ((),) * num_clouds)
+        told = tuple([one if isinstance(one, StoredSteps) else tuple(one) for one in given["history"]])
+        fill(self, "history", told or ((),) * num_clouds)
         fill(self, "kinds", dict(zip(self.kinds, map(Kind, self.kinds.values()))))
 
     @classmethod
@@ -177,11 +180,11 @@ class PointCloud(CloudBatch):
                 extra[name] = value
         kinds = {name: kind for name, kind in self.kinds.items() if name in extra}
         layout = None if {"points", "source_index"} & values.keys() else self.layout
-        return replace(self, **core, extra=extra, kinds=kinds, layout=layout)  # type: ignore[arg-type]
+        return checked_copy(self, **core, extra=extra, kinds=kinds, layout=layout)
 
     def with_extra(self, name: str, value: Tensor, kind: Kind | str) -> PointCloud:
         """Add or replace one extra per-point field of the given kind."""
-        return replace(self, extra={**self.extra, name: value}, kinds={**self.kinds, name: Kind(kind)})
+        return checked_copy(self, extra={**self.extra, name: value}, kinds={**self.kinds, name: Kind(kind)})
 
     def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
         """Merge one mapping of JSON-able findings into the meta of each cloud."""
@@ -189,7 +192,11 @@ class PointCloud(CloudBatch):
 
     def with_steps(self, steps: Sequence[Step]) -> PointCloud:
         """Add one JSON-able step to the history of each cloud."""
-        return derived(self, history=tuple([(*old, new) for old, new in zip(self.history, steps, strict=True)]))
+        longer = [
+            old.then(new) if isinstance(old, StoredSteps) else (*old, new)
+            for old, new in zip(vars(self)["history"], steps, strict=True)
+        ]
+        return derived(self, history=tuple(longer))
 
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
@@ -279,6 +286,10 @@ class PointCloud(CloudBatch):
             ShapeError: the clouds carry different fields, or there are none.
             DeviceError: the clouds lie on different devices.
         """
+        if isinstance(clouds, Unbatched):
+            clouds = clouds.batches
+            if len(clouds) == 1:
+                return clouds[0]
         parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
         ptr = ptr_from_counts(torch.cat([cloud.counts for cloud in clouds]))
         return clouds[0]._with_rows(join_rows(parts), ptr=ptr, **joined_facts(clouds))
@@ -321,6 +332,10 @@ class PointCloud(CloudBatch):
         Raises:
             FrameError, UnitError, ShapeError, DeviceError: as :meth:`cat` and :meth:`padded`.
         """
+        if isinstance(clouds, Unbatched):
+            clouds = clouds.batches
+            if len(clouds) == 1:
+                return clouds[0].padded(num_points)
         parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
         counts = [[stop - start for start, stop in itertools.pairwise(cloud.ptr.tolist())] for cloud in clouds]
         flat = list(itertools.chain.from_iterable(counts))

@@ -22,6 +22,14 @@ def derived(structure: S, **changes: Any) -> S:
     return copy
 
 
+def checked_copy(structure: S, **changes: Any) -> S:
+    """Return a copy with other attributes, made by the constructor: ``dataclasses.replace`` that reads no attribute.
+
+    So what is computed when it is read, a history, is handed on as it is held.
+    """
+    return type(structure)(**{**vars(structure), **changes})
+
+
 class Structure:
     """A frozen dataclass of tensors, of mappings of them, and of structures; whatever else it holds stays as it is."""
 

@@ -186,7 +186,7 @@ class Transform(nn.Module):
     def recorded(self, data: Any, result: Any, params: Params) -> Any:
         """Return the result of this step on the data with the step in its history."""
         if isinstance(result, DepthFrame):
-            steps = [*result.provenance.get("history", ()), {**self._step(), "params": {}}]
+            steps = [*result.provenance.get("history", ()), {**self._steps(1)[0], "params": {}}]
             return result.with_provenance({"history": steps})
         before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
         return self.recorded_counts(result, before, result.counts.tolist(), params)
@@ -200,7 +200,9 @@ class Transform(nn.Module):
             TooFewPointsError: a cloud has lost its last point, or never had one.
         """
         steps = []
-        for b, count in enumerate(after):
+        small = _small(params, len(after))
+        beginnings = self._steps(len(after))
+        for b, (beginning, count) in enumerate(zip(beginnings, after)):
             facts: dict[str, Any] = {"points": count}
             if before is not None and len(before) == len(after):
                 facts = {"points_before": before[b], "points": count}
@@ -214,24 +216,28 @@ class Transform(nn.Module):
                     f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
                     "before left none (masks, ranges, crops); leave the capture out, or widen those"
                 )
-            small = _small(params, b, len(after)) if params else {}
-            steps.append({**self._step(), "params": small, **facts})
+            steps.append({**beginning, "params": small[b], **facts})
         return result.with_steps(steps)
 
-    def _step(self) -> dict[str, Any]:
-        """The beginning of an entry in a history; it may be changed there, so lists are given anew."""
+    def _steps(self, count: int) -> list[dict[str, Any]]:
+        """The beginnings of entries in histories; each may be changed there, so lists are given anew."""
         own = self.__dict__
         given = tuple(map(own.get, field_names(type(self))))
         before, told = own.get("_told", (None, {}))
         if before != given or self._modules:  # a field was set since, or may have been in a step within
             (told,) = self.to_config().values()
             own["_told"] = given, told
-        fields = {}
-        for name, value in told.items():
-            if type(value) is list:  # of numbers, or of rows of numbers
-                value = [*map(list, value)] if value and type(value[0]) is list else [*value]
-            fields[name] = value
-        return {"step": type(self).__name__, "version": self.version, "fields": fields}
+        name, version = type(self).__name__, self.version
+        return [{"step": name, "version": version, "fields": _anew(told)} for _ in range(count)]
+
+
+def _anew(fields: dict[str, Any]) -> dict[str, Any]:
+    """Copy fields, and the lists of numbers, or of rows of numbers, among them."""
+    copy = {**fields}
+    for name, value in fields.items():
+        if type(value) is list:
+            copy[name] = [*map(list, value)] if value and type(value[0]) is list else [*value]
+    return copy
 
 
 def unit_advice(step: Transform) -> str:
@@ -282,12 +288,13 @@ def sha256_of(identity: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _small(params: Params, b: int, num: int) -> dict[str, Any]:
+def _small(params: Params, num: int) -> list[dict[str, Any]]:
     """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise."""
-    kept = {}
+    kept: list[dict[str, Any]] = [{} for _ in range(num)]
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
         is_per_cloud = name not in ("index", "ptr", *FIELDS)
-        if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value[b].numel() <= 16:
-            kept[name] = value[b].tolist()
+        if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
+            for own, numbers in zip(kept, value.tolist(), strict=True):
+                own[name] = numbers
     return kept

@@ -23,6 +23,7 @@ from pcdata.files.strict_json import json_object, parse_json
 from pcdata.structures import PointCloud, Signal
 from pcdata.structures.kinds import FIELDS
 from pcdata.structures.signals import checked_signal
+from pcdata.structures.stored_steps import StoredSteps
 
 SCHEMA = "pcdata.cloud/1"
 SIGNALS_SCHEMA = "pcdata.signals/1"
@@ -203,10 +204,10 @@ def _check_info(info: Mapping[str, Any]) -> None:
             raise CacheError(f"{name} must be a text, got {info.get(name)!r:.100}")
     if not isinstance(info.get("kinds"), dict):
         raise CacheError(f"kinds must be an object, got {info.get('kinds')!r:.100}")
-    for name, kind in (("meta", dict), ("history", list)):
+    for name, kinds in (("meta", (dict,)), ("history", (list, StoredSteps))):
         entries = info.get(name)
-        if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
-            raise CacheError(f"{name} must be a list with one {kind.__name__} per cloud, got {entries!r:.100}")
+        if not isinstance(entries, list) or not all(isinstance(entry, kinds) for entry in entries):
+            raise CacheError(f"{name} must be a list with one {kinds[0].__name__} per cloud, got {entries!r:.100}")
 
 
 def _signal_arrays(signals: Mapping[str, Signal]) -> dict[str, np.ndarray]:

@@ -1,37 +1,100 @@
-"""Records of several samples put together, as the record of the batch of their clouds."""
+"""Records of several samples put together, as the record of the batch of their clouds; and facts taken apart for it."""
 
 from __future__ import annotations
 
+import itertools
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.io.store.cloud_record import EXTRA, Record
+from pcdata.errors import CacheError
+from pcdata.io.store.cloud_record import EXTRA, Record, parse_info
 from pcdata.structures.kinds import FIELDS
+from pcdata.structures.stored_steps import StoredSteps
+
+_OWN = ("meta", "history")  # facts that differ from sample to sample, as do the texts of signals
+
+
+def split_info(record: Record) -> tuple[dict[str, Any], str, str]:
+    """Return what a record's facts have in common with other samples', its own, and its history, the last two as JSON.
+
+    Together they are all of them.
+    """
+    own: dict[str, Any] = {name: record.info[name] for name in _OWN if name in record.info}
+    common = {name: value for name, value in record.info.items() if name not in _OWN}
+    signals = common.get("signals", [])
+    own["texts"] = [entry.get("texts") for entry in signals]
+    if signals:
+        common["signals"] = [{name: one for name, one in entry.items() if name != "texts"} for entry in signals]
+    text = record.info_text()
+    if Record({}, merged_info(common, own)).info_text() != text:  # not what is usual; told when it is read
+        return {}, text, ""
+    history = (
+        json.dumps(own.pop("history"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        if "history" in own
+        else ""
+    )
+    return common, json.dumps(own, sort_keys=True, separators=(",", ":"), allow_nan=False), history
+
+
+def own_info(text: bytes, history: bytes) -> dict[str, Any]:
+    """Return the facts of a record's own.
+
+    Raises:
+        CacheError: they are not JSON, or a cloud has no history.
+    """
+    own = parse_info(text)
+    if history:
+        own |= parse_info(b'{"history":' + history + b"}")
+        meta, steps = own.get("meta", ()), own["history"]
+        if not (_is_list(meta) and _is_list(steps) and len(meta) == len(steps) and all(map(_is_list, steps))):
+            raise CacheError(f"history must be a list with one list per cloud, got {steps!r:.100}")
+    return own
+
+
+def merged_info(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the facts that were split.
+
+    Raises:
+        CacheError: these never were.
+    """
+    info = {**common, **own}
+    texts = info.pop("texts", [])
+    signals = common.get("signals", [])
+    if not isinstance(texts, list) or not isinstance(signals, list) or len(texts) != len(signals):
+        raise CacheError(f"has {texts!r:.100} as the texts of the signals {signals!r:.100}")
+    if signals:
+        info["signals"] = [
+            entry if one is None else {**entry, "texts": one} for entry, one in zip(signals, texts, strict=True)
+        ]
+    return info
 
 
 def joined_record(
     arrays: dict[str, NDArray[Any]],  # name -> the rows of all records, one record after another
     rows: Mapping[str, NDArray[np.int64]],  # name -> (R,) how many are of each record
-    infos: Sequence[Any],  # (R,) the facts of each; they are taken apart
+    common: Mapping[str, Any],  # the facts that all have
+    owns: Sequence[Any],  # (R,) the other facts of each, but for the history
+    histories: Sequence[bytes],  # (R,) as JSON
 ) -> Record | None:
     """Return the record of all clouds in a row; None where they cannot share a batch, or one is no cloud.
 
     Read one by one, they say why.
     """
-    info = _joined_info(infos)
     ptr = arrays.get("ptr")
-    if info is None or ptr is None or "points" not in arrays or ptr.dtype != np.int64 or ptr.ndim != 1:
+    own = _joined_own(owns, histories)
+    if own is None or ptr is None or "points" not in arrays or ptr.dtype != np.int64 or ptr.ndim != 1:
         return None
     points, clouds = rows["points"], rows["ptr"] - 1
-    if not _belong_together(rows, points, clouds) or clouds.tolist() != [len(own["meta"]) for own in infos]:
+    if not _belong_together(rows, points, clouds) or clouds.tolist() != [len(one["meta"]) for one in owns]:
         return None
     joined_ptr = _joined_ptr(ptr, points, clouds)
     if joined_ptr is None:
         return None
-    return Record({**arrays, "ptr": joined_ptr}, info)
+    return Record({**arrays, "ptr": joined_ptr}, merged_info(common, own))
 
 
 def _belong_together(
@@ -61,43 +124,32 @@ def _joined_ptr(
     return np.concatenate([np.zeros(1, np.int64), np.delete(moved, first)])
 
 
-def _joined_info(infos: Sequence[Any]) -> dict[str, Any] | None:
-    """Return the facts of all clouds, or None where they differ in what a batch has once."""
-    meta: list[Any] = []
-    history: list[Any] = []
-    for info in infos:
-        if not isinstance(info, dict) or not all(isinstance(info.get(name), list) for name in ("meta", "history")):
+def _joined_own(owns: Sequence[Any], histories: Sequence[bytes]) -> dict[str, Any] | None:
+    """Return the facts of all samples' own in a row."""
+    joined: dict[str, list[Any]] = {"meta": [], "history": []}
+    texts: list[Any] = []
+    for own, history in zip(owns, histories, strict=True):
+        if not isinstance(own, dict) or own.keys() != {"meta", "texts"} or not all(map(_is_list, own.values())):
             return None
-        if len(info["meta"]) != len(info["history"]):
+        joined["meta"] += own["meta"]
+        if len(own["meta"]) == 1:
+            joined["history"].append(StoredSteps(history[1:-1]))  # the list of one list, without its own brackets
+        else:
+            joined["history"] += json.loads(history)
+        texts.append(own["texts"])
+    if any(any(each) for each in texts):
+        told = [[*of_signal] for of_signal in zip(*texts, strict=True)]
+        if not all(all(map(_is_list, each)) or not any(each) for each in told):
             return None
-        meta += info["meta"]
-        history += info["history"]
-    first = infos[0]
-    signals = first.get("signals", [])
-    if not isinstance(signals, list) or not all(isinstance(entry, dict) for entry in signals):
-        return None
-    texts = [[*entry["texts"]] if isinstance(entry.get("texts"), list) else None for entry in signals]
-    common = _without(first, "meta", "history", "signals")
-    told = [_without(entry, "texts") for entry in signals]
-    for info in infos[1:]:
-        others = info.get("signals", [])
-        if _without(info, "meta", "history", "signals") != common or len(others) != len(signals):
-            return None
-        for own, entry, known in zip(texts, others, told):
-            if not isinstance(entry, dict) or _without(entry, "texts") != known:
-                return None
-            more: Any = entry.get("texts")
-            if isinstance(more, list) != (own is not None):
-                return None
-            if own is not None:
-                own += more
-    joined = {**common, "meta": meta, "history": history}
-    if "signals" in first:
-        joined["signals"] = [
-            entry if own is None else {**entry, "texts": own} for entry, own in zip(told, texts, strict=True)
-        ]
+        joined["texts"] = [[*itertools.chain.from_iterable(each)] if _is_list(each[0]) else None for each in told]
+    else:
+        joined["texts"] = [None] * len(texts[0])
     return joined
 
 
-def _without(entry: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {name: value for name, value in entry.items() if name not in names}
+def _json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _is_list(value: Any) -> bool:
+    return type(value) is list

@@ -41,7 +41,8 @@ _LONGEST_INDEX = 256 << 20  # bytes: of ten million records with a few hundred g
 _MOST_AXES = 32
 _DTYPES = {np.dtype(code).str for code in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")}
 
-_Form = tuple[tuple[str, str, tuple[int, ...] | None], ...]  # name, dtype and shape of a row of every array
+# The facts as a text, and of every array its name, its dtype and the shape of a row.
+_Form = tuple[str, tuple[tuple[str, str, tuple[int, ...] | None], ...]]
 
 
 class PackedWriter:
@@ -63,8 +64,8 @@ class PackedWriter:
         with open(path, "xb") as file:
             file.write(_MAGIC)
 
-    def add(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Add one record.
+    def add(self, key: str, facts: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Add one record; ``facts`` are kept once for all records of a group, which have the same.
 
         Raises:
             CacheError: the key was added before, or an array is not of plain numbers.
@@ -80,7 +81,8 @@ class PackedWriter:
         self._keys.add(key)
         # Copied: it is the caller's, who may change it before it is written.
         copies = [np.array(array, order="C") for array in arrays.values()]
-        self._waiting.setdefault(tuple(form), []).append((key, copies))
+        text = json.dumps(facts, sort_keys=True, allow_nan=False)
+        self._waiting.setdefault((text, tuple(form)), []).append((key, copies))
         self._held += sum(array.nbytes for array in copies)
         if self._held >= _GROUP:
             self._write_waiting()
@@ -108,7 +110,7 @@ class PackedWriter:
 
     def _write_waiting(self) -> None:
         waiting, self._waiting, self._held = self._waiting, {}, 0
-        for form, records in waiting.items():
+        for (facts, form), records in waiting.items():
             parts: list[Any] = []
             columns: list[dict[str, Any]] = []
             tables: list[bytes] = []
@@ -128,7 +130,8 @@ class PackedWriter:
                 columns.append({"name": name, "dtype": dtype, "row": row, "rows": rows, "begin": place})
                 place += sum(array.nbytes for array in arrays)
             keys = "\n".join(key for key, _ in records).encode("utf-8", "surrogatepass")
-            self._groups.append({"records": len(records), "columns": columns, "keys": keys, "tables": tables})
+            group = {"records": len(records), "columns": columns, "keys": keys, "tables": tables}
+            self._groups.append({**group, "facts": json.loads(facts)})
             self._append(parts)
         if waiting:
             self._append([bytes(-self._place % _ALIGNED)])
@@ -173,14 +176,33 @@ class _Column:
         return np.diff(self.pointers[first : stop + 1])
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Records with the same arrays and the same facts."""
+
+    keys: list[str]
+    facts: dict[str, Any]
+    columns: dict[str, _Column]
+
+    def joins(self, other: _Group, names: Sequence[str], leave_out: Collection[str]) -> bool:
+        """Whether records of both can be read as one."""
+        if self is other:
+            return True
+        return (
+            self.facts == other.facts
+            and other.columns.keys() - leave_out == {*names}
+            and all(self.columns[name].form == other.columns[name].form for name in names)
+        )
+
+
 class PackedFile:
     """A mapped file whose end, index and tables are right; :func:`open_packed` makes it."""
 
-    def __init__(self, groups: list[dict[str, _Column]], keys: list[list[str]], identity: tuple[int, ...]) -> None:
+    def __init__(self, groups: list[_Group], identity: tuple[int, ...]) -> None:
         self._groups = groups
         self.identity = identity
-        self._places = {key: (group, row) for group, own in enumerate(keys) for row, key in enumerate(own)}
-        if len(self._places) != sum(map(len, keys)):
+        self._places = {key: (number, row) for number, own in enumerate(groups) for row, key in enumerate(own.keys)}
+        if len(self._places) != sum(len(own.keys) for own in groups):
             raise CacheError("two records have one key")
 
     def place_of(self, key: str) -> tuple[int, int]:
@@ -194,11 +216,15 @@ class PackedFile:
             raise CacheError(f"the record {key!r:.300} is missing")
         return place
 
+    def facts(self, place: tuple[int, int]) -> dict[str, Any]:
+        """Return what a record has in common with the others of its group."""
+        return self._groups[place[0]].facts
+
     def record(self, place: tuple[int, int]) -> dict[str, NDArray[Any]]:
         """Return the arrays of one record, read-only, as they lie in the file."""
         group, row = place
         arrays = {}
-        for name, column in self._groups[group].items():
+        for name, column in self._groups[group].columns.items():
             values = column.values[column.rows(row, row + 1)]
             arrays[name] = values.reshape(()) if column.is_scalar else values
         return arrays
@@ -208,22 +234,23 @@ class PackedFile:
     ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[np.int64]]] | None:
         """Return each array of some records with its rows one after another, and how many rows are of each record.
 
-        None where their arrays differ in name, dtype or shape of a row, but for those that are left out.
+        None where their facts differ, or their arrays in name, dtype or shape of a row, but for those that are left
+        out.
         """
         runs = _runs(places)
-        groups = [self._groups[group] for group, _, _ in runs]
-        first = groups[0]
-        names = [name for name in first if name not in leave_out]
-        for own in groups:
-            if own is not first and (
-                own.keys() - leave_out != {*names} or any(own[name].form != first[name].form for name in names)
-            ):
-                return None
+        groups = [self._groups[number] for number, _, _ in runs]
+        names = [name for name in groups[0].columns if name not in leave_out]
+        if not all(groups[0].joins(other, names, leave_out) for other in groups):
+            return None
         arrays, counts = {}, {}
         for name in names:
-            cuts = [(own[name], begin, stop) for own, (_, begin, stop) in zip(groups, runs)]
+            cuts = [(own.columns[name], begin, stop) for own, (_, begin, stop) in zip(groups, runs)]
             arrays[name] = np.concatenate([one.values[one.rows(begin, stop)] for one, begin, stop in cuts])
-            counts[name] = np.concatenate([one.counts(begin, stop) for one, begin, stop in cuts])
+            each = {one.each for one, _, _ in cuts}
+            if len(each) == 1 and None not in each:
+                counts[name] = np.full(len(places), each.pop(), dtype=np.int64)
+            else:
+                counts[name] = np.concatenate([one.counts(begin, stop) for one, begin, stop in cuts])
         return arrays, counts
 
 
@@ -266,9 +293,8 @@ def open_packed(file: BinaryIO) -> PackedFile:
     if not isinstance(groups, list):
         raise CacheError(f"its index must list groups, got {groups!r:.100}")
     reader = _Reader(content, len(_MAGIC), begin, stop - length)
-    read = [reader.group(group) for group in groups]
     identity = (status.st_dev, status.st_ino, size, status.st_mtime_ns)
-    return PackedFile([columns for columns, _ in read], [keys for _, keys in read], identity)
+    return PackedFile([reader.group(group) for group in groups], identity)
 
 
 class _Reader:
@@ -279,9 +305,11 @@ class _Reader:
         self._block, self._end = begin, end  # where the next block may begin, and where blocks end
         self._table, self._stop = end, stop  # the same of tables
 
-    def group(self, told: Any) -> tuple[dict[str, _Column], list[str]]:
-        """Return the columns of a group by name, and its keys."""
-        records, tables, columns = (_entry(told, name) for name in ("records", "tables", "columns"))
+    def group(self, told: Any) -> _Group:
+        """Return a group."""
+        records, tables, columns, facts = (_entry(told, name) for name in ("records", "tables", "columns", "facts"))
+        if not isinstance(facts, dict):
+            raise CacheError(f"the facts of a group must be an object, got {facts!r:.100}")
         if not _is_count(records) or records == 0 or not isinstance(tables, list) or not isinstance(columns, list):
             raise CacheError(f"a group needs records, tables and columns, got {told!r:.200}")
         try:
@@ -297,7 +325,7 @@ class _Reader:
             if not isinstance(name, str) or name in found:
                 raise CacheError(f"the arrays of a group must have a name each, got {name!r:.100}")
             found[name] = self._column(name, column, records, pointers)
-        return found, keys
+        return _Group(keys, facts, found)
 
     def _column(self, name: str, told: Any, records: int, pointers: Sequence[NDArray[np.int64]]) -> _Column:
         dtype, row, rows, begin = (_entry(told, entry) for entry in ("dtype", "row", "rows", "begin"))

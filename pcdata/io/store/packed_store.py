@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
-from pcdata.io.store.cloud_record import DERIVED, Record, parse_info
-from pcdata.io.store.joined_record import joined_record
+from pcdata.io.store.cloud_record import DERIVED, Record
+from pcdata.io.store.joined_record import joined_record, merged_info, own_info, split_info
 from pcdata.io.store.packed_file import PackedFile, PackedWriter, open_packed
 from pcdata.io.store.store import INFO, Compression, Store, damage_named, register_store, writing
+
+_HISTORY = f"{INFO}.history"  # apart from the other facts: it is long, and seldom read
 
 
 @register_store
@@ -42,10 +44,11 @@ class _PackedStore(Store):
 
     def write(self, key: str, record: Record) -> None:
         """Add one record; it is on disk after :meth:`close`."""
-        text = np.frombuffer(record.info_text().encode(), np.uint8)
+        common, *texts = split_info(record)
+        text, history = (np.frombuffer(one.encode(), np.uint8) for one in texts)
         with writing(self.path):
             writer, self._writer = self._writer or PackedWriter(self.path), None
-            writer.add(key, {**record.arrays, INFO: text})
+            writer.add(key, common, {**record.arrays, INFO: text, _HISTORY: history})
             self._writer = writer  # one that failed is not gone on with
 
     def close(self) -> None:
@@ -59,29 +62,28 @@ class _PackedStore(Store):
         """Read one record; its arrays are the caller's own."""
         with damage_named(self.path):
             file = self._mapped()
-            arrays = {name: array.copy() for name, array in file.record(file.place_of(key)).items()}
-            return Record(arrays, parse_info(_text_of(arrays)))
+            record = _as_it_lies(file, file.place_of(key))
+            return Record({name: array.copy() for name, array in record.arrays.items()}, record.info)
 
     def digest(self, key: str) -> str:
         """Return the digest of one record, computed where it lies."""
         with damage_named(self.path):
             file = self._mapped()
-            arrays = file.record(file.place_of(key))
-            return Record(arrays, parse_info(_text_of(arrays))).digest()
+            return _as_it_lies(file, file.place_of(key)).digest()
 
     def read_joined(self, keys: Sequence[str]) -> Record | None:
         """Read records as one, every array copied once."""
         with damage_named(self.path):
             file = self._mapped()
-            joined = file.joined([file.place_of(key) for key in keys], DERIVED)
+            places = [file.place_of(key) for key in keys]
+            joined = file.joined(places, DERIVED)
             if joined is None:
                 return None
             arrays, rows = joined
-            text = arrays.pop(INFO).tobytes()
-            ends = rows.pop(INFO).cumsum().tolist()
-            texts = [text[begin:end] for begin, end in zip([0, *ends], ends)]
+            own, history = (_texts(arrays.pop(name), rows.pop(name)) for name in (INFO, _HISTORY))
             # The strict parser looked at each when its digest was compared.
-            return joined_record(arrays, rows, json.loads(b"[" + b",".join(texts) + b"]"))
+            owns = json.loads(b"[" + b",".join(own) + b"]")
+            return joined_record(arrays, rows, file.facts(places[0]), owns, history)
 
     def identity(self) -> tuple[int, ...]:
         """Return what tells the mapped file from another of its name."""
@@ -100,8 +102,16 @@ class _PackedStore(Store):
         return {**self.__dict__, "_writer": None, "_opened_file": None}
 
 
-def _text_of(arrays: dict[str, NDArray[Any]]) -> bytes:
-    text = arrays.pop(INFO, None)
-    if text is None or text.dtype != np.uint8:
-        raise CacheError(f"has a record without the text {INFO!r}")
-    return text.tobytes()
+def _as_it_lies(file: PackedFile, place: tuple[int, int]) -> Record:
+    """Return a record whose arrays are those of the mapped file."""
+    arrays = file.record(place)
+    own, history = (arrays.pop(name, None) for name in (INFO, _HISTORY))
+    if own is None or history is None or own.dtype != np.uint8 or history.dtype != np.uint8:
+        raise CacheError(f"has a record without the texts {INFO!r} and {_HISTORY!r}")
+    return Record(arrays, merged_info(file.facts(place), own_info(own.tobytes(), history.tobytes())))
+
+
+def _texts(letters: NDArray[Any], counts: NDArray[np.int64]) -> list[bytes]:
+    ends = counts.cumsum().tolist()
+    together = letters.tobytes()
+    return [together[begin:end] for begin, end in zip([0, *ends], ends)]
