@@ -221,7 +221,8 @@ class EpisodeWindows(SampleDataset):
                     self._check_still(name, int(self.places.episode[number]), own_clouds)
             values = table.rows(index).values
             assert isinstance(values, Tensor)
-            recorded[name] = derived(table, values=values.repeat_interleave(self.num_obs, dim=0))
+            each = values[:, None].expand(-1, self.num_obs, *values.shape[1:])  # of one window the memory is shared
+            recorded[name] = derived(table, values=each.flatten(0, 1))
         told: list[dict[str, Any]] = []
         for number in numbers:
             start, length = int(self.places.start[number]), int(self._lengths[self.places.episode[number]])
