@@ -215,7 +215,7 @@ def files_of(folder: Path, *, leave_out: tuple[str, ...] = ()) -> dict[str, byte
 
 # -- stores ------------------------------------------------------------------------------------------------------------
 
-STORED = {"hdf5": ("none", "lzf", "gzip"), "npz": ("none", "gzip"), "pt": ("none",)}
+STORED = {"hdf5": ("none", "lzf", "gzip"), "npz": ("none", "gzip"), "packed": ("none",), "pt": ("none",)}
 CONFIG = """\
 depth: [MaskDepth: {near: 0.2, far: 3.0}, Deproject]
 cloud:

@@ -31,7 +31,9 @@ from pcdata.rng import seeded
 RESULTS = Path(__file__).parent / "results"
 BATCH, POINTS = 64, 4096
 STORES = ("packed", "hdf5", "npz", "pt")
-AUGMENT = "augment: [RandomRotation: {degrees: 180}, RandomScale: {low: 0.9, high: 1.1}, RandomJitter: {sigma: 0.001}]\n"
+AUGMENT = (
+    "augment: [RandomRotation: {degrees: 180}, RandomScale: {low: 0.9, high: 1.1}, RandomJitter: {sigma: 0.001}]\n"
+)
 
 
 class _Clouds:
