@@ -2,8 +2,8 @@
 
     python benchmarks/loading.py     # a minute; writes results/loading.json
 
-Clouds of 4096 points with colors, without signals and without random steps, then turned, scaled and jittered; batches of
-64 by one process, shuffled, collated to (B, N, 3). Beside each store stand per-sample ``.npz`` files of the two arrays
+Clouds of 4096 points with colors, without signals, as they are stored and then turned, scaled and jittered; batches of 64
+by one process, shuffled, collated to (B, N, 3). Beside each store stand per-sample ``.npz`` files of the two arrays
 alone, read by ``numpy.load`` and put together by torch's ``default_collate``, as most training code does, and a copy of
 the same bytes out of one array in memory. In turns, the medians of CPU time kept. "First" is the pass that compares
 every record of a packed store with its digest; the other stores do so in every pass.
