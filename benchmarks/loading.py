@@ -2,7 +2,7 @@
 
     python benchmarks/loading.py     # a minute; writes results/loading.json
 
-Clouds of 4096 points with colors, without signals, as they are stored and then turned, scaled and jittered; batches of 64
+Clouds of 4096 points with colors, without signals, as they are stored and then turned, scaled and jittered; 64 a batch
 by one process, shuffled, collated to (B, N, 3). Beside each store stand per-sample ``.npz`` files of the two arrays
 alone, read by ``numpy.load`` and put together by torch's ``default_collate``, as most training code does, and a copy of
 the same bytes out of one array in memory. In turns, the medians of CPU time kept. "First" is the pass that compares
