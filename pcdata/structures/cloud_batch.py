@@ -17,10 +17,29 @@ from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
 from pcdata.structures.pose_layouts import motion_by
 from pcdata.structures.signal_joining import joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, attached, refuse_mirror, signals_now
-from pcdata.structures.stored_steps import Histories, Step
+from pcdata.structures.stored_steps import Step, StoredSteps
 from pcdata.structures.structure import Structure, derived
 
 Clouds = TypeVar("Clouds", bound="CloudBatch")
+
+
+class _Histories:
+    """The attribute ``history`` of clouds: a tuple of the steps of each, as everybody sees it.
+
+    ``vars(clouds)["history"]`` is what they hold: steps that nobody has read yet may be :class:`StoredSteps`.
+    """
+
+    def __get__(self, clouds: Any, owner: type) -> Sequence[Sequence[Step]]:
+        if clouds is None:
+            return ()  # the default, as dataclasses ask for it
+        held: Sequence[Any] = vars(clouds)["history"]
+        if any(isinstance(one, StoredSteps) for one in held):
+            held = tuple([one.read() if isinstance(one, StoredSteps) else one for one in held])
+            vars(clouds)["history"] = held
+        return held
+
+    def __set__(self, clouds: Any, value: Sequence[Any]) -> None:
+        vars(clouds)["history"] = value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +70,7 @@ class CloudBatch(Structure):
     frames: Mapping[str, Tensor] = field(default_factory=dict)
     layout: ImageLayout | None = None
     meta: Sequence[Mapping[str, Any]] = ()
-    history: Sequence[Sequence[Step]] = Histories()  # type: ignore[assignment]
+    history: Sequence[Sequence[Step]] = _Histories()  # type: ignore[assignment]
     recorded_signals: Mapping[str, Signal] = field(default_factory=dict)
 
     def kind(self, name: str) -> Kind:

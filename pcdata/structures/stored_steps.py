@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from pcdata.errors import CacheError
@@ -37,25 +36,3 @@ class StoredSteps:
         if not isinstance(stored, list):
             raise CacheError("the history of a cloud must be a list of steps; rebuild the dataset")
         return (*stored, *self._more)
-
-
-Steps = Sequence[Step] | StoredSteps
-
-
-class Histories:
-    """The attribute ``history`` of clouds: a tuple of the steps of each, as everybody sees it.
-
-    ``vars(clouds)["history"]`` is what they hold: steps that nobody has read yet may be :class:`StoredSteps`.
-    """
-
-    def __get__(self, clouds: Any, owner: type) -> Sequence[Sequence[Step]]:
-        if clouds is None:
-            return ()  # the default, as dataclasses ask for it
-        held: Sequence[Steps] = vars(clouds)["history"]
-        if any(isinstance(one, StoredSteps) for one in held):
-            held = tuple([one.read() if isinstance(one, StoredSteps) else one for one in held])
-            vars(clouds)["history"] = held
-        return held  # type: ignore[return-value]
-
-    def __set__(self, clouds: Any, value: Sequence[Steps]) -> None:
-        vars(clouds)["history"] = value
