@@ -53,6 +53,22 @@ def test_depth_is_lossless_video_that_others_decode_bit_for_bit(tmp_path: Path) 
     assert not any(key.startswith("depth.") for key in info(tmp_path / "out")["features"])
 
 
+def test_damaged_depth_is_never_filled_from_the_picture_before(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures())
+    convert(made, "lerobot", tmp_path / "out")
+    file = tmp_path / "out/videos/depth.view0/chunk-000/file-000.mkv"
+    content, refused = file.read_bytes(), 0
+    for place in range(700, len(content), 397):
+        file.write_bytes(content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :])
+        source = open_source(tmp_path / "out")
+        for name, own in zip(made.ids, source.ids):
+            try:
+                assert torch.equal(source.load(own).depth, made.load(name).depth)
+            except CaptureError:
+                refused += 1
+    assert refused > 3
+
+
 def test_rows_and_episodes_are_what_pyarrow_reads(tmp_path: Path) -> None:
     made = cut_to_episodes(made_captures())
     convert(made, "lerobot", tmp_path / "out", state=["joints", "count"])
