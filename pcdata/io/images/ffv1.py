@@ -7,10 +7,27 @@ at another number.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
+from typing import Any
+
+from pcdata.errors import CaptureError
 
 _PLAIN, _SUMMED = 3, 8  # bytes after a slice: its size; and a status and the sum
 _BEGINNINGS = (0, 0x7A8C4079)
 _MIRRORED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+
+
+def decoded(container: Any, track: Any) -> Iterator[Any]:
+    """Decode a track of any codec from where its container is, a picture of PyAV at a time.
+
+    Raises:
+        CaptureError: the sum of an FFV1 picture is not that of its content.
+    """
+    has_sums = track.codec_context.name == "ffv1" and bool(track.codec_context.extradata)  # version 3 or later
+    for packet in container.demux(track):
+        if has_sums and packet.size and is_damaged(bytes(packet)):
+            raise CaptureError("a picture is damaged: its checksum is not that of its content")
+        yield from packet.decode()
 
 
 def is_damaged(packet: bytes) -> bool:

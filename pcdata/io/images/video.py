@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pcdata.errors import CaptureError, PcdataError, add_note
 from pcdata.extras import require
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
-from pcdata.io.images.ffv1 import is_damaged
+from pcdata.io.images.ffv1 import decoded
 from pcdata.io.images.reading import check_pixels
 
 _MATROSKA = b"\x1a\x45\xdf\xa3"
@@ -107,7 +107,7 @@ class VideoFile:
         onward = self._last is not None and 0 < seconds - self._last[0] < _ONWARD * self._period
         if not onward or self._frames is None:
             self._container.seek(round(seconds / self._unit), stream=self._track, backward=True)
-            self._frames = self._decoded()
+            self._frames = decoded(self._container, self._track)
         nearest = math.inf
         for frame in self._frames:
             if frame.pts is None:
@@ -127,13 +127,6 @@ class VideoFile:
             raise CaptureError(f"the picture at {seconds:.6f} s is damaged")
         check_pixels("its pictures", frame.width, frame.height)
         return frame
-
-    def _decoded(self) -> Iterator[Any]:
-        has_sums = self._track.codec_context.name == "ffv1" and bool(self._track.codec_context.extradata)
-        for packet in self._container.demux(self._track):
-            if has_sums and packet.size and is_damaged(bytes(packet)):
-                raise CaptureError("a picture is damaged: its checksum is not that of its content")
-            yield from packet.decode()
 
     @contextmanager
     def _named(self) -> Iterator[None]:

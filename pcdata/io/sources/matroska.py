@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pcdata.errors import CaptureError, PcdataError, add_note
 from pcdata.extras import require
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
+from pcdata.io.images.ffv1 import decoded
 from pcdata.io.images.reading import check_pixels
 
 MAGIC = b"\x1a\x45\xdf\xa3"
@@ -71,7 +72,7 @@ class _Matroska:
         tick = round(time / float(stream.time_base))
         check_pixels(f"track {title}", stream.width, stream.height)
         self._container.seek(tick, stream=stream, backward=True)
-        for frame in self._container.decode(stream):  # from the last picture before it that stands by itself
+        for frame in decoded(self._container, stream):  # from the last picture before it that stands by itself
             if frame.pts is None or frame.pts < tick:
                 continue
             if frame.pts > tick or frame.is_corrupt:
