@@ -21,6 +21,7 @@ from pcdata.files.handles import Handles
 from pcdata.files.sample_names import check_known, name_some
 from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
 from pcdata.io.arrays.parquet import ParquetColumns
+from pcdata.io.sources.episode_file import EPISODES
 from pcdata.io.sources.joined_views import join_views
 from pcdata.io.sources.lerobot_cameras import (
     DepthStream,
@@ -36,7 +37,7 @@ from pcdata.io.sources.lerobot_pictures import Pictures
 from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
 from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
 from pcdata.io.sources.listed import checked_folder
-from pcdata.io.sources.listing import LinkTargets, is_file, link_targets
+from pcdata.io.sources.listing import LinkTargets, has_file, is_file, link_targets
 from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole, check_switch
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
@@ -284,6 +285,8 @@ class _LeRobotSource(Source):
         return self._signals_of(episode, step, self._row(episode, step, columns))
 
     def _read_episodes(self) -> list[Episode]:
+        if has_file(self.path / EPISODES):  # what is said beside a capture goes before what it says
+            return super()._read_episodes()
         found, first = [], 0
         times = self._own_times()
         names = self._column_names()
