@@ -45,6 +45,7 @@ cloud:
 SIZE = (60, 80)  # pixels of each camera
 WITHIN = 0.03  # metres
 TRIALS = 10
+TRIED_AFTER = (1, 2, 3, 5, 10, 15)  # epochs, besides none and all
 MOST_STEPS = 40
 UNSEEN = 10_000  # the first seed of the trials
 WAYS = {"actions move with the cloud": True, "actions are left out": False}
@@ -92,9 +93,9 @@ class Run:
     """One training: what was learned, and the share of trials that succeeded as it went on."""
 
     policy: Policy
-    epochs: list[int]
-    success: list[float]
-    error: list[float]  # metres, of the targets in training
+    epochs: list[int]  # after how many it was tried
+    success: list[float]  # then
+    error: list[float]  # metres, of the targets in every epoch of training
 
 
 def loss_of(said: Tensor, action: Tensor) -> Tensor:
@@ -103,9 +104,7 @@ def loss_of(said: Tensor, action: Tensor) -> Tensor:
     return place + nn.functional.binary_cross_entropy_with_logits(said[:, 3], action[:, 3])
 
 
-def train(
-    windows: EpisodeWindows, *, moved: bool, epochs: int, every: int, seed: int, trials: int, size: tuple[int, int]
-) -> Run:
+def train(windows: EpisodeWindows, *, moved: bool, epochs: int, seed: int, trials: int, size: tuple[int, int]) -> Run:
     """Train on the windows; without ``moved`` the actions are those recorded, whatever was done to the clouds."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -116,7 +115,7 @@ def train(
     optimizer = torch.optim.Adam(groups)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)
     loader = DataLoader(windows, batch_size=16, shuffle=True, collate_fn=collate_windows, generator=seeded(seed))
-    run = Run(policy, [], [], [])
+    run = Run(policy, [0], [success(policy, trials, size)], [])
     for epoch in range(epochs):
         windows.set_epoch(epoch + 1000 * seed)
         errors = []
@@ -130,10 +129,10 @@ def train(
             optimizer.step()
             errors.append((said[:, :3] - action[:, :3]).norm(dim=-1).detach())
         schedule.step()
-        if (epoch + 1) % every == 0:
+        run.error.append(round(float(torch.cat(errors).mean()), 4))
+        if epoch + 1 in TRIED_AFTER or epoch + 1 == epochs:
             run.epochs.append(epoch + 1)
             run.success.append(success(policy, trials, size))
-            run.error.append(round(float(torch.cat(errors).mean()), 4))
     return run
 
 
@@ -181,28 +180,37 @@ def demonstrations(episodes: int, size: tuple[int, int]) -> EpisodeWindows:
 
 
 def draw(rows: dict[str, Any], path: Path) -> None:
-    """Draw the mean curve of every training, and around it the range of its seeds."""
+    """Draw the mean curves of every training, and around them the range of its seeds."""
     require_extra("matplotlib")
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
-    axes = figure.add_subplot()
+    def curve(axes: Axes, epochs: list[int], seeds: list[list[float]], scale: float, label: str) -> None:
+        values = scale * torch.tensor(seeds)
+        (line,) = axes.plot(epochs, values.mean(dim=0).tolist(), label=label)
+        low, high = values.amin(dim=0).tolist(), values.amax(dim=0).tolist()
+        axes.fill_between(epochs, low, high, color=line.get_color(), alpha=0.2)
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    arrived, error = figure.subplots(1, 2)
     for name, row in rows.items():
-        percent = 100 * torch.tensor(row["success"])
-        (line,) = axes.plot(row["epochs"], percent.mean(dim=0).tolist(), label=name)
-        low, high = percent.amin(dim=0).tolist(), percent.amax(dim=0).tolist()
-        axes.fill_between(row["epochs"], low, high, color=line.get_color(), alpha=0.2)
-    axes.set(xlabel="epoch", ylabel="trials in which the cube arrives, %", ylim=(0, 102))
-    axes.grid(alpha=0.3)
-    axes.legend()
+        curve(arrived, row["epochs"], row["success"], 100, name)
+        errors = row["training_error_metres"]
+        curve(error, list(range(1, len(errors[0]) + 1)), errors, 1000, name)
+    arrived.set(xlabel="epochs of training", ylabel="trials in which the cube arrives, %", ylim=(-3, 103))
+    error.set(xlabel="epoch", ylabel="error of the targets in training, mm", yscale="log")
+    for axes in (arrived, error):
+        axes.grid(alpha=0.3)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    arrived.legend(loc="center right")
     figure.savefig(path, dpi=110)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--episodes", type=int, default=30)
-    parser.add_argument("--epochs", type=int, default=10)
-    parser.add_argument("--every", type=int, default=2)
+    parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--trials", type=int, default=TRIALS)
     arguments = parser.parse_args()
@@ -213,8 +221,7 @@ def main() -> None:
     for name, moved in WAYS.items():
         begun = time.process_time()
         runs = [
-            train(windows, moved=moved, epochs=arguments.epochs, every=arguments.every, seed=seed,
-                  trials=arguments.trials, size=SIZE)
+            train(windows, moved=moved, epochs=arguments.epochs, seed=seed, trials=arguments.trials, size=SIZE)
             for seed in range(arguments.seeds)
         ]  # fmt: skip
         seconds = (time.process_time() - begun) / arguments.seeds

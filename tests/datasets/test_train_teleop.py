@@ -31,7 +31,8 @@ def test_actions_that_move_point_at_the_cube_of_turned_clouds_and_recorded_ones_
 def test_a_policy_is_trained_and_tried(script, monkeypatch):
     monkeypatch.setattr(script, "MOST_STEPS", 2)
     windows = script.demonstrations(1, (24, 32))
-    run = script.train(windows, moved=True, epochs=1, every=1, seed=0, trials=1, size=(24, 32))
-    assert run.epochs == [1]
-    assert 0.0 <= run.success[0] <= 1.0
+    run = script.train(windows, moved=True, epochs=1, seed=0, trials=1, size=(24, 32))
+    assert run.epochs == [0, 1]
+    assert all(0.0 <= share <= 1.0 for share in run.success)
+    assert len(run.error) == 1
     assert torch.isfinite(torch.tensor(run.error)).all()
