@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from pcdata.report.inspection_text import size_in_words
 from pcdata.report.plain_table import text_table
 
 _MOST_FILES = 10_000  # that are counted
+_WIDTH = 110  # characters of a line
 _TRIED = 20  # images, of which the first that can be depth is told
 _FLAG = re.compile(r"\((--[a-z][a-z-]*[^()]*)\)")  # how messages name the option that helps
 
@@ -63,7 +65,8 @@ def unopened_text(facts: Mapping[str, Any], words: Sequence[str]) -> str:
     rows += [["contents" * (not number), line] for number, line in enumerate(facts["contents"])]
     if depth := facts.get("depth"):
         rows.append(["depth", f"{depth['file']}: {depth['width']}x{depth['height']} {depth['dtype']}, {depth['told']}"])
-    rows.append(["not opened", facts["refused"].splitlines()[0]])
+    why = textwrap.wrap(facts["refused"].splitlines()[0], _WIDTH, break_long_words=False, break_on_hyphens=False)
+    rows += [["not opened" * (not number), line] for number, line in enumerate(why)]
     # An image needs both of these; of other options that a message names, one helps.
     needed = [option for option in facts["options"] if option.startswith(("--intrinsics", "--metres-per-unit"))]
     commands = [" ".join(needed)] if needed else facts["options"]

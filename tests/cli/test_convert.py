@@ -11,12 +11,13 @@ import torch
 
 from pcdata import open_source
 from pcdata.cli.main import main
-from pcdata.io import convert
-from pcdata.structures import Signal
+from pcdata.errors import CaptureError
+from pcdata.io import convert, write_ply
+from pcdata.structures import PointCloud, Signal
 from pcdata.synthetic import TeleopSource
 from tests.exports.samples import tree
 from tests.factories import base_from_camera
-from tests.io.writers.made_captures import cut_to_episodes, made_captures
+from tests.io.writers.made_captures import cut_to_episodes, made_captures, made_frame
 
 
 @pytest.fixture
@@ -133,3 +134,26 @@ def test_simulated_demonstrations_come_back_as_they_are(tmp_path):
         assert torch.equal(read.depth, made.depth)
         assert torch.equal(read.labels, made.labels)
         assert all(read.recorded_signals[key].same_bits(one) for key, one in made.recorded_signals.items())
+
+
+def test_what_lies_in_the_captures_and_is_not_read_is_told(capture, tmp_path, capsys):
+    (capture / "thermal").mkdir()
+    (capture / "thermal" / "0.png").touch()
+    assert main(["convert", str(capture), "--to", "folder", "--out", str(tmp_path / "out")]) == 0
+    assert "not read thermal/" in capsys.readouterr().out
+
+
+def test_a_capture_that_does_not_fit_the_others_is_named(tmp_path, capsys):
+    made = made_captures(4)
+    made.episodes = []
+    made.frames["002"] = made_frame(2, colors=None)
+    with pytest.raises(CaptureError, match="lacks what those before it have: colors") as e:
+        convert(made, "folder", tmp_path / "out")
+    assert e.value.sample_id == "002"
+    assert not (tmp_path / "out").exists()
+
+
+def test_clouds_are_no_captures_to_write(tmp_path, capsys):
+    write_ply(tmp_path / "a.ply", PointCloud(points=torch.rand(9, 3), frame_id="camera"))
+    assert main(["convert", str(tmp_path / "a.ply"), "--to", "folder", "--out", str(tmp_path / "out")]) == 2
+    assert "no depth image but a PointCloud" in capsys.readouterr().err

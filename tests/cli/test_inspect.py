@@ -112,3 +112,43 @@ def test_json_of_captures_that_are_not_opened_says_why(capsys, tmp_path):
     assert (code, facts["layout"], facts["files"]) == (1, ["pairs"], {".npy": 1})
     assert facts["refused"].startswith("IntrinsicsError")
     assert facts["options"] == ["--intrinsics FX FY CX CY", "--metres-per-unit 0.001"]
+
+
+def test_a_recording_that_is_not_opened_is_told_by_its_topics(capsys, tmp_path):
+    recordings = pytest.importorskip("tests.ros_recordings")
+    make = recordings.Types(2)
+    entries = [entry for entry in recordings.recording(make) if not entry[0].endswith("camera_info")]
+    recordings.written(tmp_path / "take.mcap", entries, make)
+    code, out, _ = inspected(capsys, tmp_path / "take.mcap")
+    assert code == 1
+    assert "contents  " in out
+    assert "/joint_states (sensor_msgs/msg/JointState, 20 messages, 100 Hz)" in out
+    assert out.splitlines()[-1].endswith("take.mcap --intrinsics FX FY CX CY")
+    followed = ["--intrinsics", "20", "21", "8", "6"]
+    code, out, _ = inspected(capsys, tmp_path / "take.mcap", *followed)
+    assert code == 0
+    (joints,) = [line.split() for line in out.splitlines() if line.startswith("/joint_states")]
+    assert joints == [
+        "/joint_states",
+        "signal",
+        "joint_states/position",
+        "100",
+        "20",
+        "linear",
+        "13",
+        "0",
+        "3",
+        "0",
+        "0.01",
+        "s",
+    ]
+
+
+def test_a_lerobot_dataset_that_is_not_opened_is_told_by_its_features(capsys, tmp_path):
+    pytest.importorskip("pyarrow")
+    convert(cut_to_episodes(made_captures()), "lerobot", tmp_path / "set", color="image", fps=10)
+    (tmp_path / "set" / "meta" / "pcdata.json").unlink()
+    code, out, _ = inspected(capsys, tmp_path / "set")
+    assert code == 1
+    assert "observation.joints: float64 [7]" in out
+    assert "not opened  " in out

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.contracts.lengths import check_metres_per_unit, ways
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, UnitError, near_matches
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, near_matches
 from pcdata.files.handles import Handles
 from pcdata.files.sample_names import check_known, name_some
 from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
@@ -246,6 +246,22 @@ class _LeRobotSource(Source):
         return found
 
     # -- what a sample is ------------------------------------------------------------------------------------------
+
+    @classmethod
+    def glance(cls, path: Path) -> list[str]:
+        """Name the features, as ``meta/info.json`` has them."""
+        try:
+            info = read_json(f"{cls.kind} source {path}", path, INFO, [path]) or {}
+        except PcdataError:
+            return []
+        features = info.get("features")
+        if not isinstance(features, dict):
+            return []
+        return [
+            f"{name}: {one.get('dtype')!s:.40} {one.get('shape')!s:.60}"
+            for name, one in features.items()
+            if isinstance(one, dict)
+        ]
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files that a sample is in, with others: that of its rows, and those of its pictures."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, ConfigError
+from pcdata.errors import CaptureError, ConfigError, PcdataError
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, in_order, name_some
-from pcdata.io.messages.camera_streams import Choice, image_topics
+from pcdata.io.messages.camera_streams import Choice, image_topics, told
 from pcdata.io.messages.clock import CLOCKS, Clock
 from pcdata.io.messages.cloud_recording import CloudRecording, cloud_topics
 from pcdata.io.messages.joined_recording import JoinedRecording, Joining
@@ -168,6 +168,18 @@ class _RosSource(Source):
             return container_of(path) is not None and not is_realsense(path)
         except CaptureError:
             return False
+
+    @classmethod
+    def glance(cls, path: Path) -> list[str]:
+        """Name the topics of the recording; of several, those of the first."""
+        where = f"{cls.kind} source {path}"
+        try:
+            parts = _parts(where, absolute(path), ())
+            log = opened_log(where, next(iter(parts.values())))
+        except PcdataError:
+            return []
+        first = [f"{len(parts)} recordings; the topics of {next(iter(parts))}:"] if len(parts) > 1 else []
+        return [*first, *(told(topic) for topic in log.topics.values())]
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the file of messages, or the first of them, which hold every sample."""
