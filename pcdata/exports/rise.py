@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -264,7 +265,14 @@ def _stamps(episode: Episode) -> list[int]:
 
 
 def _write_mapping(path: Path, arrays: Mapping[str, NDArray[np.float64]]) -> None:
-    """Write names and arrays as the loader reads them, which is a pickled dict: nothing here reads such a file."""
+    """Write names and arrays as the loader reads them, which is a pickled dict: nothing here reads such a file.
+
+    From version 2 on NumPy pickles arrays by a name that the versions which RISE was written for do not have; both know
+    the old one. In protocol 3 a name is a line of text, so it is put in place of the other.
+    """
+    content = np.array(dict(arrays), dtype=object)
+    pickled = pickle.dumps(content, protocol=3).replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
     packed = io.BytesIO()
-    np.save(packed, np.array(dict(arrays), dtype=object), allow_pickle=True)
+    np.lib.format.write_array_header_1_0(packed, np.lib.format.header_data_from_array_1_0(content))
+    packed.write(pickled)
     path.write_bytes(packed.getbuffer())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickletools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,3 +160,19 @@ def test_a_continued_export_keeps_finished_episodes(tmp_path):
         export_dataset(source, "rise", tmp_path / "out", resume=True)
     report = export_dataset(Recording((2, 2)), "rise", tmp_path / "out", resume=True)
     assert (report.kept, report.written) == (2, 2)
+
+
+def test_the_calibration_opens_in_the_numpy_that_the_loader_was_written_for(tmp_path):
+    """numpy._core came with NumPy 2: RISE's own environment cannot import it, and both know numpy.core.multiarray."""
+    export_dataset(Recording((2,)), "rise", tmp_path / "out")
+    (calibration,) = (tmp_path / "out/calib").iterdir()
+    for name, shape in (("extrinsics", (1, 4, 4)), ("intrinsics", (3, 4))):
+        written = (calibration / f"{name}.npy").read_bytes()
+        header, pickled = written[:128], written[128:]
+        assert header.endswith(b"\n")
+        named = {text for code, text, _ in pickletools.genops(pickled) if code.name == "GLOBAL"}
+        assert "numpy.core.multiarray _reconstruct" in named
+        assert not any(text.startswith("numpy._core") for text in named)
+        matrices = np.load(calibration / f"{name}.npy", allow_pickle=True).item()
+        assert matrices[CAMERA].shape == shape
+        assert matrices[CAMERA].dtype == np.float64
