@@ -46,7 +46,8 @@ DP3_SIM = ModelContract(
     checked=(
         "YanjieZe/3D-Diffusion-Policy e65e2ae common/replay_buffer.py, common/sampler.py, dataset/adroit_dataset.py, "
         "model/common/normalizer.py: the exported zarr ran through them with zarr 2.12.0, into memory and from "
-        "disk; sequences of 16 steps, normalized to [-1, 1].",
+        "disk; every sequence of 16, 4 and 1 steps equals what pcdata holds and its EpisodeWindows give, normalized to "
+        "[-1, 1].",
         "YanjieZe/3D-Diffusion-Policy e65e2ae gym_util/mjpc_wrapper.py: open box, farthest points on xyz, zero rows. "
         "a406207 model/vision/pointnet_extractor.py: the forward pass of PointNetEncoderXYZ and PointNetEncoderXYZRGB "
         "takes the preset's columns as they are.",
@@ -103,7 +104,8 @@ DEXART = replace(
     checked=(
         "YanjieZe/3D-Diffusion-Policy e65e2ae dataset/dexart_dataset.py, env/dexart/dexart_wrapper.py, "
         "config/task/dexart_laptop.yaml: (T, 1024, 3) and (T, 96, 7), create_identity() for both; farthest points only "
-        "where the simulator gives more than 1024. a406207 model/vision/pointnet_extractor.py: the forward pass takes "
+        "where the simulator gives more than 1024. The exported zarr ran through DexArtDataset: every sequence is what "
+        "pcdata holds, and the cloud is not scaled. a406207 model/vision/pointnet_extractor.py: the forward pass takes "
         "the preset's batch.",
         "Kami-code/dexart-release 2c14d45 dexart/env/rl_env/pc_processing.py: world coordinates, an open box, a random "
         "draw, short clouds filled up with the first point inside.",
@@ -134,7 +136,8 @@ MANIFLOW = replace(
     checked=(
         "pummmmpkin/ManiFlow_Policy eb37c38 ManiFlow/maniflow/dataset/robotwin_dataset.py, "
         "ManiFlow/maniflow/config/robotwin_task/block_hammer_beat_pointcloud.yaml: point_cloud (1024, 6), state, "
-        "action, no img; normalized by the extremes of the data set. Read, not run.",
+        "action, no img; normalized by the extremes of the data set. The exported zarr ran through it, with its change "
+        "of colors too: every sequence is what pcdata holds.",
         "RoboTwin-Platform/RoboTwin 2701a07 envs/camera/camera.py: world coordinates, a closed box, colors in [0, 1], "
         "zero rows, farthest points on xyz.",
     ),
@@ -160,6 +163,12 @@ DEMOGEN = replace(
         "Its real recorder draws 5,000 points, drops what DBSCAN (12 mm, 10 points) leaves in clusters of fewer than "
         "50, then takes 1024 farthest points; the preset takes the farthest points of the crop: put RemoveOutliers "
         "before them for a noisy camera.",
+        "The generator takes the action of a step for the motion that led to it: its home is state[0] - action[0]. "
+        "With actions that follow their step, as policies learn them, the hand of a generated episode ends beside the "
+        "moved object by what the first and the last step of the approach differ (3.3 mm in a simulated set, at most "
+        "one step); with those that led to it, at it to rounding. Give the generator the latter.",
+        "Which points are the object it finds by masks of its authors' own camera: intrinsics and pose are constants "
+        "in demo_generation/mask_util.py, for images of 1920x1080.",
         "The generator reads state, action and point_cloud; the policies for robosuite and MetaWorld read agent_pos "
         "instead of state.",
         'Columns beside x, y, z are copied as they are; the policies take three. channels=["xyz", "rgb_255"] makes '
@@ -169,8 +178,10 @@ DEMOGEN = replace(
     "sink, and the generated actions reach beside them.",
     checked=(
         "TEA-Lab/DemoGen 06faf73 demo_generation/demo_generation/demogen.py, "
-        "diffusion_policies/diffusion_policies/env/metaworld/metaworld_wrapper.py: keys and motions; 512 farthest "
-        "points of a closed box in the world. Read, not run.",
+        "demo_generation/demo_generation/mask_util.py: the exported zarr ran through the generator for tasks of one "
+        "object: it reads what pcdata holds, and all points of the object are moved.",
+        "TEA-Lab/DemoGen 06faf73 diffusion_policies/diffusion_policies/env/metaworld/metaworld_wrapper.py: 512 "
+        "farthest points of a closed box in the world. Read, not run.",
         "TRAIL-rcvlab/DemoGen 89c6ae3 real_world/utils/pcd_process.py: robot base, an open box, clusters, 1024 "
         "farthest points. The loader of robosuite data was read without its commit: agent_pos, action and point_cloud "
         "(T, 1024, 3).",
@@ -233,7 +244,9 @@ IDP3 = ModelContract(
     checked=(
         "YanjieZe/Improved-3D-Diffusion-Policy 3216526 common/multi_realsense.py, dataset/gr1_dex_dataset_3d.py, "
         "model/vision_3d/point_process.py, deploy.py: the first point of each 5 mm cell, drawn with replacement or "
-        "filled up with zeros, no normalization. Not run: it records from a camera.",
+        "filled up with zeros, no normalization. The exported zarr ran through GR1DexDataset3D with 4096, 10,000 and "
+        "12,000 points: states and actions are what pcdata holds, points are drawn among the stored ones. "
+        "multi_realsense.py was not run: it records from a camera.",
         "YanjieZe/Improved-3D-Diffusion-Policy 3216526 model/vision_3d/multi_stage_pointnet.py, "
         "model/vision_3d/pointnet_extractor.py: conv_in has three channels; the forward pass of the encoder takes the "
         "preset's batch and draws 4096 of its rows.",
