@@ -163,6 +163,8 @@ def _missing(first: DepthFrame | PointCloud, facts: Mapping[str, Any]) -> list[s
 def _bytes(source: CaptureSource) -> int | None:
     """Return the size of all files that captures are read from; None where there are none, or too many to ask."""
     found: set[Path] = set()
+    if len(source) > _MOST_FILES:
+        return None
     for sample_id in source.ids:
         for stored, own in stored_captures(source, sample_id):
             found.update(stored.files(own).values())
