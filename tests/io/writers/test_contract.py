@@ -20,6 +20,7 @@ from pcdata.structures import DepthFrame
 from tests.disk_limits import largest_file
 from tests.exports.samples import tree
 from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
+from tests.warm import run_python
 
 OPTIONS: dict[str, dict[str, Any]] = {"lerobot": {"color": "image", "fps": 10}}  # what loses least, by writer
 IMAGES = {"color": "colors", "labels": "labels", "mask": "mask", "confidence": "confidence"}
@@ -131,6 +132,27 @@ def test_an_interrupted_writer_leaves_nothing(kind: str, tmp_path: Path) -> None
     with pytest.raises(KeyboardInterrupt):
         convert(cut_to_episodes(made_captures()), kind, tmp_path / "out", progress=interrupt)
     assert tree(tmp_path) == {}
+
+
+KILLED = """
+import os, signal, sys
+from pcdata.io import convert
+from tests.io.writers.made_captures import cut_to_episodes, made_captures
+convert(
+    cut_to_episodes(made_captures()), sys.argv[1], sys.argv[2],
+    progress=lambda done, *_: os.kill(os.getpid(), signal.SIGKILL) if done == 2 else None,
+)
+"""
+
+
+def test_what_a_killed_writer_left_is_no_capture_and_goes_with_the_next(kind: str, tmp_path: Path) -> None:
+    done = run_python(KILLED, kind, str(tmp_path / "out"), folder=Path(__file__).parents[3])
+    assert done.returncode != 0
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".")
+    report = convert(cut_to_episodes(made_captures()), kind, tmp_path / "out", **OPTIONS.get(kind, {}))
+    assert any(left.name in note for note in report.notes)
+    assert [one.name for one in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_capture_that_cannot_be_read_stops_the_writer_and_leaves_nothing(kind: str, tmp_path: Path) -> None:
