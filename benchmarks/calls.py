@@ -73,7 +73,7 @@ def points_path() -> Callable[[], Any]:
 
     def run() -> None:
         capture = pcdata.DepthFrame.from_numpy(
-            depth, intrinsics, metres_per_unit=0.001, color=color, world_from_camera=pose, frame_id=frame
+            depth, intrinsics, metres_per_unit=0.001, colors=color, world_from_camera=pose, frame_id=frame
         )
         assert chain(capture).num_points == 1024
 

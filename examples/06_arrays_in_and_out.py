@@ -12,7 +12,7 @@ from pcdata.errors import UnitError
 depth = np.full((120, 160), 800, np.uint16)
 depth[40:80, 60:100] = 600  # a box before it
 intrinsics = np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]])
-color = np.full((120, 160, 3), 128, np.uint8)
+colors = np.full((120, 160, 3), 128, np.uint8)
 pose = np.array([[0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]], float)  # base_from_camera
 
 try:
@@ -21,7 +21,7 @@ except UnitError as error:
     print("whole numbers have no unit of their own:", error)
 
 frame = pcdata.DepthFrame.from_numpy(
-    depth, intrinsics, metres_per_unit=0.001, color=color, world_from_camera=pose, frame_id="base"
+    depth, intrinsics, metres_per_unit=0.001, colors=colors, world_from_camera=pose, frame_id="base"
 )
 chain = pcdata.Compose([pcdata.Deproject(), pcdata.ToFrame(frame="base"), pcdata.FarthestPointSample(num_points=1024)])
 cloud = chain(frame)

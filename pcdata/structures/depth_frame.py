@@ -125,7 +125,7 @@ class DepthFrame(Structure):
         intrinsics: ArrayLike | Camera,  # (3, 3) or (V, 3, 3) pixels of this very image size; or the cameras
         *,
         metres_per_unit: float | None = None,  # of depth, e.g. 0.001 for millimetres; None = floats are metres
-        color: ArrayLike | None = None,  # (H, W, 3) or (V, H, W, 3) uint8 RGB at the depth's pixels
+        colors: ArrayLike | None = None,  # (H, W, 3) or (V, H, W, 3) uint8 RGB at the depth's pixels
         world_from_camera: ArrayLike | None = None,  # (4, 4) or (V, 4, 4) rigid
         frame_id: str | None = None,  # the frame that world_from_camera leads to, e.g. "base"
         distortion: ArrayLike | None = None,  # (D,) or (V, D), in OpenCV's order
@@ -141,8 +141,8 @@ class DepthFrame(Structure):
 
         All arrays are copied: the driver may use its buffers again. Depth becomes the metres that reading it from a
         file would give; NaN and infinite depth means "no reading". What arrays cannot show must be right: depth is z
-        along the optical axis, not the length of the ray; color is RGB (OpenCV's is BGR: ``color[..., ::-1]``); camera
-        axes are OpenCV's, x right, y down, z forward (of OpenGL's poses, ``pose @ np.diag([1, -1, -1, 1])``).
+        along the optical axis, not the length of the ray; colors are RGB (OpenCV's are BGR: ``colors[..., ::-1]``);
+        camera axes are OpenCV's, x right, y down, z forward (of OpenGL's poses, ``pose @ np.diag([1, -1, -1, 1])``).
 
         Signals are what belongs to the moment: ``{"joints": (q, "invariant"), "eef": (pose, "pose xyz_quat_xyzw",
         "base"), "task": ("pick the cube", "text")}``, q (7,) or with a horizon (H, 7); see docs/signals.md.
@@ -170,7 +170,7 @@ class DepthFrame(Structure):
         frame = cls(
             depth=torch.from_numpy(depth_in_metres(where, stored, metres_per_unit, invalid_values)),
             camera=camera_of(where, intrinsics, distortion, views, (size[0], size[1])),
-            colors=image_tensor(where, "color", color, stored.shape, dtypes=("uint8",), channels=(3,)),
+            colors=image_tensor(where, "colors", colors, stored.shape, dtypes=("uint8",), channels=(3,)),
             labels=image_tensor(where, "labels", labels, stored.shape, dtypes=_INTEGERS),
             confidence=image_tensor(where, "confidence", confidence, stored.shape, dtypes=("uint8",)),
             mask=image_tensor(where, "mask", mask, stored.shape, dtypes=("bool",)),

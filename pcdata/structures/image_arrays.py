@@ -44,7 +44,7 @@ def image_tensor(
 
 
 _CONVERT = {
-    "color": "8-bit RGB: (color * 255).round().astype(np.uint8) where it is 0..1",
+    "colors": "8-bit RGB: (colors * 255).round().astype(np.uint8) where it is 0..1",
     "labels": "whole numbers, -1 = none: convert it",
     "confidence": "values of Confidence, 0 to 3: translate the sensor's own",
     "mask": "give mask > 0",
@@ -53,15 +53,15 @@ _CONVERT = {
 
 def _way_out(name: str, given: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     height, width = wanted[1:3]
-    if name != "color":
+    if name != "colors":
         return "give it at the depth's pixels"
     if given[-3:] == (3, height, width):
-        return "channels come last: np.moveaxis(color, -3, -1)"
+        return "channels come last: np.moveaxis(colors, -3, -1)"
     if given[-3:] == (height, width, 4):
-        return "drop the alpha channel: color[..., :3]"
+        return "drop the alpha channel: colors[..., :3]"
     if given[-2:] == (height, width):
         return "a gray image has no colors: leave it out"
-    return "color is RGB at the depth's pixels: let the camera's driver align it to the depth, or leave it out"
+    return "colors are RGB at the depth's pixels: let the camera's driver align them to the depth, or leave them out"
 
 
 def camera_of(

@@ -87,7 +87,7 @@ def test_m2t2_takes_the_mean_of_what_lies_inside_the_scene_bounds(test_data: Pat
     low, high = meta["scene_bounds"][:3], meta["scene_bounds"][3:]
     mean = world[((world > low) & (world < high)).all(1)].mean(0)
     frame = DepthFrame.from_numpy(
-        depth, k, color=np.zeros((*depth.shape, 3), np.uint8), world_from_camera=pose, frame_id="base"
+        depth, k, colors=np.zeros((*depth.shape, 3), np.uint8), world_from_camera=pose, frame_id="base"
     )
     made = preset("m2t2", frame="base", crop=(tuple(low), tuple(high)))
     batch = made.collate([made.pipeline(frame, generator=seeded(0))])

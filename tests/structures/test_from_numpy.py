@@ -38,7 +38,7 @@ def frame_of(depth=DEPTH, intrinsics=K, **given) -> DepthFrame:
 
 
 def test_a_capture_of_arrays_is_the_one_that_its_files_hold(tmp_path):
-    frame = frame_of(color=COLOR, world_from_camera=POSE, frame_id="base")
+    frame = frame_of(colors=COLOR, world_from_camera=POSE, frame_id="base")
     assert (frame.num_views, frame.size, frame.frame_id) == (1, SIZE, "base")
     assert frame.depth[0, 0, 0] == np.float32(0.5)
     write_capture(frame, str(tmp_path / "capture"))
@@ -55,7 +55,7 @@ def test_a_frames_own_arrays_make_the_frame_again():
     again = DepthFrame.from_numpy(
         frame.depth.numpy(),
         frame.camera.intrinsics.numpy(),
-        color=frame.colors.numpy(),
+        colors=frame.colors.numpy(),
         labels=frame.labels.numpy().astype(np.int16),
         world_from_camera=frame.world_from_camera.numpy(),
         frame_id=frame.frame_id,
@@ -66,7 +66,7 @@ def test_a_frames_own_arrays_make_the_frame_again():
 def test_arrays_are_copied_whatever_their_strides_and_writability():
     depth, bgr = DEPTH.astype(np.float32) / 1000, COLOR[..., ::-1]
     depth.flags.writeable = False
-    frame = DepthFrame.from_numpy(depth, K, color=bgr[..., ::-1])
+    frame = DepthFrame.from_numpy(depth, K, colors=bgr[..., ::-1])
     assert not np.shares_memory(frame.depth.numpy(), depth)
     assert not np.shares_memory(frame.colors.numpy(), COLOR)
     assert torch.equal(frame.colors[0], torch.from_numpy(COLOR))
@@ -90,7 +90,7 @@ def test_a_mark_that_becomes_points_is_told():
 
 
 def test_one_matrix_counts_for_all_views_of_one_camera():
-    frame = frame_of(np.stack([DEPTH, DEPTH]), K, color=np.stack([COLOR, COLOR]), distortion=[0.1, 0, 0, 0])
+    frame = frame_of(np.stack([DEPTH, DEPTH]), K, colors=np.stack([COLOR, COLOR]), distortion=[0.1, 0, 0, 0])
     assert frame.camera.intrinsics.shape == (2, 3, 3)
     assert frame.camera.distortion.shape == (2, 4)
 
@@ -119,11 +119,11 @@ LARGE = Camera.pinhole(fx=60.0, fy=62.0, cx=31.5, cy=23.5, size=(48, 64))
         ({"intrinsics": K.T}, IntrinsicsError, "must be"),
         ({"intrinsics": np.hstack([K, K[:, :1]])}, ShapeError, "projection matrix"),
         ({"intrinsics": [30.0, 31.0, 15.5, 11.5]}, ShapeError, "Camera.pinhole"),
-        ({"color": np.moveaxis(COLOR, -1, 0)}, ShapeError, "channels come last"),
-        ({"color": np.dstack([COLOR, COLOR[..., :1]])}, ShapeError, "alpha"),
-        ({"color": COLOR[..., 0]}, ShapeError, "gray"),
-        ({"color": COLOR[::2, ::2]}, ShapeError, "at the depth's pixels"),
-        ({"color": COLOR / 255.0}, DTypeError, "8-bit RGB"),
+        ({"colors": np.moveaxis(COLOR, -1, 0)}, ShapeError, "channels come last"),
+        ({"colors": np.dstack([COLOR, COLOR[..., :1]])}, ShapeError, "alpha"),
+        ({"colors": COLOR[..., 0]}, ShapeError, "gray"),
+        ({"colors": COLOR[::2, ::2]}, ShapeError, "at the depth's pixels"),
+        ({"colors": COLOR / 255.0}, DTypeError, "8-bit RGB"),
         ({"labels": DEPTH / 1.0}, DTypeError, "whole numbers"),
         ({"mask": COLOR[..., 0]}, DTypeError, "mask > 0"),
         ({"confidence": COLOR[..., 0].astype(np.float32)}, DTypeError, "Confidence"),
