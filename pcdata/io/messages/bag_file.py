@@ -9,17 +9,15 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import BinaryIO
 
 import numpy as np
 
 from pcdata.errors import CaptureError
-from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.io.messages.fields import Fields
 from pcdata.io.messages.log_file import MAX_MESSAGE, Index, LogFile, Place, Read, by_topic
 from pcdata.io.messages.mcap_file import type_name
-from pcdata.io.messages.packing import check_packing, unpacked
+from pcdata.io.messages.packing import UNPACKED, check_packing, unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MAX_HEADER = 1 << 20  # bytes of names and values before a record's data
@@ -62,19 +60,16 @@ class BagFile(LogFile):
                     if length > MAX_MESSAGE:
                         raise CaptureError(f"{self.path}: a message claims {length} bytes, the limit is {MAX_MESSAGE}")
                     return stream.read(length if most is None else min(most, length))
-                chunk = Fields(_chunk(str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start), offset)
+                key = (str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start)
+                content = UNPACKED.get(key, lambda: _unpacked_chunk(stream, _Record(stream, start, size).check(_CHUNK)))
+                chunk = Fields(content, offset)
                 header_fields(chunk.take(chunk.number("I")), _MESSAGE)
                 length = chunk.number("I")
+                if length > chunk.left:
+                    raise CaptureError(f"{self.path}: a message leads out of its chunk at byte {start}; it is damaged")
                 return chunk.take(length if most is None else min(most, length))
 
             yield read
-
-
-@lru_cache(maxsize=2)  # the images of one moment lie in one chunk, or two
-def _chunk(path: str, changed: int, start: int) -> bytes:
-    """Return the unpacked records of the chunk at a byte of a file that was changed at a time."""
-    with open_input("ROS 1 bag", path, max_bytes=MAX_STREAMED_BYTES) as stream:
-        return _unpacked_chunk(stream, _Record(stream, start, os.fstat(stream.fileno()).st_size).check(_CHUNK))
 
 
 def bag_topics(stream: BinaryIO, size: int) -> list[str]:

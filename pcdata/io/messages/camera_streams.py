@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note, near_matches
 from pcdata.io.messages.cameras import camera_of
-from pcdata.io.messages.clock import Clock, on_clock
+from pcdata.io.messages.clock import Clock
 from pcdata.io.messages.decoding import decoded, is_known, plain_type
 from pcdata.io.messages.images import ImageForm, form_of
 from pcdata.io.messages.log_file import Topic
@@ -45,7 +45,7 @@ class ImageTopic:
 
 @dataclass(frozen=True, eq=False)
 class CameraStream:
-    """One depth camera: its images on the clock, how they are measured, and its color.
+    """One depth camera: its images, how they are measured, and its color.
 
     Args:
         name: of the camera.
@@ -74,6 +74,22 @@ class CameraStream:
     others: Mapping[str, Topic]
     poses: Topic | None
     facts: Mapping[str, Any]
+
+    @property
+    def topics(self) -> list[Topic]:
+        """The topics whose times count."""
+        images = [self.images] if self.color is None else [self.images, self.color]
+        return [*(image.topic for image in images), *([self.infos] if self.infos else []), *self.others.values()]
+
+    def on(self, clocked: Mapping[Topic, Topic]) -> CameraStream:
+        """Return the camera with other times of its topics."""
+        return replace(
+            self,
+            images=replace(self.images, topic=clocked[self.images.topic]),
+            color=None if self.color is None else replace(self.color, topic=clocked[self.color.topic]),
+            infos=None if self.infos is None else clocked[self.infos],
+            others={role: clocked[topic] for role, topic in self.others.items()},
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,14 +247,10 @@ def _stream(
             raise IntrinsicsError(
                 f"{where}: the color camera of {color_infos.name} changes; it cannot be registered to"
             )
-        color = _clocked(log, color, choice.clock)
-    elif color is not None:
-        color = _clocked(log, color, choice.clock)
-    told_topics = {role: log.topics.get(f"/{own}/{role}/image_raw") for role in ROLES if facts}
-    others = {role: on_clock(log, topic, choice.clock) for role, topic in told_topics.items() if topic is not None}
+    others = {role: log.topics.get(f"/{own}/{role}/image_raw") for role in ROLES if facts}
     return CameraStream(
         str(facts.get("name", name)),
-        _clocked(log, image, choice.clock),
+        image,
         unit,
         float_unit,
         unit_source,
@@ -247,14 +259,10 @@ def _stream(
         rectified,
         color,
         color_camera,
-        {role: topic for role, topic in others.items() if len(topic)},
+        {role: topic for role, topic in others.items() if topic is not None and len(topic)},
         log.topics.get(f"/{own}/pose_matrix") if facts else None,
         facts,
     )
-
-
-def _clocked(log: MessageLog, image: ImageTopic, clock: Clock) -> ImageTopic:
-    return ImageTopic(on_clock(log, image.topic, clock), image.form, image.frame)
 
 
 def _pixels(image: ImageTopic) -> str:
@@ -300,7 +308,7 @@ def _described(
     if intrinsics is not None:
         fx, fy, cx, cy = intrinsics
         return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=size), None, False
-    topic = on_clock(log, _info_topic(where, log, choice, image), choice.clock)
+    topic = _info_topic(where, log, choice, image)
     told_by = f"{where}: {topic.name}"
     with log.opened() as read:
         first, last = (decoded(topic, read(topic, place)) for place in (0, len(topic) - 1))

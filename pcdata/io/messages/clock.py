@@ -1,38 +1,62 @@
-"""When a message was taken: the time in its header, or that of its recording."""
+"""When messages were taken: the times in their headers, or those of their recording."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
 from pcdata.io.messages.decoding import HEADED, decoded, plain_type, stamp, stamp_of
 from pcdata.io.messages.log_file import Topic
-from pcdata.io.messages.message_log import MessageLog
+from pcdata.io.messages.message_log import MessageLog, in_file_order
 
 Clock = Literal["header", "recorded"]
 CLOCKS = ("header", "recorded")
 _START = 32  # bytes of a message that hold its time
 
 
-def on_clock(log: MessageLog, topic: Topic, clock: Clock) -> Topic:
-    """Return a topic with the times of its messages on a clock, in their order.
+def on_clock(
+    log: MessageLog,
+    topics: Iterable[Topic],
+    clock: Clock,
+    takers: Mapping[Topic, Callable[[int, Any], None]] | None = None,
+) -> dict[Topic, Topic]:
+    """Return topics with the times of their messages on a clock, in their order; the files are read through once.
 
     Messages without a header, such as plain numbers and texts, have the time of recording alone.
+
+    Args:
+        log: the recording.
+        topics: of it, or parts of topics.
+        clock: that is wanted.
+        takers: by topic, what takes each of its messages and their numbers in the same pass, in the order of the file.
 
     Raises:
         CaptureError: headers hold no time, or a message is damaged.
     """
-    has_header = topic.type in HEADED or plain_type(topic.type).startswith("foxglove.")
-    if clock == "recorded" or not has_header or not len(topic):
-        return topic
-    times = np.empty(len(topic), np.int64)
+    found = {topic: topic for topic in topics}
+    headed = [topic for topic in found if clock == "header" and _has_header(topic) and len(topic)]
+    times = {topic: np.empty(len(topic), np.int64) for topic in headed}
+    takers = takers or {}
     with log.opened() as read:
-        for number in range(len(topic)):
-            time = stamp_of(topic, read(topic, number, _START))
-            times[number] = stamp(decoded(topic, read(topic, number))) if time is None else time
+        for topic, number in in_file_order([*headed, *takers]):
+            if topic in times:
+                time = stamp_of(topic, read(topic, number, _START))
+                times[topic][number] = stamp(decoded(topic, read(topic, number))) if time is None else time
+            if topic in takers:
+                takers[topic](number, decoded(topic, read(topic, number)))
+    return found | {topic: _timed(topic, own) for topic, own in times.items()}
+
+
+def _has_header(topic: Topic) -> bool:
+    return topic.type in HEADED or plain_type(topic.type).startswith("foxglove.")
+
+
+def _timed(topic: Topic, times: NDArray[np.int64]) -> Topic:
     if not times.any():
         raise CaptureError(
             f"topic {topic.name}: the headers of its messages hold no time; clock='recorded' (--clock recorded) "

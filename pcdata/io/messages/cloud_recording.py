@@ -36,7 +36,8 @@ class CloudRecording:
             raise ConfigError(f"{where}: there is no topic {name!r:.200}{near_matches(name, log.topics)}")
         if log.topics[name] not in cloud_topics(log):
             raise CaptureError(f"{where}: topic {told(log.topics[name])} has no clouds (PointCloud2)")
-        self._topic = on_clock(log, log.topics[name], clock)
+        topic = log.topics[name]
+        self._topic = on_clock(log, [topic], clock)[topic]
         self._metres_per_unit = metres_per_unit
         self.times = self._topic.times
         self.streams = [

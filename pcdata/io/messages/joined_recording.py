@@ -25,6 +25,7 @@ from pcdata.io.messages.camera_streams import (
     told,
 )
 from pcdata.io.messages.cameras import camera_of
+from pcdata.io.messages.clock import Clock, on_clock
 from pcdata.io.messages.decoding import decoded, plain_type
 from pcdata.io.messages.images import color_pixels, depth_numbers, plain_numbers
 from pcdata.io.messages.log_file import Topic
@@ -81,10 +82,10 @@ class JoinedRecording:
         self.cameras = chosen_cameras(where, log, images, self.said, choice)
         self.frame_id = joining.frame_id if joining.frame_id is not None else self.said.frame_id
         max_gap = joining.max_gap * 1e9
-        self.signals, left = chosen_signals(where, log, self.said, joining.signals, choice.clock, max_gap)
+        self.signals, left = chosen_signals(where, log, self.said, joining.signals, max_gap)
         self._check_sizes()
+        self._tree = self._read_times(log, choice.clock)
         self.times = self.cameras[0].images.topic.times  # (N,) int64 nanoseconds
-        self._tree = self._frames(log)
         self.skipped: dict[int, str] = {}
         self.streams: list[dict[str, Any]] = []
         self._joins: dict[str, Joined] = {}
@@ -183,7 +184,8 @@ class JoinedRecording:
         """Return the topic of the camera's poses, where the recording states those that are wanted."""
         return camera.poses if self.frame_id is not None and self.frame_id == self.said.frame_id else None
 
-    def _frames(self, log: MessageLog) -> FrameTree | None:
+    def _read_times(self, log: MessageLog, clock: Clock) -> FrameTree | None:
+        """Put all topics that are read on the clock, and return the tree of tf where it is needed: in one pass."""
         spatial = [one.name for one in self.signals if one.frame not in (None, "camera")]
         if self.frame_id is None and (spatial or self._joining.poses):
             name = next(iter(spatial or self._joining.poses))
@@ -192,16 +194,14 @@ class JoinedRecording:
                 "FRAME), where poses lead to"
             )
         ways = self._ways()
-        if not ways:
-            return None
         builder = TreeBuilder(self._where)
-        topics = [topic for topic in log.topics.values() if plain_type(topic.type) in _TF]
-        with log.opened() as read:
-            for topic in topics:
-                static = topic.name.rpartition("/")[2] == _STATIC
-                for number in range(len(topic)):
-                    builder.add(decoded(topic, read(topic, number)), static=static)
-        return builder.tree().only(ways)
+        frames = [topic for topic in log.topics.values() if plain_type(topic.type) in _TF] if ways else []
+        takers = {topic: builder.taker(static=topic.name.rpartition("/")[2] == _STATIC) for topic in frames}
+        topics = [*(topic for one in self.cameras for topic in one.topics), *(one.topic for one in self.signals)]
+        clocked = on_clock(log, topics, clock, takers)
+        self.cameras = [one.on(clocked) for one in self.cameras]
+        self.signals = [replace(one, topic=clocked[one.topic]) for one in self.signals]
+        return builder.tree().only(ways) if ways else None
 
     def _check_poses(self) -> None:
         """Leave out the depth images of whose time tf tells nothing."""

@@ -8,16 +8,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import BinaryIO
 
 import numpy as np
 
 from pcdata.errors import CaptureError
-from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.io.messages.fields import Fields
 from pcdata.io.messages.log_file import LATEST, MAX_MESSAGE, Index, LogFile, Place, Read, by_topic
-from pcdata.io.messages.packing import unpacked
+from pcdata.io.messages.packing import UNPACKED, unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
@@ -60,22 +58,16 @@ class McapFile(LogFile):
                     stream.seek(_MESSAGE_START, os.SEEK_CUR)
                     wanted = length - _MESSAGE_START
                     return stream.read(wanted if most is None else min(most, wanted))
-                chunk = _chunk(str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start)
-                content = Fields(chunk, offset)
-                if content.number("B") != _MESSAGE:
+                key = (str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start)
+                chunk = Fields(UNPACKED.get(key, lambda: _unpacked_chunk(stream, start, size)), offset)
+                kind, length = chunk.number("B"), chunk.number("Q")
+                if kind != _MESSAGE or not _MESSAGE_START <= length <= chunk.left:
                     raise CaptureError(f"{self.path}: no message stands in the chunk at byte {start}; it is damaged")
-                content = Fields(content.take(content.number("Q")))
-                content.take(_MESSAGE_START)
-                return content.take(content.left if most is None else min(most, content.left))
+                chunk.take(_MESSAGE_START)
+                wanted = length - _MESSAGE_START
+                return chunk.take(wanted if most is None else min(most, wanted))
 
             yield read
-
-
-@lru_cache(maxsize=2)  # the images of one moment lie in one chunk, or two
-def _chunk(path: str, changed: int, start: int) -> bytes:
-    """Return the unpacked records of the chunk at a byte of a file that was changed at a time."""
-    with open_input("MCAP file", path, max_bytes=MAX_STREAMED_BYTES) as stream:
-        return _unpacked_chunk(stream, start, os.fstat(stream.fileno()).st_size)
 
 
 def _unpacked_chunk(stream: BinaryIO, start: int, size: int) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,6 +21,7 @@ from pcdata.yaml_nodes import parse_yaml
 CONTAINERS: tuple[type[LogFile], ...] = (BagFile, McapFile, SqliteFile)
 METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _MAX_METADATA = 1 << 24
+_TOGETHER = 1 << 14  # messages whose numbers are Python's at one time
 
 
 def container_of(path: Path) -> type[LogFile] | None:
@@ -80,10 +81,10 @@ class MessageLog:
                     readers[file] = stack.enter_context(self.files[file].opened())
                 if not self._packed:
                     return readers[file](tuple(place), most)
-                content = unpacked_zstd(readers[file](tuple(place), None), MAX_MESSAGE + 1)
+                content = unpacked_zstd(readers[file](tuple(place), None), MAX_MESSAGE + 1 if most is None else most)
                 if len(content) > MAX_MESSAGE:
                     raise CaptureError(f"a message of {topic.name} unpacks to more than {MAX_MESSAGE} bytes")
-                return content if most is None else content[:most]
+                return content
 
             yield read
 
@@ -93,6 +94,20 @@ class MessageLog:
         smaller.files, smaller._packed, smaller.damage = self.files, self._packed, self.damage
         smaller.topics = {name: self.topics[name] for name in topics if name in self.topics}
         return smaller
+
+
+def in_file_order(topics: Sequence[Topic]) -> Iterator[tuple[Topic, int]]:
+    """Yield every message of some topics as they lie in the files, so that a packed chunk is unpacked once for all."""
+    if not topics:
+        return
+    places = np.concatenate([topic.places for topic in topics])
+    owners = np.repeat(np.arange(len(topics)), [len(topic) for topic in topics])
+    numbers = np.concatenate([np.arange(len(topic)) for topic in topics])
+    order = np.lexsort((places[:, 2], places[:, 1], places[:, 0]))
+    for start in range(0, len(order), _TOGETHER):
+        some = order[start : start + _TOGETHER]
+        for owner, number in zip(owners[some].tolist(), numbers[some].tolist()):
+            yield topics[owner], number
 
 
 def opened_log(where: str, path: Path, links_to: tuple[Path, ...] = ()) -> MessageLog:

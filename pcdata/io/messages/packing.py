@@ -5,12 +5,18 @@ from __future__ import annotations
 import bz2
 import importlib
 import zlib
+from functools import cache
 from typing import Any
 
 from pcdata.errors import CaptureError
+from pcdata.files.recent import Recent
 
 _PACKINGS = ("none", "bz2", "lz4", "zstd")
 MAX_CHUNK = 1 << 28  # bytes of messages packed together: recorders' default is about 1 MB, or one image if larger
+
+
+# The images and joints of one moment lie in a few chunks, and those of the next in the last of these.
+UNPACKED = Recent(1 << 24)
 
 
 def unpacked(content: bytes, compression: str, size: int, checksum: int = 0) -> bytes:
@@ -76,6 +82,7 @@ def unpacked_zstd(content: bytes, most: int) -> bytes:
         raise CaptureError(f"a packed chunk is damaged: {str(error) or type(error).__name__}") from error
 
 
+@cache  # a module that is not there is looked for each time
 def _zstd() -> Any:
     for name in ("compression.zstd", "backports.zstd", "zstandard"):
         try:

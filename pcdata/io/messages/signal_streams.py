@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pcdata.errors import CaptureError, ConfigError, PcdataError
 from pcdata.geometry import rigid
 from pcdata.io.messages.camera_streams import told
-from pcdata.io.messages.clock import Clock, on_clock
 from pcdata.io.messages.decoding import decoded, is_known
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
@@ -54,7 +53,7 @@ class SignalStream:
 
     Args:
         name: of the signal.
-        topic: on the clock.
+        topic: of its messages, or those of a topic that are of it.
         kind: of signals, as :class:`pcdata.Signal` has it.
         frame: of its spatial parts; that of the messages' header must be the same, where they have one.
         rule: how it is joined.
@@ -172,7 +171,6 @@ def chosen_signals(
     log: MessageLog,
     said: Statement,
     given: Mapping[str, Any] | None,
-    clock: Clock,
     max_gap: float,
 ) -> tuple[list[SignalStream], list[str]]:
     """Return the signals that the recording states and the joints that it holds, and those that are asked for.
@@ -183,7 +181,6 @@ def chosen_signals(
         said: what it states.
         given: by the name of a stream, its topic without the first slash: kind, and maybe frame, rule, max_gap (in
             seconds); None = left out.
-        clock: of their times.
         max_gap: nanoseconds, where none is stated.
 
     The second list says in words what of the topics is no signal.
@@ -196,11 +193,11 @@ def chosen_signals(
     streams: dict[str, SignalStream] = {}
     left: list[str] = []
     for own, told_of in said.signals.items():
-        stream = _stated(where, log, own, told_of, clock)
+        stream = _stated(where, log, own, told_of)
         streams[stream.name] = stream
     for topic in log.topics.values():
         if topic.type == JOINTS and len(topic) and is_known(topic) and topic.name.strip("/") not in _left_out(stated):
-            found, without = joint_streams(where, log, topic, clock, max_gap)
+            found, without = joint_streams(log, topic, max_gap)
             streams |= {one.name: one for one in found}
             left += without
     others = {topic.name.strip("/"): topic for topic in log.topics.values() if _may_be_signal(topic)}
@@ -215,7 +212,7 @@ def chosen_signals(
         if name in streams:
             stream = replace(streams[name], kind=kind[0], frame=kind[1])
         else:
-            stream = SignalStream(name, on_clock(log, others[name], clock), kind[0], kind[1], "step", math.inf)
+            stream = SignalStream(name, others[name], kind[0], kind[1], "step", math.inf)
             stream = replace(stream, rule="slerp", max_gap=max_gap) if stream.is_pose else stream
         check_kind(at, stream)
         rule, gap = rules.get(name, (None, None))
@@ -292,7 +289,7 @@ def check_rule(where: str, stream: SignalStream) -> None:
         )
 
 
-def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any], clock: Clock) -> SignalStream:
+def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any]) -> SignalStream:
     where = f"{where}: topic /pcdata: signal {name!r:.100}"
     topic = log.topics.get(f"{SIGNALS}{name}")
     if topic is None or not len(topic):
@@ -317,7 +314,7 @@ def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any], clo
     check_signal_name(where, own)
     return SignalStream(
         own,
-        on_clock(log, topic, clock),
+        topic,
         parsed.text,
         frame,
         "step",
@@ -327,23 +324,20 @@ def _stated(where: str, log: MessageLog, name: str, said: Mapping[str, Any], clo
     )
 
 
-def joint_streams(
-    where: str, log: MessageLog, topic: Topic, clock: Clock, max_gap: float
-) -> tuple[list[SignalStream], list[str]]:
+def joint_streams(log: MessageLog, topic: Topic, max_gap: float) -> tuple[list[SignalStream], list[str]]:
     """Return positions, velocities and efforts of the joints of a topic, and in words what is left out.
 
     Joints that are published by several nodes, in messages of their own, are signals of their own.
     """
-    timed = on_clock(log, topic, clock)
     streams: list[SignalStream] = []
     left: list[str] = []
     base = topic.name.strip("/")
     with log.opened() as read:
-        groups = _groups(lambda number: decoded(timed, read(timed, number)), len(timed))
+        groups = _groups(lambda number: decoded(topic, read(topic, number)), len(topic))
         for number, (joints, numbers) in enumerate(groups.items()):
             name = base if len(groups) == 1 else f"{base}/{number}"
             own = (
-                timed if len(groups) == 1 else replace(timed, times=timed.times[numbers], places=timed.places[numbers])
+                topic if len(groups) == 1 else replace(topic, times=topic.times[numbers], places=topic.places[numbers])
             )
             first = decoded(own, read(own, 0))
             for part in _JOINT_FIELDS:

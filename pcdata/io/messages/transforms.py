@@ -6,8 +6,9 @@ static holds for ever.
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -146,23 +147,34 @@ class FrameTree:
 
 
 class TreeBuilder:
-    """Takes messages of tf, one after another."""
+    """Takes messages of tf in any order; of transforms of one time the first counts, of static ones the last.
+
+    Topics that are taken from come one after another, in the order in which their takers were made.
+    """
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._moving: dict[Edge, dict[int, list[float]]] = {}
-        self._static: dict[Edge, list[float]] = {}
+        self._topics = 0
+        self._moving: dict[Edge, _Rows] = {}
+        self._static: dict[Edge, tuple[tuple[int, int], list[float]]] = {}
 
-    def add(self, message: Any, *, static: bool) -> None:
-        """Take the transforms of a message; of those of one time the first counts, of static ones the last."""
-        for one in message.transforms if hasattr(message, "transforms") else [message]:
-            edge = (plain_frame(one.header.frame_id), plain_frame(one.child_frame_id))
-            shift, turn = one.transform.translation, one.transform.rotation
-            numbers = [float(value) for value in (shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w)]
-            if static:
-                self._static[edge] = numbers
-            else:
-                self._moving.setdefault(edge, {}).setdefault(stamp(one), numbers)
+    def taker(self, *, static: bool) -> Callable[[int, Any], None]:
+        """Return what takes the messages of a topic, each with its number in it."""
+        topic = self._topics
+        self._topics += 1
+
+        def take(number: int, message: Any) -> None:
+            order = (topic, number)
+            for one in message.transforms if hasattr(message, "transforms") else [message]:
+                edge = (plain_frame(one.header.frame_id), plain_frame(one.child_frame_id))
+                shift, turn = one.transform.translation, one.transform.rotation
+                numbers = [float(value) for value in (shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w)]
+                if not static:
+                    self._moving.setdefault(edge, _Rows()).add(order, stamp(one), numbers)
+                elif edge not in self._static or order >= self._static[edge][0]:
+                    self._static[edge] = (order, numbers)
+
+        return take
 
     def tree(self) -> FrameTree:
         """Return the tree.
@@ -171,15 +183,35 @@ class TreeBuilder:
             CaptureError: a pose cannot be right, or a frame has two parents.
         """
         moving, static = {}, {}
-        for edge, numbers in self._static.items():
+        for edge, (_, numbers) in self._static.items():
             static[edge] = self._track(edge, [0], np.array([numbers])).pose(0)
-        for edge, poses in self._moving.items():
+        for edge, rows in self._moving.items():
             if edge not in static:
-                moving[edge] = self._track(edge, list(poses), np.array(list(poses.values()), np.float64))
+                moving[edge] = self._track(edge, *rows.first_of_each_time())
         return FrameTree(self._where, moving, static)
 
     def _track(self, edge: Edge, times: list[int], table: Any) -> Trajectory:
         return Trajectory(f"{self._where}: tf from {edge[1]!r} to {edge[0]!r}", times, table[:, :3], table[:, 3:])
+
+
+class _Rows:
+    """The poses of one frame, in plain arrays: recordings have millions."""
+
+    def __init__(self) -> None:
+        self._order, self._times, self._numbers = array("q"), array("q"), array("d")
+
+    def add(self, order: tuple[int, int], time: int, numbers: list[float]) -> None:
+        self._order.extend(order)
+        self._times.append(time)
+        self._numbers.extend(numbers)
+
+    def first_of_each_time(self) -> tuple[list[int], NDArray[np.float64]]:
+        """Return the times in order, and the (N, 7) numbers of the first pose of each."""
+        topic, number = np.array(self._order, np.int64).reshape(-1, 2).T
+        by_message = np.lexsort((number, topic))
+        times, first = np.unique(np.array(self._times, np.int64)[by_message], return_index=True)
+        table = np.array(self._numbers, np.float64).reshape(-1, 7)
+        return times.tolist(), table[by_message[first]]
 
 
 def plain_frame(name: str) -> str:

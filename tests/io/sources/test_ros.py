@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 import struct
 from contextlib import suppress
@@ -15,8 +16,10 @@ import torch
 from pcdata import open_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CaptureError, ConfigError, FrameError, IntrinsicsError, PcdataError, UnitError
+from pcdata.files.recent import Recent
 from pcdata.geometry import rigid
 from pcdata.io import refused_captures
+from pcdata.io.messages import bag_file, mcap_file
 from pcdata.io.store.manifest import Manifest
 from tests.ros_recordings import (
     EPOCH,
@@ -32,6 +35,9 @@ from tests.ros_recordings import (
     recording,
     written,
 )
+
+rosbag1 = pytest.importorskip("rosbags.rosbag1")
+storage_mcap = pytest.importorskip("rosbags.rosbag2.storage_mcap")
 
 FORMS = [("bag", False), ("bag", True), ("mcap", False), ("mcap", True), ("db3", False), ("folder", False)]
 ROS2 = Types(2)
@@ -562,6 +568,47 @@ def test_damage_anywhere_is_a_typed_error_or_changes_readings_only(tmp_path: Pat
             source = open_source(file, kind="ros", frame_id="base")
             for sample_id in source.ids:
                 source.load(sample_id)
+
+
+@pytest.mark.parametrize("form", ["bag", "mcap"])
+def test_packed_chunks_are_unpacked_once_for_all_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    make = Types(1 if form == "bag" else 2)
+    if form == "bag":
+        monkeypatch.setattr(rosbag1.Writer, "write", closing(rosbag1.Writer.write, "chunk_threshold"))
+    else:
+        monkeypatch.setattr(storage_mcap.McapWriter, "write", closing(storage_mcap.McapWriter.write, "close_chunk"))
+    path = written(tmp_path / f"a.{form}", recording(make, count=100), make, form=form, packed=True)
+    unpacked: list[bytes] = []
+    module = bag_file if form == "bag" else mcap_file
+    original = module.unpacked
+
+    def counted(content: bytes, *others: Any) -> bytes:
+        unpacked.append(content)
+        return original(content, *others)
+
+    monkeypatch.setattr(module, "unpacked", counted)
+    monkeypatch.setattr(module, "UNPACKED", Recent(10_000))  # far less than the recording
+    assert len(open_source(path, frame_id="base")) == 100
+    chunks = len(set(unpacked))
+    assert chunks > 80
+    # Besides the one pass: the first messages of topics, and those that show how joints are published.
+    assert len(unpacked) < 1.5 * chunks
+
+
+def closing(write: Any, what: str) -> Any:
+    """Return what writes a message, and begins a chunk after every tenth."""
+    count = itertools.count(1)
+
+    def written(self: Any, *message: Any) -> None:
+        if what == "chunk_threshold":
+            self.chunk_threshold = -1 if next(count) % 10 == 0 else 1 << 20
+        write(self, *message)
+        if what == "close_chunk" and next(count) % 10 == 0:
+            self.close_chunk()
+
+    return written
 
 
 def test_a_recording_is_sent_to_workers_without_its_messages(tmp_path: Path) -> None:
