@@ -25,7 +25,8 @@ def test_the_sensors_asked_for_are_there():
         "realsense_d415", "realsense_d435", "realsense_d435i", "realsense_d455", "realsense_l515", "azure_kinect_nfov",
         "azure_kinect_wfov", "kinect_v1", "photoneo_phoxi_m", "ouster_os1", "velodyne_vlp16", "realsense_d405",
         "realsense_d457", "realsense_d555", "femto_bolt_nfov", "femto_bolt_wfov", "femto_mega_nfov", "zed_2i",
-        "oak_d_pro", "zivid_2_plus_m130",
+        "oak_d_pro", "zivid_2_plus_m130", "orbbec_gemini_335", "orbbec_gemini_336", "zed_x", "apple_lidar",
+        "mech_eye_pro_s",
     }  # fmt: skip
     assert {profile.name for profile in PROFILES if not profile.is_organized} == {"ouster_os1", "velodyne_vlp16"}
 
@@ -42,6 +43,13 @@ def test_the_d405_stores_tenths_of_a_millimetre_and_sees_near():
     profile = sensor_profiles()["realsense_d405"]
     assert profile.metres_per_unit[0] == 0.0001
     assert profile.noise_at(0.3) == pytest.approx(0.3**2 * 0.08 / (427 * 0.018))
+
+
+@pytest.mark.parametrize("name", ["orbbec_gemini_336", "zed_x", "apple_lidar", "mech_eye_pro_s", "zivid_2_plus_m130"])
+def test_focal_length_and_field_of_view_tell_of_one_lens(name: str):
+    profile = sensor_profiles()[name]
+    for pixels, angle in zip(profile.size, profile.field_of_view, strict=True):
+        assert profile.focal == pytest.approx(pixels / (2 * math.tan(math.radians(angle / 2))), rel=0.04)
 
 
 @each

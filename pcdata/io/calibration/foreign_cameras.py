@@ -6,6 +6,7 @@ Open3D, PinholeCameraIntrinsic (the matrix column by column); M2T2, meta_data; C
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -33,6 +34,10 @@ _REALSENSE = re.compile(
     r'Intrinsic of "Depth" /[^\n]*\n\s*Width:\s*(\d+)\s*\n\s*Height:\s*(\d+)\s*\n\s*PPX:\s*(\S+)\s*\n\s*PPY:\s*(\S+)'
     r"\s*\n\s*Fx:\s*(\S+)\s*\n\s*Fy:\s*(\S+)\s*\n\s*Distortion:\s*([^\n]*?)\s*\n\s*Coeffs:([^\n]*)"
 )
+_REALSENSE_PAIR = re.compile(
+    r'Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"\s*:[^\S\n]*\n\s*Rotation Matrix:(?:[^\n]*\n){1,5}?'
+    r"\s*Translation Vector:\s*(\S+)\s+(\S+)\s+(\S+)"
+)
 
 
 class ForeignCamera(NamedTuple):
@@ -45,6 +50,7 @@ class ForeignCamera(NamedTuple):
     depth_encoding: DepthEncoding | None = None
     invalid_values: tuple[int, ...] | None = None
     poses: Mapping[str, Tensor] | None = None  # signals: (4, 4) float64 of other things, in the same frame
+    baseline: float | None = None  # metres, of the two cameras that a stereo camera is made of
 
 
 def read_foreign_camera(
@@ -179,7 +185,9 @@ def _text_intrinsics(where: str, text: str) -> ForeignCamera:
         streams[int(height), int(width)] = (*map(float, (fx, fy, cx, cy)), *bent)
     if not streams:
         raise CaptureError(f'{where}: names no intrinsics of the stream "Depth"')
-    return ForeignCamera(partial(_realsense, streams=streams))
+    pair = _REALSENSE_PAIR.search(text)
+    apart = None if pair is None else math.dist([0.0] * 3, [float(shift) for shift in pair.groups()])
+    return ForeignCamera(partial(_realsense, streams=streams), baseline=apart)
 
 
 def _realsense(size: Size, *, streams: Mapping[Size, tuple[float, ...]]) -> Camera:

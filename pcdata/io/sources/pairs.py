@@ -6,7 +6,7 @@ So lie the frames of AnyGrasp, gqcnn, D3RoMa, ClearGrasp and M2T2, and most that
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from pcdata.files.sample_names import name_some
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.io.calibration.foreign_cameras import ForeignCamera, pinhole, read_foreign_camera
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES, image_size, read_depth, read_raw_depth
-from pcdata.io.sources.listed import ListedSource, StoredView, stated_intrinsics, stated_unit
+from pcdata.io.sources.disparity_unit import unit_by_disparity
+from pcdata.io.sources.listed import ListedSource, Size, StoredView, stated_intrinsics, stated_unit
 from pcdata.io.sources.listing import (
     LinkTargets,
     absolute,
@@ -33,7 +34,7 @@ from pcdata.io.sources.option_checks import check_invalid_values, check_label, c
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import check_partners
 from pcdata.io.sources.stated import one_value
-from pcdata.structures import Signal
+from pcdata.structures import Camera, Signal
 
 _WORDS = {  # of file names, without case: the role that they tell
     "depth": "depth",
@@ -46,8 +47,9 @@ _WORDS = {  # of file names, without case: the role that they tell
     "segmask": "labels",
     "segmentation": "labels",
     "mask": "labels",
+    "disparity": "disparity",  # of a stereo camera, which tells the unit of depth
 }
-_SUFFIXES = {"depth": DEPTH_SUFFIXES, "color": COLOR_SUFFIXES, "labels": (".png",)}
+_SUFFIXES = {"depth": DEPTH_SUFFIXES, "color": COLOR_SUFFIXES, "labels": (".png",), "disparity": DEPTH_SUFFIXES}
 _NO_NAMES = ("img", "image", "map", "raw")  # say nothing of a frame
 _PICTURES = ("vis", "viz", "visualization", "preview", "colored", "colormap")  # of depth, made for viewing
 _SEPARATORS = re.compile(r"[-_. ]+")
@@ -58,7 +60,8 @@ class _PairsSource(ListedSource):
     """Depth images and their partners in one folder, or one depth image; a frame is called after the rest of its name.
 
     The words: depth; color, colour, rgb; label, seg, segmentation, mask, segmask (whose values become labels, so no
-    point is cut away). Intrinsics and a pose come from a file beside them that other programs write, see
+    point is cut away). Disparity in pixels beside the depth, of a stereo camera whose baseline a file states, tells the
+    unit. Intrinsics and a pose come from a file beside them that other programs write, see
     :func:`pcdata.io.calibration.foreign_cameras.read_foreign_camera`, or from the options. Floats are metres where
     nothing else is said.
     """
@@ -87,7 +90,8 @@ class _PairsSource(ListedSource):
         Args:
             path: the folder, or the depth image.
             intrinsics: (fx, fy, cx, cy) in pixels, where no file has them.
-            metres_per_unit: length of one stored depth unit; None = as a file says, else floats are metres.
+            metres_per_unit: length of one stored depth unit; None = as a file says or disparity tells, else
+                floats are metres.
             depth_encoding: order of the stored bits; None = as a file says, else "plain".
             invalid_values: stored depth values besides 0 that mean "no reading".
             background_label: the label in the files that means "no object" and becomes -1; None = keep all.
@@ -115,6 +119,7 @@ class _PairsSource(ListedSource):
             found = {role: files for role, files in found.items() if files or role == "depth"}
         if not found["depth"]:
             raise CaptureError(f"{where}: no depth image found; this layout needs {self.needs}")
+        disparities = found.pop("disparity", {})
         said, read = _said_of_camera(where, folder, allowed)
         told = _of_other_sizes(where, found)
         if said.camera is not None and intrinsics is not None:
@@ -129,6 +134,9 @@ class _PairsSource(ListedSource):
         camera = said.camera or partial(
             pinhole, numbers=stated_intrinsics(where, intrinsics, _unit_too(where, unit, first))
         )
+        if unit is None and encoding == "plain":
+            unit, used = _measured_unit(where, found["depth"], disparities, camera, said.baseline)
+            read = [*read, *used]
         decode = partial(
             _read, where=where, unit=unit, encoding=check_depth_encoding(where, encoding), invalid=tuple(invalid)
         )
@@ -229,6 +237,22 @@ def _of_other_sizes(where: str, found: dict[str, dict[str, Path]]) -> list[str]:
             )
             del found[role]
     return told
+
+
+def _measured_unit(
+    where: str,
+    depths: dict[str, Path],
+    disparities: dict[str, Path],
+    camera: Callable[[Size], Camera],
+    baseline: float | None,
+) -> tuple[float | None, list[Path]]:
+    """Return the unit that disparity beside the first depth image tells, and the file; None = nothing tells one."""
+    name = next((name for name in depths if name in disparities), None)
+    if name is None or not baseline:
+        return None, []
+    focal = float(camera(image_size(where, depths[name])).intrinsics[0, 0, 0])
+    unit = unit_by_disparity(where, depths[name], disparities[name], focal, baseline)
+    return unit, [] if unit is None else list(disparities.values())
 
 
 def _unit_too(where: str, unit: float | None, depth: Path) -> str:

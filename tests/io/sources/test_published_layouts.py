@@ -501,7 +501,7 @@ def test_a_file_that_is_a_link_out_of_the_capture_is_not_read(name: str, tmp_pat
 REAL = {  # by path: options that files cannot answer; kind, samples, views, bounds of a median depth in metres
     "apc_multiview_shelf": ({}, "apc", 15, 1, (0.5, 0.6)),
     "azure_kinect_mkv": ({}, "azure_kinect", 1, 1, (1.48, 1.5)),
-    "d3roma_ir_stereo": ({"metres_per_unit": 0.001}, "pairs", 1, 1, (0.42, 0.45)),
+    "d3roma_ir_stereo": ({}, "pairs", 1, 1, (0.42, 0.45)),
     "gqcnn_phoxi": ({}, "pairs", 1, 1, (0.6, 1.0)),
     "m2t2_real_tabletop/03": ({}, "pairs", 1, 1, (0.9, 1.3)),
     "open3d_rgbd": ({}, "open3d", 5, 1, (1.0, 2.7)),
@@ -528,14 +528,12 @@ def test_real_captures_open_with_what_their_files_cannot_answer(name: str, test_
     ("name", "unit"),
     [
         ("tabletop_stream", "metres_per_unit=0.001 (--metres-per-unit 0.001)"),
-        ("d3roma_ir_stereo", "metres_per_unit=0.001 (--metres-per-unit 0.001)"),
         ("open3d_rgbd/other_formats/TUM_depth.png", "metres_per_unit=0.0002 (--metres-per-unit 0.0002)"),
         ("open3d_rgbd/other_formats/SUN_depth.png", "(--metres-per-unit 0.001 --depth-encoding rotated)"),
     ],
 )
 def test_units_of_real_captures_are_named_and_not_guessed(name: str, unit: str, test_data: Path) -> None:
-    options = {} if name.startswith("d3roma") else {"intrinsics": (582.6, 582.7, 313.0, 238.0)}
-    source = open_source(test_data / name, **options)
+    source = open_source(test_data / name, intrinsics=(582.6, 582.7, 313.0, 238.0))
     with pytest.raises(UnitError) as caught:
         source.load(source.ids[0])
     assert unit in str(caught.value)
