@@ -1,9 +1,9 @@
-"""What the structure of a PNG, JPEG or TIFF file tells of its own wholeness, checked before Pillow decodes it.
+"""What the structure of a PNG or JPEG file tells of its own wholeness, checked before Pillow decodes it.
 
 Pillow shows what it can of a damaged picture: rows that are missing become 0, a wrong checksum is passed over. For a
 photograph that is kind; for depth it invents "no reading". So chunks, checksums and sizes are checked here.
 
-Source: W3C, Portable Network Graphics (Third Edition), sections 5 and 11; ITU-T T.81, annex B; TIFF 6.0, sections 2, 8.
+Source: W3C, Portable Network Graphics (Third Edition), sections 5 and 11; ITU-T T.81, annex B.
 """
 
 from __future__ import annotations
@@ -18,12 +18,9 @@ _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 _MAX_SCANS = 64  # of a progressive JPEG, which has about ten; each is decoded over the whole picture
 _JPEG_PIXELS_PER_BYTE = 512  # 16x16 pixels in two colors of half size take six codes of at least one bit
-_TIFF_UNPACKED_PER_BYTE = 1100  # deflate: 1032 to 1; LZW and PackBits pack less tightly
-_TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
-_TIFF_PLAIN, _TIFF_DEFLATE = 1, (8, 32946)
 
 
-class _StructureError(ValueError):
+class StructureError(ValueError):
     """What does not fit together in an image file."""
 
 
@@ -35,30 +32,30 @@ def checked_png(data: bytes, max_pixels: int) -> tuple[bytes, int, int]:
         the color type.
 
     Raises:
-        _StructureError: damaged, cut short, more than one picture, or with bytes that belong to nothing.
+        StructureError: damaged, cut short, more than one picture, or with bytes that belong to nothing.
     """
     chunks = _png_chunks(data)
     kinds = [kind for kind, _ in chunks]
     if kinds[0] != b"IHDR" or len(chunks[0][1]) != 13 or kinds.count(b"IHDR") > 1:
-        raise _StructureError("it does not start with one header")
+        raise StructureError("it does not start with one header")
     width, height, bits, color, packing, filtering, interlaced = struct.unpack(">IIBBBBB", chunks[0][1])
     if bits not in _DEPTHS.get(color, ()) or packing or filtering or interlaced > 1:
-        raise _StructureError(f"no PNG has {bits} bits of color type {color}")
+        raise StructureError(f"no PNG has {bits} bits of color type {color}")
     if not 0 < width * height <= max_pixels:
-        raise _StructureError(f"an image must have 1 .. {max_pixels} pixels, this one claims {width}x{height}")
+        raise StructureError(f"an image must have 1 .. {max_pixels} pixels, this one claims {width}x{height}")
     if b"acTL" in kinds:
-        raise _StructureError("must hold one image, but is an animation; save one file each")
+        raise StructureError("must hold one image, but is an animation; save one file each")
     unknown = [kind for kind in kinds if not kind[0] & 0x20 and kind not in (b"IHDR", b"PLTE", b"IDAT", b"IEND")]
     palettes = [content for kind, content in chunks if kind == b"PLTE"]
     if unknown or len(palettes) > 1 or (color == 3 and not palettes):
-        raise _StructureError(f"chunk {unknown[0]!r} is not known" if unknown else "it must have one palette")
+        raise StructureError(f"chunk {unknown[0]!r} is not known" if unknown else "it must have one palette")
     first = kinds.index(b"IDAT") if b"IDAT" in kinds else len(kinds)
     count = kinds.count(b"IDAT")
     if kinds[first : first + count] != [b"IDAT"] * count or not count:
-        raise _StructureError("its image data are missing or not in one row")
+        raise StructureError("its image data are missing or not in one row")
     size = _png_bytes(width, height, bits * _CHANNELS[color], bool(interlaced))
     packed = b"".join(content for kind, content in chunks if kind == b"IDAT")
-    _check_inflated(packed, size)
+    check_inflated(packed, size)
     parts: list[tuple[bytes, bytes | memoryview]] = [(b"IHDR", chunks[0][1])]
     parts += [(b"PLTE", palette) for palette in palettes]
     parts += [(b"IDAT", packed), (b"IEND", b"")]
@@ -67,22 +64,22 @@ def checked_png(data: bytes, max_pixels: int) -> tuple[bytes, int, int]:
 
 def _png_chunks(data: bytes) -> list[tuple[bytes, memoryview]]:
     if data[:8] != PNG_SIGNATURE:
-        raise _StructureError("it does not start as a PNG does")
+        raise StructureError("it does not start as a PNG does")
     view, chunks, start = memoryview(data), list[tuple[bytes, memoryview]](), 8
     while not chunks or chunks[-1][0] != b"IEND":
         if start + 12 > len(data):
-            raise _StructureError("it is cut short: its end chunk is missing")
+            raise StructureError("it is cut short: its end chunk is missing")
         (size,) = struct.unpack_from(">I", data, start)
         end = start + 12 + size
         if end > len(data):
-            raise _StructureError(f"it is cut short: a chunk claims {size} bytes where {len(data) - start - 12} follow")
+            raise StructureError(f"it is cut short: a chunk claims {size} bytes where {len(data) - start - 12} follow")
         kind = data[start + 4 : start + 8]
         if zlib.crc32(view[start + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            raise _StructureError(f"the checksum of chunk {kind!r} at byte {start} is wrong: the file is damaged")
+            raise StructureError(f"the checksum of chunk {kind!r} at byte {start} is wrong: the file is damaged")
         chunks.append((kind, view[start + 8 : end - 4]))
         start = end
     if start != len(data):
-        raise _StructureError(f"{len(data) - start} bytes follow its end")
+        raise StructureError(f"{len(data) - start} bytes follow its end")
     return chunks
 
 
@@ -102,7 +99,7 @@ def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
     return total
 
 
-def _check_inflated(packed: bytes | memoryview, size: int) -> None:
+def check_inflated(packed: bytes | memoryview, size: int) -> None:
     """Require that a zlib stream unpacks to exactly so many bytes and ends with the right checksum."""
     stream = zlib.decompressobj()
     try:
@@ -110,14 +107,14 @@ def _check_inflated(packed: bytes | memoryview, size: int) -> None:
         if len(content) == size and not stream.eof:  # the checksum may still wait in what was not consumed
             content += stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
-        raise _StructureError(f"its packed image data are damaged: {error}") from error
+        raise StructureError(f"its packed image data are damaged: {error}") from error
     if len(content) != size:
         more = "more than" if len(content) > size else len(content)
-        raise _StructureError(f"its image data unpack to {more} {'the ' * (len(content) > size)}{size} bytes it claims")
+        raise StructureError(f"its image data unpack to {more} {'the ' * (len(content) > size)}{size} bytes it claims")
     if not stream.eof:
-        raise _StructureError("its packed image data have no end and no checksum")
+        raise StructureError("its packed image data have no end and no checksum")
     if stream.unused_data.strip(b"\0"):
-        raise _StructureError(f"{len(stream.unused_data)} bytes follow its packed image data")
+        raise StructureError(f"{len(stream.unused_data)} bytes follow its packed image data")
 
 
 def check_jpeg(data: bytes, max_pixels: int) -> None:
@@ -126,20 +123,20 @@ def check_jpeg(data: bytes, max_pixels: int) -> None:
     The entropy-coded data have no checksum: a wrong bit in them cannot be told.
 
     Raises:
-        _StructureError: cut short, segments that lead nowhere, restart markers out of turn, sizes that cannot be.
+        StructureError: cut short, segments that lead nowhere, restart markers out of turn, sizes that cannot be.
     """
     if data[:2] != b"\xff\xd8":
-        raise _StructureError("it does not start as a JPEG does")
+        raise StructureError("it does not start as a JPEG does")
     start, scans, frames, interval = 2, 0, 0, 0
     while True:
         start, marker = _jpeg_marker(data, start)
         if marker == 0xD9:
             break
         if marker in (0x00, 0x01, 0xD8) or 0xD0 <= marker <= 0xD7:
-            raise _StructureError(f"marker {marker:#04x} stands where no such marker may")
+            raise StructureError(f"marker {marker:#04x} stands where no such marker may")
         size = struct.unpack_from(">H", data, start)[0] if start + 2 <= len(data) else 0
         if size < 2 or start + size > len(data):
-            raise _StructureError(f"it is cut short: segment {marker:#04x} claims {size} bytes")
+            raise StructureError(f"it is cut short: segment {marker:#04x} claims {size} bytes")
         body = data[start + 2 : start + size]
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             frames += 1
@@ -151,27 +148,27 @@ def check_jpeg(data: bytes, max_pixels: int) -> None:
             scans += 1
             start = _skip_jpeg_scan(data, start, interval)
     if frames != 1 or not 1 <= scans <= _MAX_SCANS:
-        raise _StructureError(f"it has {frames} pictures in {scans} scans")
+        raise StructureError(f"it has {frames} pictures in {scans} scans")
     if data[start:].strip(b"\0\xff"):  # cameras pad what they send with zeros
-        raise _StructureError(f"{len(data) - start} bytes follow its end; does it hold several images?")
+        raise StructureError(f"{len(data) - start} bytes follow its end; does it hold several images?")
 
 
 def _jpeg_marker(data: bytes, start: int) -> tuple[int, int]:
     if start >= len(data) or data[start] != 0xFF:
-        raise _StructureError(f"it is cut short or damaged: no marker at byte {start}")
+        raise StructureError(f"it is cut short or damaged: no marker at byte {start}")
     while start < len(data) and data[start] == 0xFF:
         start += 1
     if start >= len(data):
-        raise _StructureError("it is cut short: the marker of its end is missing")
+        raise StructureError("it is cut short: the marker of its end is missing")
     return start + 1, data[start]
 
 
 def _check_jpeg_frame(marker: int, body: bytes, size: int, max_pixels: int) -> None:
     if marker not in (0xC0, 0xC1, 0xC2) or len(body) < 6 or len(body) != 6 + 3 * body[5]:
-        raise _StructureError(f"its frame header {marker:#04x} is not one of a baseline or progressive JPEG")
+        raise StructureError(f"its frame header {marker:#04x} is not one of a baseline or progressive JPEG")
     height, width = struct.unpack_from(">HH", body, 1)
     if not 0 < width * height <= min(max_pixels, _JPEG_PIXELS_PER_BYTE * size):
-        raise _StructureError(f"{size} bytes cannot hold the {width}x{height} pixels that it claims")
+        raise StructureError(f"{size} bytes cannot hold the {width}x{height} pixels that it claims")
 
 
 def _skip_jpeg_scan(data: bytes, start: int, interval: int) -> int:
@@ -180,91 +177,12 @@ def _skip_jpeg_scan(data: bytes, start: int, interval: int) -> int:
     while True:
         start = data.find(b"\xff", start)
         if start < 0 or start + 1 >= len(data):
-            raise _StructureError("it is cut short: the marker of its end is missing")
+            raise StructureError("it is cut short: the marker of its end is missing")
         following = data[start + 1]
         if 0xD0 <= following <= 0xD7:
             if not interval or following - 0xD0 != expected % 8:
-                raise _StructureError(f"restart marker {following - 0xD0} comes out of turn: data are missing")
+                raise StructureError(f"restart marker {following - 0xD0} comes out of turn: data are missing")
             expected += 1
         elif following not in (0x00, 0xFF):
             return start
         start += 1 if following == 0xFF else 2
-
-
-def check_tiff(data: bytes, max_pixels: int) -> None:
-    """Check that a TIFF holds one picture whose strips or tiles lie in the file and hold what its size asks for.
-
-    Raises:
-        _StructureError: cut short, several pictures, or strips of other sizes.
-    """
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if order is None or len(data) < 8:
-        raise _StructureError("it does not start as a TIFF does")
-    entries, following = _tiff_directory(data, order, struct.unpack_from(order + "I", data, 4)[0])
-    if following:
-        raise _StructureError("must hold one image, but holds several; save one file each")
-    if 330 in entries:
-        raise _StructureError("must hold one image, but holds others inside it; save one file each")
-    width, height = _tiff_one(entries, 256), _tiff_one(entries, 257)
-    if not 0 < width * height <= max_pixels:
-        raise _StructureError(f"an image must have 1 .. {max_pixels} pixels, this one claims {width}x{height}")
-    samples, bits = _tiff_one(entries, 277, 1), entries.get(258, (1,))
-    if not 1 <= samples <= 4 or len(set(bits)) != 1 or bits[0] not in (1, 4, 8, 16, 32, 64):
-        raise _StructureError(f"it claims {samples} samples of {bits!s:.60} bits")
-    packing = _tiff_one(entries, 259, 1)
-    bits_per_pixel = bits[0] * (samples if _tiff_one(entries, 284, 1) == 1 else 1)
-    planes = 1 if _tiff_one(entries, 284, 1) == 1 else samples
-    sizes = _tiff_parts(entries, width, height, bits_per_pixel) * planes
-    offsets = entries.get(273, entries.get(324, ()))
-    counts = entries.get(279, entries.get(325, ()))
-    if not len(offsets) == len(counts) == len(sizes):
-        raise _StructureError(f"it needs {len(sizes)} strips or tiles, but lists {len(offsets)} of {len(counts)} sizes")
-    for offset, count, size in zip(offsets, counts, sizes, strict=True):
-        if not count or offset + count > len(data) or offset < 8:
-            raise _StructureError(f"a strip of {count} bytes at byte {offset} lies outside its {len(data)} bytes")
-        if packing == _TIFF_PLAIN and count != size:
-            raise _StructureError(f"a strip has {count} bytes where the image size asks for {size}")
-        if packing in _TIFF_DEFLATE:
-            _check_inflated(data[offset : offset + count], size)
-        if size > _TIFF_UNPACKED_PER_BYTE * count:
-            raise _StructureError(f"a strip of {count} bytes cannot hold the {size} that the image size asks for")
-
-
-def _tiff_directory(data: bytes, order: str, start: int) -> tuple[dict[int, tuple[int, ...]], int]:
-    """Return the whole-number entries of a directory, and where the next one is."""
-    if start + 2 > len(data) or start + 6 + 12 * (count := struct.unpack_from(order + "H", data, start)[0]) > len(data):
-        raise _StructureError("it is cut short: its directory lies outside the file")
-    entries: dict[int, tuple[int, ...]] = {}
-    for place in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind, number = struct.unpack_from(order + "HHI", data, place)
-        if tag in entries:
-            raise _StructureError(f"its entry {tag} is there twice")
-        if kind not in _TIFF_TYPES:
-            continue
-        size = number * struct.calcsize(_TIFF_TYPES[kind])
-        at = place + 8 if size <= 4 else struct.unpack_from(order + "I", data, place + 8)[0]
-        if at + size > len(data):
-            raise _StructureError(f"its entry {tag} lies outside the file")
-        entries[tag] = struct.unpack_from(f"{order}{number}{_TIFF_TYPES[kind]}", data, at)
-    return entries, struct.unpack_from(order + "I", data, start + 2 + 12 * count)[0]
-
-
-def _tiff_one(entries: dict[int, tuple[int, ...]], tag: int, default: int | None = None) -> int:
-    values = entries.get(tag, () if default is None else (default,))
-    if len(values) != 1:
-        raise _StructureError(f"its entry {tag} must be one number, but it has {len(values)}")
-    return values[0]
-
-
-def _tiff_parts(entries: dict[int, tuple[int, ...]], width: int, height: int, bits: int) -> list[int]:
-    """Return how many bytes each strip or tile of one plane unpacks to."""
-    if 322 in entries or 324 in entries:
-        across, down = _tiff_one(entries, 322), _tiff_one(entries, 323)
-        if not 0 < across <= 1 << 16 or not 0 < down <= 1 << 16:
-            raise _StructureError(f"its tiles claim {across}x{down} pixels")
-        return [(across * bits + 7) // 8 * down] * (-(-width // across) * -(-height // down))
-    rows = min(_tiff_one(entries, 278, height), height)
-    if rows < 1:
-        raise _StructureError("its strips claim no row")
-    row = (width * bits + 7) // 8
-    return [row * min(rows, height - first) for first in range(0, height, rows)]

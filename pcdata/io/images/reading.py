@@ -25,7 +25,8 @@ from pcdata.files.opening import map_npy, open_input, read_bytes
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
 from pcdata.io.images.exr import exr_size, read_exr_channel
-from pcdata.io.images.file_wholeness import PNG_SIGNATURE, check_jpeg, check_tiff, checked_png
+from pcdata.io.images.file_wholeness import PNG_SIGNATURE, StructureError, check_jpeg, checked_png
+from pcdata.io.images.tiff import check_tiff, read_reals, tiff_size
 
 MAX_PIXELS = 1 << 26  # 67 megapixels: above every depth camera, below what a hostile header could make us allocate
 _MAX_BYTES = 1 << 30
@@ -50,8 +51,8 @@ def read_depth(
 ) -> Tensor:  # (H, W) float32 metres, 0 = no reading
     """Read a depth image as metres along z, 0 where the sensor had no reading.
 
-    Accepted: 16-bit gray PNG or TIFF, uint16 ``.npy``; float TIFF, float ``.npy`` and OpenEXR, whose NaN and infinite
-    pixels mean "no reading" and become 0.
+    Accepted: 16-bit gray PNG or TIFF, uint16 ``.npy``; TIFF of float32 or float64, float ``.npy`` and OpenEXR, whose
+    NaN and infinite pixels mean "no reading" and become 0.
 
     Args:
         path: ``.png``, ``.tif``, ``.tiff``, ``.npy`` or ``.exr``, which needs OpenEXR.
@@ -143,11 +144,16 @@ def image_size(where: str, path: Path) -> tuple[int, int]:
         if len(shape) < 2:
             raise CaptureError(f"{where}: {path}: must be one image (H, W), got shape {shape}")
         return int(shape[0]), int(shape[1])
+    if _FORMATS.get(suffix) == _TIFF:
+        try:
+            return tiff_size(read_bytes(where, path, max_bytes=_MAX_BYTES))
+        except StructureError as error:
+            raise CaptureError(f"{where}: {path}: no readable image: {error}") from error
     with open_input(where, path, max_bytes=_MAX_BYTES) as stream:
         if suffix == ".exr":
             return exr_size(where, stream.read(_EXR_HEADER))
         try:
-            with Image.open(stream, formats=("PNG", "TIFF", "JPEG")) as image:
+            with Image.open(stream, formats=("PNG", "JPEG")) as image:
                 return image.height, image.width
         except _PARSERS as error:
             raise CaptureError(f"{where}: {path}: no readable image: {str(error) or type(error).__name__}") from error
@@ -256,6 +262,8 @@ def decoded_image(where: str, data: bytes, formats: tuple[str, ...]) -> tuple[st
             formats = (_PNG,)
         elif _TIFF in formats:
             check_tiff(data, MAX_PIXELS)
+            if (reals := read_reals(data, _bytes_of_tiff)) is not None:
+                return "F", reals, depth
         else:
             check_jpeg(data, MAX_PIXELS)
         with Image.open(io.BytesIO(data), formats=formats) as image:
@@ -270,3 +278,9 @@ def decoded_image(where: str, data: bytes, formats: tuple[str, ...]) -> tuple[st
         raise CaptureError(
             f"{where}: not a readable {' or '.join(formats)} image: {str(error) or type(error).__name__}"
         ) from error
+
+
+def _bytes_of_tiff(data: bytes) -> NDArray[np.uint8]:  # (H, W)
+    with Image.open(io.BytesIO(data), formats=(_TIFF,)) as image:
+        image.load()
+        return np.asarray(image)
