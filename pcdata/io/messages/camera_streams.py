@@ -11,7 +11,7 @@ from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataErro
 from pcdata.io.messages.cameras import camera_of
 from pcdata.io.messages.clock import Clock
 from pcdata.io.messages.decoding import decoded, is_known, plain_type
-from pcdata.io.messages.images import ImageForm, form_of
+from pcdata.io.messages.images import DEPTH_ENCODINGS, ImageForm, form_of
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.messages.statement import Statement
@@ -285,6 +285,11 @@ def _units(where: str, image: ImageTopic, said: Mapping[str, Any], given: float 
         return _MILLIMETRE, 1.0, "REP 118: depth of floats is in metres"
     if image.form.encoding == "16UC1":
         return _MILLIMETRE, 1.0, "REP 118: 16-bit depth is in millimetres"
+    if image.form.encoding not in DEPTH_ENCODINGS:
+        raise CaptureError(
+            f"{where}: images of {image.topic.name} are encoded as {image.form.encoding!r:.60}, which is not read as "
+            f"depth; depth is encoded as {', '.join(DEPTH_ENCODINGS)}; name another topic, or convert the images"
+        )
     raise UnitError(
         f"{where}: images of {image.topic.name} are encoded as {image.form.encoding!r}, which says nothing of a unit "
         "(16UC1 would be millimetres); say metres_per_unit=0.001 (--metres-per-unit) if they are millimetres"

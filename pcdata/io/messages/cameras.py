@@ -60,8 +60,13 @@ def camera_of(
     matrix = [float(value) for value in (info.p if hasattr(info, "p") else info.P)] if rectified else _k(info)
     k = [matrix[0], matrix[1], matrix[2], *matrix[3 + rectified : 6 + rectified]]  # a projection has four columns
     fx, skew, cx, below, fy, cy = k
+    how = "say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX FY CX CY)"
     if fx == 0 or fy == 0:
-        raise IntrinsicsError(f"{where} states no focal length: the camera was not calibrated; say intrinsics=")
+        raise IntrinsicsError(f"{where} states no focal length: the camera was not calibrated; {how}")
+    if not all(map(math.isfinite, k)):
+        raise IntrinsicsError(f"{where} states intrinsics that are not finite: the camera was not calibrated; {how}")
+    if not info.height or not info.width:
+        raise IntrinsicsError(f"{where} is of an image of {info.width}x{info.height} pixels, which is none; {how}")
     lens = None if rectified else lens_of(where, str(info.distortion_model), info.d if hasattr(info, "d") else info.D)
     rows = [[fx, skew, cx], [below, fy, cy], [0.0, 0.0, 1.0]]
     try:

@@ -22,6 +22,8 @@ _CHANNELS: dict[str, tuple[Any, int]] = {  # the channels that are red, green an
     "bgra8": (slice(2, None, -1), 4), "mono8": ((0, 0, 0), 1), "8UC1": ((0, 0, 0), 1),
 }  # fmt: skip
 _WHOLE, _FLOAT = ("16UC1", "mono16"), "32FC1"
+_PACKED_WHOLE = "16-bit PNG"  # that does not say of what
+DEPTH_ENCODINGS = (*_WHOLE, _FLOAT, _PACKED_WHOLE)  # what can be read as depth
 _GRAY = ("mono8", "8UC1")
 _CONFIG = struct.Struct("<iff")  # of packed depth: what it is, and two numbers
 
@@ -126,7 +128,7 @@ def _packed_form(message: Any, named_depth: bool) -> ImageForm:
     size = (pixels.shape[0], pixels.shape[1])
     if bits == 16 or mode.startswith("I"):
         is_depth = encoding == "16UC1" or named_depth
-        return ImageForm("depth" if is_depth else "gray", encoding if encoding in _WHOLE else "16-bit PNG", size)
+        return ImageForm("depth" if is_depth else "gray", encoding if encoding in _WHOLE else _PACKED_WHOLE, size)
     return ImageForm("color" if mode in ("RGB", "RGBA") else "gray", mode, size)
 
 

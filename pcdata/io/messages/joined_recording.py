@@ -25,7 +25,7 @@ from pcdata.io.messages.camera_streams import (
     told,
 )
 from pcdata.io.messages.cameras import camera_of
-from pcdata.io.messages.clock import Clock, on_clock
+from pcdata.io.messages.clock import Clock, has_header, on_clock
 from pcdata.io.messages.decoding import decoded, plain_type
 from pcdata.io.messages.images import color_pixels, depth_numbers, plain_numbers
 from pcdata.io.messages.log_file import Topic
@@ -41,6 +41,7 @@ from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
 _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 _STATIC = "tf_static"
+_LATE = 1.0  # seconds between header and recording that no transport takes
 Read = Callable[..., bytes]
 
 
@@ -86,6 +87,7 @@ class JoinedRecording:
         self._check_sizes()
         self._tree = self._read_times(log, choice.clock)
         self.times = self.cameras[0].images.topic.times  # (N,) int64 nanoseconds
+        self._check_clocks(log, choice.clock)
         self.skipped: dict[int, str] = {}
         self.streams: list[dict[str, Any]] = []
         self._joins: dict[str, Joined] = {}
@@ -94,8 +96,7 @@ class JoinedRecording:
         if len(self.skipped) == len(self.times):
             raise CaptureError(
                 f"{where}: no depth image of {len(self.times)} has all its partners: "
-                f"{next(iter(self.skipped.values()))}; "
-                "allow more by max_time_apart (images) or max_gap (what is interpolated), or leave the stream out"
+                f"{next(iter(self.skipped.values()))}; {self._way_out()}"
             )
         used = self._used()
         self.unread = [*log.damage, *left, *self._unread(log, images, used), *self._counted()]
@@ -110,6 +111,40 @@ class JoinedRecording:
             raise CaptureError(
                 f"{self._where}: views of one frame must have one size, but: {named}; read one camera at a time"
             )
+
+    def _check_clocks(self, log: MessageLog, clock: Clock) -> None:
+        """Require that messages without a header, which have the time of recording, are on the clock of the depth."""
+        depth = self.cameras[0].images.topic
+        bare = [one for one in self.signals if not has_header(one.topic)]
+        if clock == "recorded" or not bare or not has_header(depth):
+            return
+        apart = (float(np.median(log.topics[depth.name].times)) - float(np.median(self.times))) / 1e9
+        if abs(apart) > _LATE:
+            raise CaptureError(
+                f"{self._where}: messages of {bare[0].topic.name} have no header, so only the time of recording, and "
+                f"the headers of {depth.name} are {abs(apart):.3g} s {'before' if apart > 0 else 'after'} that: two "
+                f"clocks; clock='recorded' (--clock recorded) joins all by the times of recording, or {_left_out(bare)}"
+            )
+
+    def _way_out(self) -> str:
+        """Say what can be done where no depth image has all its partners."""
+        worst = max(self.streams, key=lambda stream: int(stream.get("missing", 0)))
+        signals = [one for one in self.signals if worst["role"] == f"signal {one.name}"]
+        if signals:
+            times = signals[0].topic.times
+            early, late = int(self.times[0]) - int(times[-1]), int(times[0]) - int(self.times[-1])
+            if max(early, late) > 0:
+                where = (
+                    f"end {early / 1e9:.3g} s before the first"
+                    if early > 0
+                    else f"begin {late / 1e9:.3g} s after the last"
+                )
+                return (
+                    f"its times {where} depth image; if these are two clocks, clock='recorded' (--clock recorded) "
+                    f"joins all by the times of recording; or {_left_out(signals)}"
+                )
+        leave = _left_out(signals) if signals else "leave the stream out"
+        return f"allow more by max_time_apart (images) or max_gap (what is interpolated), or {leave}"
 
     def _join(self) -> None:
         limit = self._joining.max_time_apart * 1e9
@@ -194,14 +229,33 @@ class JoinedRecording:
                 "FRAME), where poses lead to"
             )
         ways = self._ways()
+        unnamed = next((one.images.topic.name for one in self.cameras if not one.images.frame), None)
+        if unnamed is not None and any(not frame for way in ways for frame in way):
+            raise CaptureError(
+                f"{self._where}: the headers of {unnamed} name no frame, so tf cannot tell where that camera is; leave "
+                "out frame_id (--frame)"
+            )
         builder = TreeBuilder(self._where)
         frames = [topic for topic in log.topics.values() if plain_type(topic.type) in _TF] if ways else []
-        takers = {topic: builder.taker(static=topic.name.rpartition("/")[2] == _STATIC) for topic in frames}
+        takers = {
+            topic: builder.taker(
+                static=topic.name.rpartition("/")[2] == _STATIC, times=topic.times if clock == "recorded" else None
+            )
+            for topic in frames
+        }
         topics = [*(topic for one in self.cameras for topic in one.topics), *(one.topic for one in self.signals)]
         clocked = on_clock(log, topics, clock, takers)
         self.cameras = [one.on(clocked) for one in self.cameras]
         self.signals = [replace(one, topic=clocked[one.topic]) for one in self.signals]
-        return builder.tree().only(ways) if ways else None
+        try:
+            return builder.tree().only(ways) if ways else None
+        except CaptureError as error:
+            for one in self.signals:
+                if one.frame not in (None, self.frame_id, "camera"):
+                    add_note(
+                        error, f"the signal {one.name!r} is said to be in {one.frame!r}, poses in {self.frame_id!r}"
+                    )
+            raise
 
     def _check_poses(self) -> None:
         """Leave out the depth images of whose time tf tells nothing."""
@@ -403,6 +457,11 @@ class JoinedRecording:
             rectified=camera.rectified,
             is_window=camera.facts.get("is_window") is True,
         )
+
+
+def _left_out(signals: Sequence[SignalStream]) -> str:
+    name = signals[0].name
+    return f"leave it out by signals={{{name!r}: None}} (--signal '{name}=')"
 
 
 def _seen_size(camera: CameraStream) -> tuple[int, int]:

@@ -340,6 +340,10 @@ def joint_streams(log: MessageLog, topic: Topic, max_gap: float) -> tuple[list[S
                 topic if len(groups) == 1 else replace(topic, times=topic.times[numbers], places=topic.places[numbers])
             )
             first = decoded(own, read(own, 0))
+            if len(set(joints)) < len(joints):
+                twice = next(joint for joint in joints if joints.count(joint) > 1)
+                left.append(f"{topic.name}: its messages name the joint {twice!r:.60} twice")
+                continue
             for part in _JOINT_FIELDS:
                 values = np.asarray(getattr(first, part))
                 if len(values) < len(joints) or not joints:

@@ -37,11 +37,27 @@ class FrameTree:
                     "has one"
                 )
         self._parents = parents
+        self._check_circles()
 
     @property
     def frames(self) -> list[str]:
         """The names of all frames, sorted."""
         return sorted({*self._parents, *self._parents.values()})
+
+    def _check_circles(self) -> None:
+        ends: set[str] = set()  # frames from which the way to a root is known
+        for frame in self._parents:
+            way: dict[str, None] = {}
+            while frame in self._parents and frame not in ends:
+                if frame in way:
+                    circle = [*[*way][[*way].index(frame) :][:20], frame]
+                    raise CaptureError(
+                        f"{self._where}: tf goes in a circle, {' in '.join(map(repr, circle))}; which pose "
+                        "is right cannot be known: record it without the one that is wrong"
+                    )
+                way[frame] = None
+                frame = self._parents[frame]
+            ends |= way.keys()
 
     def trees(self) -> list[list[str]]:
         """Return the frames that are connected, for each part of a tree that is not one."""
@@ -158,8 +174,11 @@ class TreeBuilder:
         self._moving: dict[Edge, _Rows] = {}
         self._static: dict[Edge, tuple[tuple[int, int], list[float]]] = {}
 
-    def taker(self, *, static: bool) -> Callable[[int, Any], None]:
-        """Return what takes the messages of a topic, each with its number in it."""
+    def taker(self, *, static: bool, times: NDArray[np.int64] | None = None) -> Callable[[int, Any], None]:
+        """Return what takes the messages of a topic, each with its number in it.
+
+        ``times`` are those of recording, where they count and not the stamp of each transform.
+        """
         topic = self._topics
         self._topics += 1
 
@@ -167,10 +186,14 @@ class TreeBuilder:
             order = (topic, number)
             for one in message.transforms if hasattr(message, "transforms") else [message]:
                 edge = (plain_frame(one.header.frame_id), plain_frame(one.child_frame_id))
+                if edge[0] == edge[1]:
+                    continue  # tf2 passes over it too
                 shift, turn = one.transform.translation, one.transform.rotation
                 numbers = [float(value) for value in (shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w)]
                 if not static:
-                    self._moving.setdefault(edge, _Rows()).add(order, stamp(one), numbers)
+                    self._moving.setdefault(edge, _Rows()).add(
+                        order, stamp(one) if times is None else int(times[number]), numbers
+                    )
                 elif edge not in self._static or order >= self._static[edge][0]:
                     self._static[edge] = (order, numbers)
 

@@ -216,9 +216,8 @@ class _RosSource(Source):
     def _read_episodes(self) -> list[Episode]:
         if is_folder(self.path) and is_file(self.path / "episodes.json"):
             return super()._read_episodes()
-        if len(self._recordings) == 1:
-            found = self._whole[0][2]
-        else:
+        found = _stated_episodes(self._whole)
+        if len(self._recordings) > 1 and not self._states_episodes(found):
             found = [_renamed(one) for one in joined_episodes(self._whole)]
         total = sum(count for _, count, _ in self._whole)
         starts, before = {}, 0
@@ -226,6 +225,11 @@ class _RosSource(Source):
             starts[name], before = before, before + count
         kept = sorted(starts[name] + number for name, number in self._numbers.values())
         return kept_episodes(checked_episodes(str(self), found, total), kept)
+
+    def _states_episodes(self, found: list[Episode]) -> bool:
+        """Whether every recording says what its episodes are called, each by a name of its own."""
+        stated = all(one.said.episodes is not None for one in self._recordings.values())
+        return stated and len({one.id for one in found}) == len(found)
 
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         name, number = self._numbers[sample_id]
@@ -295,6 +299,15 @@ def _episodes(recording: JoinedRecording | CloudRecording, name: str) -> list[Ep
         bare = Episode(said["id"], said["first"], said["length"], attributes=said.get("attributes", {}))
         found.append(episode(bare.id, bare.first, bare.length, bare.attributes))
     return checked_episodes(f"{recording.where}: topic /pcdata", found, len(times))
+
+
+def _stated_episodes(whole: list[tuple[str, int, list[Episode]]]) -> list[Episode]:
+    """Return the episodes of all recordings under their own names, which parts of one whole share across files."""
+    found, before = [], 0
+    for _, count, episodes in whole:
+        found += [replace(one, first=before + one.first) for one in episodes]
+        before += count
+    return found
 
 
 def _renamed(episode: Episode) -> Episode:

@@ -142,6 +142,6 @@ class RosMessages:
 
 def exact_as_doubles(values: Tensor) -> bool:
     """Say whether numbers are the same as float64."""
-    if values.is_floating_point() or values.dtype is torch.bool:
+    if values.dtype is not torch.int64:  # a comparison in fewer bits would wrap
         return True
-    return bool((values.abs() <= 1 << 53).all())
+    return bool(((values <= 1 << 53) & (values >= -(1 << 53))).all())

@@ -13,7 +13,7 @@ import torch
 
 from pcdata import open_source
 from pcdata.errors import CacheError, ConfigError, NoReadingError, PcdataError
-from pcdata.io import WRITERS, Writer, convert, register_writer
+from pcdata.io import WRITERS, SubsetSource, Writer, convert, register_writer
 from pcdata.io.sources.capture_source import episodes_of, signals_of
 from pcdata.io.writers.writer import KEPT
 from pcdata.structures import DepthFrame
@@ -75,6 +75,15 @@ def test_episodes_come_back_with_times_and_attributes(kind: str, tmp_path: Path)
         assert (after.id, after.first, after.length) == (before.id, before.first, before.length)
         assert after.times == pytest.approx(before.times, abs=1e-9)
         assert before.attributes.items() <= after.attributes.items()
+
+
+def test_parts_of_an_episode_still_know_the_whole_so_that_no_split_parts_them(kind: str, tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures(7))
+    made.episodes = [replace(one, id=f"set/{one.id}") for one in made.episodes]
+    cut = SubsetSource(made, [name for name in made.ids if name != "003"])
+    source = written(cut, kind, tmp_path / "out")
+    assert [one.id for one in episodes_of(source)] == ["set/pick 0", "set/pick 1~0", "set/pick 1~1"]
+    assert [one.whole for one in episodes_of(source)] == ["set/pick 0", "set/pick 1", "set/pick 1"]
 
 
 def test_depth_that_is_no_whole_units_comes_back_bit_for_bit_or_the_loss_is_told(kind: str, tmp_path: Path) -> None:

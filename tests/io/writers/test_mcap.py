@@ -107,6 +107,17 @@ def test_signals_are_arrays_and_texts_and_what_they_are_is_told(tmp_path: Path) 
     assert told["episodes"] == [{"id": "pick 1", "first": 0, "length": 2, "attributes": attributes}]
 
 
+def test_only_whole_numbers_that_no_float64_holds_are_told_as_rounded(tmp_path: Path) -> None:
+    small = {"u8": torch.tensor([[255]], dtype=torch.uint8), "i16": torch.tensor([[-300]], dtype=torch.int16)}
+    for name, values in (
+        ("exact", {**small, "count": torch.tensor([[1 << 53]])}),
+        ("big", {"id": torch.tensor([[-(1 << 63)]])}),
+    ):
+        signals = {key: Signal(one, "invariant") for key, one in values.items()}
+        made = MadeCaptures({"000": replace(made_frame(), recorded_signals=signals)})
+        assert ("signals" in convert(made, "mcap", tmp_path / name).lost) == (name == "big")
+
+
 def test_times_are_those_of_the_episode_on_the_clock_that_it_names(tmp_path: Path) -> None:
     start = 1_700_000_000_123_456_789
     made = made_captures(4)
