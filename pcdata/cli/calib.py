@@ -1,4 +1,4 @@
-"""Commands about calibration: calib check, calib intrinsics, calib hand-eye; of several cameras: see calib_rig."""
+"""Commands about calibration: calib check, calib intrinsics, calib hand-eye; others: see calib_rig and calib_droid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcdata.cli import calib_rig
+from pcdata.cli import calib_droid, calib_rig
 from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, open_captures, positive
 
@@ -25,7 +25,7 @@ def add_to(commands: Any) -> None:
     """Add the command, and under it one command per step."""
     calib = commands.add_parser("calib", help="check a depth camera, or calibrate it to its lens and to the robot")
     steps = calib.add_subparsers(required=True, metavar="STEP")
-    for add_step in (_add_check, _add_intrinsics, _add_hand_eye, calib_rig.add_steps):
+    for add_step in (_add_check, _add_intrinsics, _add_hand_eye, calib_rig.add_steps, calib_droid.add_step):
         add_step(steps)
     for step in steps.choices.values():
         step.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)

@@ -66,7 +66,9 @@ def with_droid_extrinsics(
 def _of_episode(where: str, said: Mapping[str, Any], episode: str | None) -> Mapping[str, Any]:
     if episode is None:
         if all(isinstance(one, Mapping) for one in said.values()) and said:
-            raise CaptureError(f"{where}: has {len(said)} episodes; say which: episode={next(iter(said))!r:.200}")
+            raise CaptureError(
+                f"{where}: has {len(said)} episodes; say which: episode={next(iter(said))!r:.200} (--episode)"
+            )
         return said
     if not isinstance(said.get(episode), Mapping):
         hint = near_matches(episode, list(said)[:10_000])

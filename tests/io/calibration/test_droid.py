@@ -11,7 +11,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pcdata import Calibration, Camera, with_droid_extrinsics
+from pcdata import Calibration, Camera, read_calibration, with_droid_extrinsics, write_calibration
+from pcdata.cli.main import main
 from pcdata.errors import CaptureError, PoseError
 
 EPISODE = "AUTOLab+0d4edc83+2023-10-21-19h-09m-36s"
@@ -67,3 +68,22 @@ def test_a_file_of_one_episode_may_hold_matrices(tmp_path: Path) -> None:
 def test_files_that_say_no_place_are_refused(said: Any, episode: Any, error: type, words: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=words):
         with_droid_extrinsics(recorded(), written(tmp_path / "a.json", said), episode=episode)
+
+
+def test_the_command_writes_what_the_function_returns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = written(tmp_path / "a.json", {EPISODE: {"23404442": SIX}})
+    write_calibration(tmp_path / "old.yaml", recorded())
+    call = ["calib", "droid", str(tmp_path / "old.yaml"), str(said), "--out", str(tmp_path / "new.yaml")]
+    assert main(call) == 1
+    assert "--episode" in capsys.readouterr().err
+    assert not (tmp_path / "new.yaml").exists()
+    assert main([*call, "--episode", EPISODE]) == 0
+    told = capsys.readouterr().out
+    assert "base_from_23404442" in told
+    assert "as they were: 29838012" in told
+    wanted = with_droid_extrinsics(recorded(), said, episode=EPISODE)
+    found = read_calibration(tmp_path / "new.yaml")
+    assert list(found.transforms) == list(wanted.transforms)
+    assert all(torch.equal(found.transforms[name], matrix) for name, matrix in wanted.transforms.items())
+    assert main([*call, "--episode", EPISODE]) != 0
+    assert "exists" in capsys.readouterr().err
