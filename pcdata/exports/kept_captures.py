@@ -18,7 +18,7 @@ from pcdata.structures import DepthFrame, Episode, Signal
 _FOLDER = "raw"  # beside the clouds, where the configuration says keep_raw
 
 
-class KeptCaptures:
+class _KeptCaptures:
     """The captures that a build kept beside its clouds, in the order of its samples."""
 
     kind = "kept captures"
@@ -79,7 +79,7 @@ def captures_of(target: str, dataset: SampleDataset) -> CaptureSource:
                 f"export: {target} is made of depth images, but {dataset!r} has clouds alone; give the captures that "
                 "it was built from, or build it with output: {keep_raw: true}, which keeps them"
             )
-        return KeptCaptures(dataset)
+        return _KeptCaptures(dataset)
     if dataset.repeats > 1:
         raise ConfigError(
             f"export: {target} is made of depth images, on which nothing is drawn, so {dataset.repeats} copies of each "

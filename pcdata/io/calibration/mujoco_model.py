@@ -21,7 +21,7 @@ from pcdata.geometry.rotations import rotation_from_quaternion
 _MAX_DEPTH = 200  # of elements within elements: a robot's bodies reach 30
 
 
-class MujocoCamera(NamedTuple):
+class _MujocoCamera(NamedTuple):
     """What a model says of one camera."""
 
     fovy: float | None  # degrees, vertical; None = not said here
@@ -31,7 +31,7 @@ class MujocoCamera(NamedTuple):
 class MujocoModel(NamedTuple):
     """What a model says of rendering."""
 
-    cameras: dict[str, MujocoCamera]
+    cameras: dict[str, _MujocoCamera]
     near: float | None  # metres; None = the extent is not said, which the compiler computes
     far: float | None
 
@@ -52,7 +52,7 @@ def read_mujoco_model(where: str, text: str) -> MujocoModel:
     planes = root.find("visual/map")
     near = None if extent is None else extent * (_number(where, planes, "znear") or 0.01)
     far = None if extent is None else extent * (_number(where, planes, "zfar") or 50.0)
-    cameras: dict[str, MujocoCamera] = {}
+    cameras: dict[str, _MujocoCamera] = {}
     for world in root.iter("worldbody"):
         waiting = [(world, True, 0)]
         while waiting:
@@ -67,17 +67,17 @@ def read_mujoco_model(where: str, text: str) -> MujocoModel:
     return MujocoModel(cameras, near, far)
 
 
-def _camera(where: str, element: ElementTree.Element, stands: bool) -> MujocoCamera:
+def _camera(where: str, element: ElementTree.Element, stands: bool) -> _MujocoCamera:
     fovy = _number(where, element, "fovy")
     turned_otherwise = any(element.get(name) is not None for name in ("euler", "xyaxes", "zaxis", "axisangle"))
     if not stands or turned_otherwise or element.get("mode", "fixed") != "fixed":
-        return MujocoCamera(fovy, None)
+        return _MujocoCamera(fovy, None)
     position = torch.tensor(_numbers(where, element, "pos", "0 0 0", 3), dtype=torch.float64, device="cpu")
     quaternion = torch.tensor(_numbers(where, element, "quat", "1 0 0 0", 4), dtype=torch.float64, device="cpu")
     if not float(quaternion.norm()) > 0:
         raise CaptureError(f"{where}: the quaternion is 0")
     pose = from_rotation_translation(rotation_from_quaternion(quaternion / quaternion.norm()), position)
-    return MujocoCamera(fovy, pose @ CAMERA_AXES["opengl"])
+    return _MujocoCamera(fovy, pose @ CAMERA_AXES["opengl"])
 
 
 def _number(where: str, element: ElementTree.Element | None, name: str) -> float | None:

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from pcdata.errors import CaptureError
-from pcdata.io.messages.fields import Fields
+from pcdata.io.messages.byte_fields import Fields
 from pcdata.io.messages.log_file import MAX_MESSAGE, Index, LogFile, Place, Read, by_topic
 from pcdata.io.messages.mcap_file import type_name
 from pcdata.io.messages.packing import UNPACKED, check_packing, unpacked

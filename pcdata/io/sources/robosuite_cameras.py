@@ -40,7 +40,7 @@ class StatedCameras:
     far: float | None
 
 
-class KnownCamera(NamedTuple):
+class _KnownCamera(NamedTuple):
     """What is known of one camera."""
 
     camera: Callable[[Size], Camera] | None  # of an image of this size
@@ -50,7 +50,7 @@ class KnownCamera(NamedTuple):
 class KnownCameras(NamedTuple):
     """What is known of the cameras of one demonstration."""
 
-    cameras: dict[str, KnownCamera]
+    cameras: dict[str, _KnownCamera]
     near: float | None  # metres, the planes between which depth was rendered
     far: float | None
 
@@ -69,7 +69,7 @@ def known_cameras(where: str, group: Any, names: Sequence[str], stated: StatedCa
     return KnownCameras(found, near, far)
 
 
-def _known(where: str, name: str, info: Any, model: MujocoModel, stated: StatedCameras) -> KnownCamera:
+def _known(where: str, name: str, info: Any, model: MujocoModel, stated: StatedCameras) -> _KnownCamera:
     camera: Callable[[Size], Camera] | None = None
     fovy, pose = model.cameras.get(name, (None, None))
     if fovy is not None:
@@ -82,7 +82,7 @@ def _known(where: str, name: str, info: Any, model: MujocoModel, stated: StatedC
     if (known := stated.calibration) is not None and name in known.cameras:
         camera = partial(_as_calibrated, camera=known.camera(name))
         pose = known.transform(stated.frame_id, name) if known.transforms else pose
-    return KnownCamera(camera, pose)
+    return _KnownCamera(camera, pose)
 
 
 def _of_info(where: str, name: str, info: Any) -> tuple[Callable[[Size], Camera], Tensor | None]:

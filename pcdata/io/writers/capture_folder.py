@@ -40,7 +40,7 @@ def write_capture(frame: DepthFrame, folder: str | os.PathLike[str]) -> None:
 
 @register_writer
 @dataclass(frozen=True, kw_only=True)
-class FolderWriter(Writer):
+class _FolderWriter(Writer):
     """The layout ``folder`` for one camera, ``rig`` for several; with ``episodes.json`` and ``timestamps.json``."""
 
     kind: ClassVar[str] = "folder"

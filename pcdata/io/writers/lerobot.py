@@ -60,7 +60,7 @@ _COMPRESSION = 3  # of PNG: half the time of the default, and as small
 
 @register_writer
 @dataclass(frozen=True, kw_only=True)
-class LeRobotWriter(Writer):
+class _LeRobotWriter(Writer):
     """LeRobot v3.0.
 
     Args:
@@ -150,7 +150,7 @@ class _Dataset:
 
     def __init__(
         self,
-        options: LeRobotWriter,
+        options: _LeRobotWriter,
         captures: Captures,
         folder: Path,
         sample_id: str,

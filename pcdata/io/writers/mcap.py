@@ -37,7 +37,7 @@ _MILLIMETRES = 0.001
 
 @register_writer
 @dataclass(frozen=True, kw_only=True)
-class McapWriter(Writer):
+class _McapWriter(Writer):
     """A ROS 2 recording of each episode, and of what lies between them.
 
     Args:
@@ -106,7 +106,7 @@ class _Recording:
     """One bag: makes topics when they are first needed, and says in ``/pcdata`` what they are."""
 
     def __init__(
-        self, writer: McapWriter, bag: Any, messages: RosMessages, captures: Captures, ids: list[str], episode: Any
+        self, writer: _McapWriter, bag: Any, messages: RosMessages, captures: Captures, ids: list[str], episode: Any
     ) -> None:
         self.writer, self.bag, self.messages, self.captures = writer, bag, messages, captures
         self._topics: dict[str, Any] = {}

@@ -27,7 +27,7 @@ KEPT: dict[str, Callable[[DepthFrame], bool]] = {
 
 
 @dataclass
-class Loss:
+class _Loss:
     """Something of captures that does not come back as it was.
 
     Args:
@@ -73,7 +73,7 @@ class WrittenReport:
     samples: int = 0
     episodes: int = 0
     size: int = 0
-    lost: dict[str, Loss] = field(default_factory=dict)
+    lost: dict[str, _Loss] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     not_read: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -137,7 +137,7 @@ class Captures:
         self, what: str, how: str, *, metres: float = 0.0, levels: int = 0, values: int = 0, captures: int = 0
     ) -> None:
         """Tell that something does not come back as it was; of what is told again, the largest difference counts."""
-        loss = self._report.lost.setdefault(what, Loss(how))
+        loss = self._report.lost.setdefault(what, _Loss(how))
         loss.metres, loss.levels = max(loss.metres, metres), max(loss.levels, levels)
         loss.values += values
         loss.captures += captures

@@ -60,7 +60,7 @@ def _top_first(view: DepthFrame) -> DepthFrame:
     return derived(view, depth=view.depth.flip(1))
 
 
-class Convention(NamedTuple):
+class _Convention(NamedTuple):
     """What a capture may be instead: the mistake in words, the captures set right, and how that is said."""
 
     subject: str  # of the mistake
@@ -69,25 +69,27 @@ class Convention(NamedTuple):
 
 
 # The mistake in words.
-CONVENTIONS: dict[str, Convention] = {
-    "camera_from_world, the inverse of what is needed": Convention(
+CONVENTIONS: dict[str, _Convention] = {
+    "camera_from_world, the inverse of what is needed": _Convention(
         "the poses", _of_pose(rigid.invert_rigid), "--option convention.poses=camera_from_world"
     ),
-    "rotations stored transposed": Convention("the poses", _of_pose(_transposed_rotation), ""),
-    "poses of OpenGL cameras (y up, z backwards)": Convention("the poses", _from_axes("opengl"), "--convention opengl"),
-    "view matrices of OpenGL (camera_from_world with y up, z backwards)": Convention(
+    "rotations stored transposed": _Convention("the poses", _of_pose(_transposed_rotation), ""),
+    "poses of OpenGL cameras (y up, z backwards)": _Convention(
+        "the poses", _from_axes("opengl"), "--convention opengl"
+    ),
+    "view matrices of OpenGL (camera_from_world with y up, z backwards)": _Convention(
         "the poses",
         _of_pose(lambda pose: rigid.invert_rigid(pose) @ CAMERA_AXES["opengl"].to(pose.device)),
         "--convention opengl --option convention.poses=camera_from_world",
     ),
-    "poses of CoppeliaSim's cameras (x left, y up)": Convention(
+    "poses of CoppeliaSim's cameras (x left, y up)": _Convention(
         "the poses", _from_axes("coppeliasim"), "--convention coppeliasim"
     ),
-    "poses of bodies (x forward, y left, z up)": Convention("the poses", _from_axes("body"), "--convention body"),
-    "translations in millimetres": Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-3)), ""),
-    "translations in centimetres": Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-2)), ""),
-    "lengths along the rays": Convention("the depth", _along_axis, "--option convention.depth=ray"),
-    "images whose bottom row is first": Convention("the depth", _top_first, "--option convention.rows=bottom_first"),
+    "poses of bodies (x forward, y left, z up)": _Convention("the poses", _from_axes("body"), "--convention body"),
+    "translations in millimetres": _Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-3)), ""),
+    "translations in centimetres": _Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-2)), ""),
+    "lengths along the rays": _Convention("the depth", _along_axis, "--option convention.depth=ray"),
+    "images whose bottom row is first": _Convention("the depth", _top_first, "--option convention.rows=bottom_first"),
 }
 
 
