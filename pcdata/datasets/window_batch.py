@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.datasets.windows import WINDOW
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.structures import PaddedClouds, PointCloud
-from pcdata.structures.signals import cloud_from_frame
+from pcdata.structures.signals import signals_now
 from pcdata.structures.structure import Structure
 from pcdata.structures.unbatched import Unbatched
 
@@ -87,11 +87,10 @@ def window_batch(where: str, windows: Sequence[PointCloud]) -> WindowBatch:
             )
     newest = torch.arange(num_obs - 1, len(clouds), num_obs, dtype=torch.int64, device=clouds.device)
     signals: dict[str, Any] = {}
-    now = clouds.signals
+    now = signals_now(clouds)
     for name, signal in clouds.recorded_signals.items():
         if name in actions:
-            way = None if signal.frame is None else cloud_from_frame(clouds, signal.frame)[newest]
-            signals[name] = signal.rows(newest).values if way is None else signal.rows(newest).moved(way)
+            signals[name] = now.of(name, newest)
         elif isinstance(signal.values, Tensor):
             signals[name] = now[name].unflatten(0, (-1, num_obs))
         else:

@@ -101,7 +101,7 @@ class PoseLayout:
     row: tuple[int, ...]  # shape of one pose
     holds: str  # in words
     rotation: Callable[[Tensor], Tensor]  # rotation part -> R (..., 3, 3), float64
-    turned: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q (..., 3, 3), quaternion (..., 4) -> Q R
+    turned: Callable[[Tensor, Tensor, Callable[[], Tensor]], Tensor]  # rotation part, Q, its quaternion (..., 4) -> Q R
     conjugated: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q, handedness (..., 1) -> Q R Q^T
     faults: Callable[[Tensor], list[Fault]]  # of rotation parts; of poses that are 4x4, of those
     has_position: bool = True
@@ -139,7 +139,7 @@ Ways = dict[str, Callable[..., Tensor | list[Fault]]]
 def _by_matrix(rotation: Callable[[Tensor], Tensor], written: Callable[[Tensor], Tensor]) -> Ways:
     """Return how a rotation part is moved by way of its matrix."""
 
-    def turned(part: Tensor, matrix: Tensor, quaternion: Tensor) -> Tensor:
+    def turned(part: Tensor, matrix: Tensor, quaternion: Callable[[], Tensor]) -> Tensor:
         return written(_product(matrix, rotation(part)))
 
     def conjugated(part: Tensor, matrix: Tensor, handedness: Tensor) -> Tensor:
@@ -152,10 +152,10 @@ def _quaternion(w_last: bool) -> Ways:
     def rotation_of(part: Tensor) -> Tensor:
         return rotations.rotation_from_quaternion(part.roll(1, -1) if w_last else part)
 
-    def turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
+    def turned(part: Tensor, rotation: Tensor, quaternion: Callable[[], Tensor]) -> Tensor:
         if w_last:
-            return rotations.multiplied(quaternion, part.roll(1, -1)).roll(-1, -1)
-        return rotations.multiplied(quaternion, part)
+            return rotations.multiplied(quaternion(), part.roll(1, -1)).roll(-1, -1)
+        return rotations.multiplied(quaternion(), part)
 
     def conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
         w, v = (part[..., 3:], part[..., :3]) if w_last else (part[..., :1], part[..., 1:])
@@ -218,8 +218,8 @@ def _rotation_vector() -> Ways:
     def matrix(part: Tensor) -> Tensor:
         return rotations.rotation_from_quaternion(rotations.quaternion_from_rotation_vector(part))
 
-    def turned(part: Tensor, rotation: Tensor, quaternion: Tensor) -> Tensor:
-        moved = rotations.multiplied(quaternion, rotations.quaternion_from_rotation_vector(part))
+    def turned(part: Tensor, rotation: Tensor, quaternion: Callable[[], Tensor]) -> Tensor:
+        moved = rotations.multiplied(quaternion(), rotations.quaternion_from_rotation_vector(part))
         return rotations.rotation_vector_from_quaternion(moved)
 
     def conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ def _moved_pose(values: Tensor, motion: Motion, layout: PoseLayout | None) -> Te
     position, rotation = layout.parts(values)
     axes = len(layout.row)
     turned = layout.turned(
-        rotation, per_cloud(motion.rotation, values, axes), per_cloud(motion.quaternion, values, axes)
+        rotation, per_cloud(motion.rotation, values, axes), lambda: per_cloud(motion.quaternion, values, axes)
     )
     return layout.joined(values, None if position is None else _moved_position(position, motion, None), turned)
 

@@ -121,12 +121,12 @@ class Signal(Structure):
 Signals = Mapping[str, Signal]
 
 
-def signals_now(clouds: CloudBatch) -> Mapping[str, Any]:
+def signals_now(clouds: CloudBatch) -> MovedSignals:
     """Return the signals of clouds by name, in the coordinates that these have now."""
-    return _MovedSignals(clouds)
+    return MovedSignals(clouds)
 
 
-class _MovedSignals(Mapping[str, Any]):
+class MovedSignals(Mapping[str, Any]):
     """The signals of clouds in the coordinates that these have now, by name; each is computed when it is read."""
 
     def __init__(self, clouds: CloudBatch) -> None:
@@ -138,11 +138,22 @@ class _MovedSignals(Mapping[str, Any]):
         if name not in self._recorded:
             raise KeyError(f"the clouds have no signal {name!r}; they have {sorted(self._recorded)}")
         signal = self._recorded[name]
+        return signal.values if signal.frame is None else self._moved(name, signal, self._motion(signal.frame))
+
+    def of(self, name: str, which: Tensor) -> Values:
+        """Return the values of some clouds alone, by (M,) int64 indices: the others are not computed."""
+        signal = self._recorded[name].rows(which)
         if signal.frame is None:
             return signal.values
-        if signal.frame not in self._motions:
-            self._motions[signal.frame] = motion_by(cloud_from_frame(self._clouds, signal.frame))
-        return _moved(f"{type(self._clouds).__name__}.signals[{name!r}]", signal, self._motions[signal.frame])
+        return self._moved(name, signal, motion_by(self._motion(signal.frame).matrix[which]))
+
+    def _motion(self, frame: str) -> Any:
+        if frame not in self._motions:
+            self._motions[frame] = motion_by(cloud_from_frame(self._clouds, frame))
+        return self._motions[frame]
+
+    def _moved(self, name: str, signal: Signal, motion: Any) -> Values:
+        return _moved(f"{type(self._clouds).__name__}.signals[{name!r}]", signal, motion)
 
     def __contains__(self, name: object) -> bool:
         return name in self._recorded  # without computing it

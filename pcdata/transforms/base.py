@@ -199,24 +199,26 @@ class Transform(nn.Module):
         Raises:
             TooFewPointsError: a cloud has lost its last point, or never had one.
         """
-        steps = []
-        small = _small(params, len(after))
-        beginnings = self._steps(len(after))
-        for b, (beginning, count) in enumerate(zip(beginnings, after)):
-            facts: dict[str, Any] = {"points": count}
-            if before is not None and len(before) == len(after):
-                facts = {"points_before": before[b], "points": count}
-                if before[b] > 0 and count == 0:
-                    raise TooFewPointsError(
-                        f"{type(self).__name__}: nothing is left of cloud {b}{sample_name(result, b)}: "
-                        f"0 of {before[b]} points; check its fields against the cloud's extent and frame"
-                    )
-            elif count == 0:
+        keeps = before is not None and len(before) == len(after)
+        earlier: list[int | None] = [*before] if before is not None and keeps else [None] * len(after)
+        for b, (had, count) in enumerate(zip(earlier, after)):
+            if count or had == 0:
+                continue
+            if had is not None:
                 raise TooFewPointsError(
-                    f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
-                    "before left none (masks, ranges, crops); leave the capture out, or widen those"
+                    f"{type(self).__name__}: nothing is left of cloud {b}{sample_name(result, b)}: "
+                    f"0 of {had} points; check its fields against the cloud's extent and frame"
                 )
-            steps.append({**beginning, "params": small[b], **facts})
+            raise TooFewPointsError(
+                f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
+                "before left none (masks, ranges, crops); leave the capture out, or widen those"
+            )
+        steps = self._steps(len(after))
+        for step, own, had, count in zip(steps, _small(params, len(after)), earlier, after):
+            step["params"] = own
+            if keeps:
+                step["points_before"] = had
+            step["points"] = count
         return result.with_steps(steps)
 
     def _steps(self, count: int) -> list[dict[str, Any]]:
