@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import CacheError, CaptureError, PcdataError
-from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file, open_input
+from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, existing_file, open_input
 from pcdata.files.sample_names import check_known, in_order, name_some, positions
 from pcdata.files.strict_json import json_object
 from pcdata.io.arrays.hdf5_arrays import checked_dataset, hard_linked, open_hdf5
 from pcdata.io.sources.joined_views import join_views
-from pcdata.io.sources.listing import absolute, is_file
+from pcdata.io.sources.listing import absolute, is_file, is_folder, visible_files
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.stated_kinds import KindAndFrame, check_stated_names, kind_of, signal_of, stated_kinds
 from pcdata.structures import DepthFrame, Episode, Signal
@@ -34,6 +34,7 @@ from pcdata.structures import DepthFrame, Episode, Signal
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _SUFFIXES = (".h5", ".hdf5")
 _MAX_EPISODES = 100_000
+_MAX_FILES = 100  # of a folder that are looked into
 _MAX_STREAMS = 1000  # in one episode
 _MAX_TEXT = 1 << 24  # characters of one attribute: the model of a kitchen takes some millions
 
@@ -118,8 +119,40 @@ class DemonstrationSource(Source):
         self._positions = positions(self._ids)
 
     @classmethod
+    def file_of(cls, path: Path) -> Path:
+        """Return the file that is given, or the only one of this layout in the folder that is given.
+
+        Raises:
+            CaptureError: there are several, or it is a link that leads out of the folder.
+        """
+        path = absolute(path)
+        if not is_folder(path):
+            return path
+        where = f"{cls.kind} source {path}"
+        found = cls._in_folder(path)
+        if len(found) != 1:
+            if not found:
+                raise CaptureError(f"{where}: no such file; this layout needs {cls.needs}")
+            names = name_some(file.name for file in found)
+            raise CaptureError(f"{where}: holds {names}; give the path of one, or '{path}/*{found[0].suffix}' for all")
+        check_inside(where, found[0], [path])
+        return found[0]
+
+    @classmethod
     def recognizes(cls, path: Path) -> bool:
-        """An HDF5 file with such episodes."""
+        """An HDF5 file with such episodes, or a folder with one."""
+        try:
+            return bool(cls._in_folder(path)) if is_folder(path) else cls._is_recording(path)
+        except CaptureError:
+            return False
+
+    @classmethod
+    def _in_folder(cls, folder: Path) -> list[Path]:
+        files = visible_files(folder, lambda name: Path(name).suffix.lower() in _SUFFIXES)
+        return [file for file in files[:_MAX_FILES] if cls._is_recording(file)]
+
+    @classmethod
+    def _is_recording(cls, path: Path) -> bool:
         if not is_file(path) or path.suffix.lower() not in _SUFFIXES:
             return False
         try:

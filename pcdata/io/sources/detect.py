@@ -13,7 +13,7 @@ from pcdata.io.sources.source import Source
 
 # Signs that other layouts may have too, where they have more: a recording that lies beside a capture is not the
 # capture, and any folder may have an image with the word depth in its name.
-_LESS_EXACT = ("realsense_bag", "azure_kinect", "ros", "pairs")
+_LESS_EXACT = ("realsense_bag", "azure_kinect", "ros", "robomimic", "maniskill", "pairs", "lerobot")
 
 _LONGEST_START = 16  # bytes
 _ANY_SIZE = 1 << 50  # of a recording only the start is read

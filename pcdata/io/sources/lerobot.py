@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, near_matches
 from pcdata.files.handles import Handles
+from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, name_some
 from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
 from pcdata.io.arrays.parquet import ParquetColumns
@@ -37,7 +38,7 @@ from pcdata.io.sources.lerobot_pictures import Pictures
 from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
 from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
 from pcdata.io.sources.listed import checked_folder
-from pcdata.io.sources.listing import LinkTargets, has_file, is_file, link_targets
+from pcdata.io.sources.listing import LinkTargets, absolute, entries, has_file, is_file, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole, check_switch
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
@@ -48,6 +49,7 @@ _TASK = "task"
 _LANGUAGE = ("language_persistent", "language_events")
 _MOST_NUMBERS = 1 << 14  # of a signal: more are an image or a cloud
 _NAMED = 0.001  # probability above which a unit is worth a mention
+_MAX_LOOKED_INTO = 100  # entries of a folder that is no dataset, of which one may be
 
 
 @register_layout
@@ -77,7 +79,7 @@ class _LeRobotSource(Source):
         """Read what the dataset says of itself, and where its steps are.
 
         Args:
-            path: the folder.
+            path: the folder, or one that holds one such folder.
             camera: read this one, or these in their order; None = all that have depth, as views of one sample.
             clouds: read the point clouds of ``observation.pointcloud``; None = where there is no depth.
             metres_per_unit: of stored depth, or of the coordinates of clouds, where the dataset does not state it; or
@@ -97,8 +99,9 @@ class _LeRobotSource(Source):
             ConfigError: an option has no such value, or names what is not there.
             MissingExtraError: pyarrow is not installed, or av where there are videos.
         """
-        path = checked_folder(self.kind, path, self.needs, INFO)
+        given, path = absolute(path), checked_folder(self.kind, _dataset_of(path), self.needs, INFO)
         where = f"{self.kind} source {path}"
+        check_inside(where, path, [given, *link_targets(links_to)])
         self._inside = [path, *link_targets(links_to)]
         self._invalid = check_invalid_values(where, invalid_values)
         self._direction = check_direction(where, extrinsics)
@@ -136,8 +139,8 @@ class _LeRobotSource(Source):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        """``meta/info.json`` beside ``data``."""
-        return is_file(path / INFO) and (path / "data").is_dir()
+        """``meta/info.json`` beside ``data``, or a folder with one such folder."""
+        return _is_dataset(_dataset_of(path))
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
@@ -512,3 +515,19 @@ def _check_sizes(where: str, streams: Sequence[DepthStream]) -> None:
             f"{where}: its cameras have images of different sizes ({told}), which are no views of one sample; say "
             "which to read: camera=NAME (--camera NAME)"
         )
+
+
+def _is_dataset(path: Path) -> bool:
+    return is_file(path / INFO) and (path / "data").is_dir()
+
+
+def _dataset_of(path: Path) -> Path:
+    """Return the only dataset in a folder that is none itself, or the path as it is."""
+    if _is_dataset(path):
+        return path
+    try:
+        found = entries(path) if is_folder(path) else []
+    except CaptureError:
+        return path
+    inside = [entry for entry in found if _is_dataset(entry)] if len(found) <= _MAX_LOOKED_INTO else []
+    return inside[0] if len(inside) == 1 else path

@@ -41,7 +41,7 @@ from pcdata.io.sources.demonstrations import (
 )
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.listed import one_of
-from pcdata.io.sources.listing import absolute, has_file
+from pcdata.io.sources.listing import has_file
 from pcdata.io.sources.option_checks import check_label, check_name
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.rendered_images import centered_camera
@@ -69,8 +69,9 @@ class _ManiSkillSource(DemonstrationSource):
 
     kind = "maniskill"
     needs = (
-        "an .h5 file with traj_N/obs/sensor_data/CAMERA/depth and obs/sensor_param/CAMERA (obs_mode rgb+depth or "
-        "sensor_data), as RecordEpisode writes it; optional rgb, segmentation, actions, and the .json beside it"
+        "an .h5 file (or a folder with one) with traj_N/obs/sensor_data/CAMERA/depth and obs/sensor_param/CAMERA "
+        "(obs_mode rgb+depth or sensor_data), as RecordEpisode writes it; optional rgb, segmentation, actions, and the "
+        ".json beside it"
     )
 
     def __init__(
@@ -85,7 +86,7 @@ class _ManiSkillSource(DemonstrationSource):
         """Read the names and the number of steps.
 
         Args:
-            path: the file.
+            path: the file, or a folder with one such file.
             camera: read this one alone; None = all, as views of one sample.
             signals: kinds of observations and actions by name, see :func:`stated_kinds`; None leaves one out. Without
                 ``action`` the last observation of every trajectory is read too.
@@ -96,7 +97,7 @@ class _ManiSkillSource(DemonstrationSource):
             CaptureError: no trajectory has depth, arrays of one have different lengths, or the file is damaged.
             ConfigError: an option is wrong.
         """
-        path = absolute(path)
+        path = self.file_of(path)
         where = f"{self.kind} source {path}"
         self._label = check_label(where, background_label)
         frame = check_name(where, "frame_id", frame_id) or _WORLD

@@ -46,7 +46,6 @@ from pcdata.io.sources.demonstrations import (
 )
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.listed import one_of
-from pcdata.io.sources.listing import absolute
 from pcdata.io.sources.option_checks import check_label, check_name, check_numbers, check_pinhole
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.rendered_images import ROWS
@@ -73,8 +72,9 @@ class _RobomimicSource(DemonstrationSource):
 
     kind = "robomimic"
     needs = (
-        "an .hdf5 file with data/demo_N/obs/CAMERA_depth; optional CAMERA_image, CAMERA_segmentation_LEVEL, other obs, "
-        "actions, rewards; camera_info or model_file of each demonstration, or the options"
+        "an .hdf5 file (or a folder with one) with data/demo_N/obs/CAMERA_depth; optional CAMERA_image, "
+        "CAMERA_segmentation_LEVEL, other obs, actions, rewards; camera_info or model_file of each demonstration, or "
+        "the options"
     )
 
     def __init__(
@@ -96,7 +96,7 @@ class _RobomimicSource(DemonstrationSource):
         """Read the names, the number of steps and what is said of the cameras.
 
         Args:
-            path: the file.
+            path: the file, or a folder with one such file.
             camera: read this one alone; None = all whose poses are known, as views of one sample.
             intrinsics: (fx, fy, cx, cy) in pixels of ``camera``, where the file does not say them.
             calibration: a :class:`Calibration` or its file: its cameras go before what the file says of them, and so
@@ -115,7 +115,7 @@ class _RobomimicSource(DemonstrationSource):
             IntrinsicsError: nothing says the intrinsics of a camera.
             ConfigError: nothing says whether depth is metres or a buffer or which row is first, or an option is wrong.
         """
-        path = absolute(path)
+        path = self.file_of(path)
         where = f"{self.kind} source {path}"
         self._label = check_label(where, background_label)
         self.near, self.far = near, far
