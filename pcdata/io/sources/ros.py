@@ -14,7 +14,8 @@ from pcdata.files.sample_names import check_known, in_order, name_some
 from pcdata.io.messages.camera_streams import Choice, image_topics, told
 from pcdata.io.messages.clock import CLOCKS, Clock
 from pcdata.io.messages.cloud_recording import CloudRecording, cloud_topics
-from pcdata.io.messages.joined_recording import JoinedRecording, Joining
+from pcdata.io.messages.joined_recording import JoinedRecording
+from pcdata.io.messages.joined_topics import Joining
 from pcdata.io.messages.message_log import CONTAINERS, METADATA, MessageLog, container_of, opened_log
 from pcdata.io.sources.listing import LinkTargets, absolute, entries, is_file, is_folder, link_targets
 from pcdata.io.sources.option_checks import (
