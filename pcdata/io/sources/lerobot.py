@@ -33,7 +33,8 @@ from pcdata.io.sources.lerobot_cameras import (
 )
 from pcdata.io.sources.lerobot_clouds import CloudColumns, cloud_columns
 from pcdata.io.sources.lerobot_facts import DTYPES, FACTS, IMAGES, SignalFacts, facts_of_json
-from pcdata.io.sources.lerobot_index import INDEX_COLUMNS, INFO, RecordedEpisode, read_index, read_json
+from pcdata.io.sources.lerobot_files import INDEX_COLUMNS, INFO, read_json
+from pcdata.io.sources.lerobot_index import RecordedEpisode, read_index
 from pcdata.io.sources.lerobot_pictures import Pictures
 from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
 from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers

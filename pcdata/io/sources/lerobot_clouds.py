@@ -16,7 +16,8 @@ import numpy as np
 from pcdata.errors import CaptureError, FrameError, UnitError
 from pcdata.io.sources.lerobot_cameras import unit_named
 from pcdata.io.sources.lerobot_facts import DatasetFacts
-from pcdata.io.sources.lerobot_index import LeRobotIndex, read_json
+from pcdata.io.sources.lerobot_files import read_json
+from pcdata.io.sources.lerobot_index import LeRobotIndex
 from pcdata.structures import PointCloud
 
 CLOUD = "observation.pointcloud"

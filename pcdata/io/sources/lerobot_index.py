@@ -18,26 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
-from pcdata.files.opening import check_inside, read_text
+from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
 from pcdata.files.strict_json import json_object
 from pcdata.io.arrays.parquet import ParquetColumns
-from pcdata.io.sources.listing import entries, has_file, is_folder
+from pcdata.io.sources.lerobot_files import INDEX_COLUMNS, INFO, MAX_TEXT, TASKS_PATH, LeRobotFiles
+from pcdata.io.sources.listing import has_file
 
-INFO = "meta/info.json"
-INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-TASKS_PATH = "meta/tasks.parquet"
-_DATA = {3: DATA_PATH,
-         2: "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"}  # fmt: skip
-_VIDEO = {3: VIDEO_PATH,
-          2: "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"}  # fmt: skip
-_FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 _VIDEO_COLUMN = re.compile(r"videos/(.+)/chunk_index")
 _VIDEO_PARTS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-_MAX_TEXT = 1 << 28
 _MOST = 1 << 40  # of any number in the index
 _LATEST = 1e9  # seconds into a video
 
@@ -98,12 +87,12 @@ def read_index(where: str, root: Path, inside: Sequence[Path]) -> LeRobotIndex:
     Raises:
         CaptureError: a file is missing, damaged or outside, or its numbers contradict each other.
     """
-    text = read_text(where, root / INFO, max_bytes=_MAX_TEXT, inside=inside)
+    text = read_text(where, root / INFO, max_bytes=MAX_TEXT, inside=inside)
     info = json_object(f"{where}: {INFO}", text, error=CaptureError)
     version, features, fps = _version(where, info), _features(where, info), _fps(where, info)
     read = _episodes_v3 if version == 3 else _episodes_v2
     keys = [key for key, said in features.items() if "video" in str(said.get("dtype"))]
-    listed, tasks = read(_Opened(where, root, inside, info, version), keys)
+    listed, tasks = read(LeRobotFiles(where, root, inside, info, version), keys)
     episodes, absent = [], []
     files: dict[str, list[dict[str, Any]]] = {}
     for one in listed:
@@ -116,66 +105,6 @@ def read_index(where: str, root: Path, inside: Sequence[Path]) -> LeRobotIndex:
     if not episodes:
         raise CaptureError(f"{where}: none of its files of rows is there, such as {next(iter(files), 'any')}")
     return LeRobotIndex(info, features, fps, tuple(sorted(episodes, key=lambda one: one.number)), tuple(sorted(absent)))
-
-
-@dataclass(frozen=True)
-class _Opened:
-    where: str
-    root: Path
-    inside: Sequence[Path]
-    info: Mapping[str, Any]
-    version: int
-
-    def path(self, key: str, default: Mapping[int, str], **fields: Any) -> str:
-        """Fill in the pattern of a path; the result lies in the folder.
-
-        Raises:
-            CaptureError: it has other fields, or leads elsewhere.
-        """
-        template = self.info.get(key) or default[self.version]
-        if not isinstance(template, str) or len(template) > 500:
-            raise CaptureError(f"{self.where}: {INFO}: {key} must be a pattern of paths, got {template!r:.100}")
-
-        def filled(match: re.Match[str]) -> str:
-            name, width = match.groups()
-            if name not in fields or (width and not isinstance(fields[name], int)):
-                raise CaptureError(
-                    f"{self.where}: {INFO}: {key} {template!r:.200} has a field {match[0]!r} that is not known"
-                )
-            return str(fields[name]).zfill(int(width or 0))
-
-        path = _FIELD.sub(filled, template)
-        parts = path.replace("\\", "/").split("/")
-        if "{" in path or "}" in path or path.startswith(("/", "\\", "~")) or ".." in parts or ":" in path:
-            raise CaptureError(
-                f"{self.where}: {INFO}: {key} {template!r:.200} leads out of the dataset, to {path!r:.200}"
-            )
-        return path
-
-    def video(self, key: str, **fields: Any) -> str:
-        """Return the file of a video; depth without loss is in .mkv files where the pattern says .mp4."""
-        path = self.path("video_path", _VIDEO, video_key=key, **fields)
-        other = f"{path.rpartition('.')[0]}.mkv"
-        return other if not has_file(self.root / path) and has_file(self.root / other) else path
-
-    def lines(self, name: str) -> list[dict[str, Any]]:
-        """Read a file of one JSON object a line."""
-        text = read_text(self.where, self.root / name, max_bytes=_MAX_TEXT, inside=self.inside)
-        return [
-            json_object(f"{self.where}: {name} line {number}", line, error=CaptureError)
-            for number, line in enumerate(text.splitlines(), 1)
-            if line.strip()
-        ]
-
-    def tables(self, folder: str) -> list[ParquetColumns]:
-        """Open the Parquet files of a folder of chunks, in order."""
-        found = []
-        for chunk in entries(self.root / folder) if is_folder(self.root / folder) else []:
-            if is_folder(chunk):
-                found += [one for one in entries(chunk) if one.suffix == ".parquet"]
-        if not found:
-            raise CaptureError(f"{self.where}: has no {folder}/chunk-000/file-000.parquet")
-        return [ParquetColumns(self.where, path, self.inside) for path in sorted(found)]
 
 
 def _version(where: str, info: Mapping[str, Any]) -> int:
@@ -208,7 +137,7 @@ def _fps(where: str, info: Mapping[str, Any]) -> float:
     return float(fps)
 
 
-def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
+def _episodes_v3(opened: LeRobotFiles, _: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
     needed = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
     listed = []
     for table in opened.tables("meta/episodes"):
@@ -243,7 +172,7 @@ def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]
                     "number": said["episode_index"],
                     "length": said["length"],
                     "first": said["dataset_from_index"],
-                    "file": opened.path("data_path", _DATA, chunk_index=chunk, file_index=file),
+                    "file": opened.rows(chunk_index=chunk, file_index=file),
                     "videos": at,
                 }
             )
@@ -252,7 +181,7 @@ def _episodes_v3(opened: _Opened, _: Sequence[str]) -> tuple[list[dict[str, Any]
     return listed, _tasks_v3(opened)
 
 
-def _check_videos_apart(opened: _Opened, listed: list[dict[str, Any]]) -> None:
+def _check_videos_apart(opened: LeRobotFiles, listed: list[dict[str, Any]]) -> None:
     """Require episodes that share no picture: each would show what the other did."""
     half = 0.5 / _fps(opened.where, opened.info)
     parts: dict[tuple[str, str], list[tuple[float, float, int]]] = {}
@@ -282,7 +211,7 @@ def _check_apart(where: str, listed: list[dict[str, Any]]) -> None:
         end = one["first"] + one["length"]
 
 
-def _tasks_v3(opened: _Opened) -> dict[int, str]:
+def _tasks_v3(opened: LeRobotFiles) -> dict[int, str]:
     path = opened.root / TASKS_PATH
     if not has_file(path):
         return {}
@@ -298,7 +227,7 @@ def _tasks_v3(opened: _Opened) -> dict[int, str]:
     return _tasks(opened.where, [*zip(columns["task_index"], columns[text])])
 
 
-def _episodes_v2(opened: _Opened, keys: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
+def _episodes_v2(opened: LeRobotFiles, keys: Sequence[str]) -> tuple[list[dict[str, Any]], dict[int, str]]:
     chunks = opened.info.get("chunks_size", 1000)
     if not isinstance(chunks, int) or isinstance(chunks, bool) or not 0 < chunks < 1 << 31:
         raise CaptureError(f"{opened.where}: {INFO}: chunks_size must be a whole number from 1, got {chunks!r:.60}")
@@ -312,7 +241,7 @@ def _episodes_v2(opened: _Opened, keys: Sequence[str]) -> tuple[list[dict[str, A
                 "number": number,
                 "length": length,
                 "first": first,
-                "file": opened.path("data_path", _DATA, **fields),
+                "file": opened.rows(**fields),
                 "videos": {key: (opened.video(key, **fields), 0.0, math.inf) for key in keys},
             }
         )
@@ -377,11 +306,3 @@ def _whole(where: str, name: str, value: Any) -> int:
     if not is_whole or not 0 <= value < _MOST:
         raise CaptureError(f"{where}: {name} must be a whole number from 0, got {value!r:.60}")
     return int(value)
-
-
-def read_json(where: str, root: Path, name: str, inside: Sequence[Path]) -> dict[str, Any] | None:
-    """Return a JSON object of the dataset; None where there is no such file."""
-    if not has_file(root / name):
-        return None
-    check_inside(where, root / name, inside)
-    return json_object(f"{where}: {name}", read_text(where, root / name, max_bytes=_MAX_TEXT), error=CaptureError)

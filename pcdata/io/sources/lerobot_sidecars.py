@@ -20,7 +20,8 @@ from pcdata.io.sources.lerobot_cameras import (
     size_of,
     unit_named,
 )
-from pcdata.io.sources.lerobot_index import LeRobotIndex, read_json
+from pcdata.io.sources.lerobot_files import read_json
+from pcdata.io.sources.lerobot_index import LeRobotIndex
 from pcdata.io.sources.listing import entries, has_file, is_folder
 
 _META, _RAW_FOLDER = "depth_meta.json", "depth"

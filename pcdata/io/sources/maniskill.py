@@ -25,16 +25,14 @@ from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import invert_rigid
 from pcdata.io.calibration.foreign_cameras import matrix_of, pinhole_of_matrix
+from pcdata.io.sources.demonstration_file import arrays_below, episode_names, opened
 from pcdata.io.sources.demonstrations import (
     Demonstration,
     DemonstrationSource,
     Steps,
     Stream,
-    arrays_below,
     check_lengths,
     color_of,
-    episode_names,
-    opened,
     plane_of,
     same_cameras,
     sample_name,

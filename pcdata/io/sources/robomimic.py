@@ -28,20 +28,16 @@ from pcdata.files.sample_names import in_order, name_some
 from pcdata.functional.depth.rendered import check_planes, z_of_rendered
 from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.io.arrays.hdf5_arrays import hard_linked
+from pcdata.io.sources.demonstration_file import arrays_below, episode_names, json_attribute, opened, text_attribute
 from pcdata.io.sources.demonstrations import (
     Demonstration,
     DemonstrationSource,
     Steps,
     Stream,
-    arrays_below,
     check_lengths,
     color_of,
-    episode_names,
-    json_attribute,
-    opened,
     plane_of,
     same_cameras,
-    text_attribute,
     without_frame,
 )
 from pcdata.io.sources.frame_files import make_frame

@@ -13,7 +13,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError
 from pcdata.io.calibration.foreign_cameras import matrix_of, pinhole, pinhole_of_matrix
 from pcdata.io.calibration.mujoco_model import MujocoModel, read_mujoco_model
-from pcdata.io.sources.demonstrations import json_attribute, number_attribute, text_attribute
+from pcdata.io.sources.demonstration_file import json_attribute, number_attribute, text_attribute
 from pcdata.io.sources.rendered_images import centered_camera
 from pcdata.structures import Calibration, Camera
 

@@ -26,7 +26,7 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth.stored_depth import metres_of_value
 from pcdata.io.sources.lerobot_facts import FACTS, IMAGES, CameraFacts, DatasetFacts, EpisodeFacts
-from pcdata.io.sources.lerobot_index import DATA_PATH, INFO, VIDEO_PATH
+from pcdata.io.sources.lerobot_files import DATA_PATH, INFO, VIDEO_PATH
 from pcdata.io.writers.lerobot_columns import (
     camera_names,
     derived_columns,

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.sources.lerobot_facts import DTYPES, SignalFacts
-from pcdata.io.sources.lerobot_index import INDEX_COLUMNS
+from pcdata.io.sources.lerobot_files import INDEX_COLUMNS
 from pcdata.structures import DepthFrame, Signal
 
 _TASKS = ("task", "instruction", "language_instruction", "language")

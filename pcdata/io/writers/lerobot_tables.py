@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.extras import require
-from pcdata.io.sources.lerobot_index import DATA_PATH, EPISODES_PATH, TASKS_PATH
+from pcdata.io.sources.lerobot_files import DATA_PATH, EPISODES_PATH, TASKS_PATH
 from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK
 
 FILE_MEGABYTES = 100

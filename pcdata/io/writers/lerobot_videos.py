@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError
 from pcdata.extras import require
-from pcdata.io.sources.lerobot_index import VIDEO_PATH
+from pcdata.io.sources.lerobot_files import VIDEO_PATH
 
 FILES_IN_CHUNK = 1000
 FILE_MEGABYTES = 200
