@@ -24,9 +24,11 @@ from pcdata.structures import Confidence, DepthFrame, confidence_of
 class AveragedSource(CombinedSource):
     """Averages every ``num_frames`` consecutive captures of a source into one with less noise and fewer holes.
 
-    A sample bears the id, colors, labels, pose and mask of the first capture of its group. Its provenance tells what
-    was averaged and what was dropped: ``averaged: {frames, readings, jitter, jumps, too_few, noise}``, counts of
-    readings and of pixels, and the median standard deviation of a single reading in metres.
+    A sample bears the id, colors, labels, pose, mask and signals of the first capture of its group: a state and an
+    action are those of one moment, as recorded; none is averaged. Its provenance tells what was averaged and what was
+    dropped: ``averaged: {frames, readings, jitter, jumps, too_few, noise}``, counts of readings and of pixels, and
+    the median standard deviation of a single reading in metres; and ``changing_signals``, the names of those signals
+    that were not the same in all captures of the group.
 
     Readings with the confidence NO_READING count for nothing; with any other, an average is as good as the worst of its
     readings. Groups follow the order of the ids within one recording; every group must show a still scene from still
@@ -62,7 +64,9 @@ class AveragedSource(CombinedSource):
         if self.num_frames < 2 or not 1 <= self.min_count <= self.num_frames or not 0 <= self.max_moving <= 1:
             raise ConfigError(
                 f"{where}: needs num_frames >= 2, 1 <= min_count <= num_frames and 0 <= max_moving <= 1, got "
-                f"{self.num_frames}, {self.min_count}, {self.max_moving}"
+                f"num_frames {self.num_frames}, min_count {self.min_count}, max_moving {self.max_moving}"
+                + f"; say min_count={self.num_frames} too"
+                * (2 <= self.num_frames < self.min_count)
             )
         if not (self.mad_factor > 0 and self.resolution >= 0 and self.max_jump > 0):
             raise ConfigError(
@@ -71,12 +75,16 @@ class AveragedSource(CombinedSource):
             )
         checked_ids(where, self.source)
         groups: dict[str, list[str]] = {}
-        for ids in recordings_of(self.source):
-            if len(ids) % self.num_frames:
-                raise CaptureError(
-                    f"{where}: {len(ids)} captures are no whole number of groups of {self.num_frames}; take a subset "
-                    f"or another num_frames ({ids[0]!r} .. {ids[-1]!r})"
-                )
+        recordings = [list(ids) for ids in recordings_of(self.source)]
+        over = [name for ids in recordings for name in ids[len(ids) - len(ids) % self.num_frames :]]
+        if over:
+            raise CaptureError(
+                f"{where}: {' and '.join(str(len(ids)) for ids in recordings[:5])}{' ...' * (len(recordings) > 5)} "
+                f"captures are no whole number of groups of {self.num_frames}; leave out the {len(over)} at the end of "
+                f"each recording, skip={over[:20]}{' ...' * (len(over) > 20)} (--skip-file FILE, an id on a line), or "
+                "take another num_frames"
+            )
+        for ids in recordings:
             groups |= {ids[n]: ids[n : n + self.num_frames] for n in range(0, len(ids), self.num_frames)}
         object.__setattr__(self, "_groups", groups)
 
@@ -149,6 +157,7 @@ class AveragedSource(CombinedSource):
             worst = torch.where(depths > 0, confidences, int(Confidence.RELIABLE)).amin(0)
             confidence = torch.where(average.depth > 0, worst, int(Confidence.NO_READING)).to(torch.uint8)
         facts = {"frames": list(names), "readings": readings, **_facts(average)}
+        facts |= {"changing_signals": changing} if (changing := _changing_signals(frames)) else {}
         provenance = {**frames[0].provenance, "averaged": facts}
         return replace(frames[0], depth=average.depth, confidence=confidence, provenance=provenance)
 
@@ -161,3 +170,14 @@ def _facts(average: DepthAverage) -> dict[str, Any]:
         "too_few": int(((average.depth == 0) & (average.num_readings > 0)).sum()),
         "noise": float(spread.median()) if len(spread) else 0.0,
     }
+
+
+def _changing_signals(frames: Sequence[DepthFrame]) -> list[str]:
+    """Return the names of the first frame's signals that another lacks or has otherwise."""
+    return [
+        name
+        for name, signal in frames[0].recorded_signals.items()
+        if not all(
+            name in frame.recorded_signals and signal.same_bits(frame.recorded_signals[name]) for frame in frames[1:]
+        )
+    ]

@@ -259,7 +259,7 @@ def test_a_pattern_joins_what_fits_it_in_order(tmp_path: Path) -> None:
 
 def test_a_pattern_with_a_slash_at_its_end_fits_folders_alone(tmp_path: Path) -> None:
     folder_capture(tmp_path / "demos" / "pick_0")
-    (tmp_path / "demos" / "camera.npz").write_bytes(b"")
+    (tmp_path / "demos" / "camera.npz").write_bytes(b"PK\3\4")
     with pytest.raises(CaptureError, match=r"camera\.npz: no known layout") as caught:
         open_source(tmp_path / "demos" / "*")
     assert "demos/*/ fits folders alone" in told(caught.value)

@@ -239,3 +239,36 @@ def test_the_temporal_filter_follows_a_real_stream_that_moves(stream):
     # It averages with what lies within delta and takes the rest as it is, so it never strays further than delta.
     assert float((disparity - smoothed).abs().max()) < 20.0
     assert torch.equal(filtered.depth > 0, (frame.depth > 0) | (filtered.confidence == Confidence.COMPLETED))
+
+
+class _Signalled:
+    """Captures of a still wall whose joints change, one after another."""
+
+    def __init__(self, count: int) -> None:
+        self.ids = [f"{number:02d}" for number in range(count)]
+
+    def load(self, sample_id: str) -> DepthFrame:
+        number = int(sample_id)
+        return DepthFrame.from_numpy(
+            np.full((6, 8), 1000 + number % 3, np.uint16),
+            [[8.0, 0, 3.5], [0, 8.0, 2.5], [0, 0, 1]],
+            metres_per_unit=0.001,
+            sample_id=sample_id,
+            signals={"q": (np.array([number, 1.0], np.float32), "invariant"), "task": ("look", "text")},
+        )
+
+
+def test_an_average_has_the_signals_of_its_first_capture_and_names_those_that_changed():
+    averaged = AveragedSource(source=_Signalled(6), num_frames=3)
+    frame = averaged.load("03")
+    assert frame.signals["q"].tolist() == [[3.0, 1.0]]
+    assert frame.signals["task"] == ("look",)
+    assert frame.provenance["averaged"]["changing_signals"] == ["q"]
+
+
+def test_what_does_not_make_a_group_is_named_so_that_it_can_be_left_out():
+    with pytest.raises(CaptureError, match="5 captures are no whole number") as caught:
+        AveragedSource(source=_Signalled(5), num_frames=3)
+    assert "skip=['03', '04']" in str(caught.value)
+    with pytest.raises(ConfigError, match=r"min_count 3.*say min_count=2 too"):
+        AveragedSource(source=_Signalled(4), num_frames=2)
