@@ -201,11 +201,11 @@ def stated_intrinsics(where: str, values: Any, advice: str) -> tuple[float, floa
     return check_pinhole(where, values)
 
 
-def stated_unit(where: str, unit: float | None, depth: Path) -> float:
+def stated_unit(where: str, unit: float | None, depth: Path, others: Sequence[Path] = ()) -> float:
     """Return the length of one stored unit, which somebody had to state.
 
     Raises:
-        UnitError: nobody has; names the units that the first image fits.
+        UnitError: nobody has; names the units that the first image fits, or that the others do not fit the same.
     """
     if unit is not None:
         return check_metres_per_unit(where, unit)
@@ -214,6 +214,16 @@ def stated_unit(where: str, unit: float | None, depth: Path) -> float:
     if not fits:
         raise UnitError(f"{where}: no file states the unit of depth; {ways(float(raw.max(initial=0)))}")
     best = fits[0].unit
+    own = {fit.unit: fit.probability for fit in unit_fits(raw)}
+    for other in others:
+        theirs = {fit.unit: fit.probability for fit in unit_fits(read_raw_depth(where, other))}
+        likely = max(theirs, key=lambda unit: theirs[unit], default=best)
+        if theirs and min(theirs.get(best, 0.0), own.get(likely, 0.0)) < _NAMED:
+            raise UnitError(
+                f"{where}: no file states the unit of depth, and by their numbers the images are not of the same: "
+                f"{depth.name} may be {best}, {other.name} {likely}. Give the path of one image instead of the folder, "
+                "and its unit with it"
+            )
     order = "" if best.encoding == "plain" else f" --depth-encoding {best.encoding}"
     raise UnitError(
         f"{where}: no file states the unit of depth; by its numbers {depth.name} may be {units_in_words(fits)}. Say "

@@ -6,7 +6,7 @@ So lie the frames of AnyGrasp, gqcnn, D3RoMa, ClearGrasp and M2T2, and most that
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ _WORDS = {  # of file names, without case: the role that they tell
 _SUFFIXES = {"depth": DEPTH_SUFFIXES, "color": COLOR_SUFFIXES, "labels": (".png",), "disparity": DEPTH_SUFFIXES}
 _NO_NAMES = ("img", "image", "map", "raw")  # say nothing of a frame
 _PICTURES = ("vis", "viz", "visualization", "preview", "colored", "colormap")  # of depth, made for viewing
+_COMPARED = 4  # images whose numbers must fit one unit before it is named
 _SEPARATORS = re.compile(r"[-_. ]+")
 
 
@@ -126,19 +127,24 @@ class _PairsSource(ListedSource):
             raise CaptureError(
                 f"{where}: {name_some(file.name for file in read)} and intrinsics both say them; drop one"
             )
-        first = next(iter(found["depth"].values()))
+        first, *further = list(found["depth"].values())[:_COMPARED]
         unit = one_value(folder, "metres_per_unit", said.metres_per_unit, metres_per_unit, error=UnitError)
         unit = None if unit is None else check_metres_per_unit(where, unit)
         encoding = one_value(folder, "depth_encoding", said.depth_encoding, depth_encoding, error=UnitError) or "plain"
         invalid = check_invalid_values(where, invalid_values) or said.invalid_values or ()
         camera = said.camera or partial(
-            pinhole, numbers=stated_intrinsics(where, intrinsics, _unit_too(where, unit, first))
+            pinhole, numbers=stated_intrinsics(where, intrinsics, _unit_too(where, unit, first, further))
         )
         if unit is None and encoding == "plain":
             unit, used = _measured_unit(where, found["depth"], disparities, camera, said.baseline)
             read = [*read, *used]
         decode = partial(
-            _read, where=where, unit=unit, encoding=check_depth_encoding(where, encoding), invalid=tuple(invalid)
+            _read,
+            where=where,
+            others=(first, *further),
+            unit=unit,
+            encoding=check_depth_encoding(where, encoding),
+            invalid=tuple(invalid),
         )
         facts: dict[str, Any] = {} if unit is None else {"metres_per_unit": unit}
         facts |= {} if encoding == "plain" else {"depth_encoding": encoding}
@@ -255,21 +261,27 @@ def _measured_unit(
     return unit, [] if unit is None else list(disparities.values())
 
 
-def _unit_too(where: str, unit: float | None, depth: Path) -> str:
+def _unit_too(where: str, unit: float | None, depth: Path, others: Sequence[Path]) -> str:
     """Say that the unit is missing as well, where it is."""
     try:
         if unit is None and read_raw_depth(where, depth).dtype.kind != "f":
-            stated_unit(where, unit, depth)
+            stated_unit(where, unit, depth, others)
     except UnitError as error:
         return f". And {str(error).partition(': ')[2]}"
     return ""
 
 
 def _read(
-    path: Path, *, where: str, unit: float | None, encoding: DepthEncoding, invalid: tuple[int, ...]
+    path: Path,
+    *,
+    where: str,
+    others: tuple[Path, ...],
+    unit: float | None,
+    encoding: DepthEncoding,
+    invalid: tuple[int, ...],
 ) -> Tensor:  # (H, W) float32 metres
     if unit is None and read_raw_depth(where, path).dtype.kind == "f":
         unit = 1.0
     return read_depth(
-        path, metres_per_unit=stated_unit(where, unit, path), depth_encoding=encoding, invalid_values=invalid
+        path, metres_per_unit=stated_unit(where, unit, path, others), depth_encoding=encoding, invalid_values=invalid
     )

@@ -539,6 +539,17 @@ def test_units_of_real_captures_are_named_and_not_guessed(name: str, unit: str, 
     assert unit in str(caught.value)
 
 
+def test_images_of_different_units_in_one_folder_are_not_named_one(test_data: Path) -> None:
+    lens = (582.6, 582.7, 313.0, 238.0)
+    source = open_source(test_data / "open3d_rgbd" / "other_formats", intrinsics=lens)
+    for name in source.ids:
+        with pytest.raises(UnitError, match=r"images are not of the same: .*Give the path of one image") as caught:
+            source.load(name)
+        assert "--metres-per-unit" not in str(caught.value)
+    with pytest.raises(IntrinsicsError, match=r"no file states the intrinsics.*the images are not of the same"):
+        open_source(test_data / "open3d_rgbd" / "other_formats")
+
+
 def test_five_simulated_cameras_meet_on_the_table(test_data: Path) -> None:
     frame = open_source(test_data / "rlbench_five_cameras").load("0")
     clouds = [cloud.points.double().numpy() for cloud in _in_world(frame)]
