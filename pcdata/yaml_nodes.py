@@ -70,13 +70,14 @@ def parse_yaml(text: str) -> Any:
     Raises:
         ValueError: no YAML, or more than any file of plain facts needs: aliases, tags, deep nesting, many values.
     """
-    loader = _Loader(text)
     try:
-        return loader.get_single_data()
-    except (yaml.YAMLError, RecursionError, AttributeError, TypeError, OverflowError) as error:
+        loader = _Loader(text)  # which refuses characters that no text holds
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, RecursionError, AttributeError, TypeError, OverflowError, LookupError) as error:
         raise ValueError(str(error)[:300]) from error
-    finally:
-        loader.dispose()
 
 
 class _Dumper(yaml.SafeDumper):

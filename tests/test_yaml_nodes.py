@@ -9,6 +9,7 @@ import pytest
 from pcdata.build import config_from_yaml
 from pcdata.errors import CalibrationError, ConfigError
 from pcdata.io.calibration.calibration_yaml import calibration_from_yaml
+from pcdata.yaml_nodes import parse_yaml
 
 PIPELINE = "depth:\n  - MaskDepth: {{near: 0.2, far: {}}}\n  - Deproject\n"
 
@@ -86,3 +87,11 @@ def test_a_calibration_of_a_long_chain_takes_time_in_proportion_to_its_length():
 
     seconds(10)
     assert seconds(800) < 16 * seconds(100)  # eight times the work; 64 times where it grows with the square
+
+
+@pytest.mark.parametrize(
+    "text", ["a: \x00", "a: \x07b", "a: *b", "a: !!python/x 1", "[" * 99, '"\\U99999999"', "%YAML 9.9.9"]
+)
+def test_yaml_of_any_origin_is_plain_data_or_a_value_error(text):
+    with pytest.raises(ValueError, match=r"\S"):
+        parse_yaml(text)

@@ -38,6 +38,7 @@ from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame, Signal
 from pcdata.structures.calibration import Calibration
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
+_EXAMPLE = '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "metres_per_unit": 0.001}'
 
 
 @register_layout
@@ -96,7 +97,10 @@ class FolderSource(Source):
         present = [path / name for name in _CALIBRATIONS if has_file(path / name)]
         if len(present) != 1:
             found = "both" if present else "neither"
-            raise CaptureError(f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there")
+            raise CaptureError(
+                f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there"
+                + ("" if present else f"; with the numbers of this camera, such as {_EXAMPLE}")
+            )
         allowed = [path, *link_targets(links_to)]
         check_inside(str(path), present[0], allowed)
         stated = read_capture_camera(present[0])

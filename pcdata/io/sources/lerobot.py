@@ -219,7 +219,7 @@ class _LeRobotSource(Source):
         if direction is None:
             self._told.append(
                 f"column {stream.extrinsics}, whose name does not say where it leads; extrinsics=camera_to_frame or "
-                "frame_to_camera (--option) reads it"
+                "frame_to_camera (--extrinsics) reads it"
             )
             return None
         return Pose(stream.extrinsics, direction == "frame_to_camera")

@@ -32,6 +32,7 @@ from pcdata.io.writers.lerobot_columns import (
     derived_columns,
     derived_value,
     index_features,
+    named_signals,
     number_feature,
     signal_columns,
     signal_features,
@@ -84,8 +85,8 @@ class _LeRobotWriter(Writer):
     metres_per_unit: float | None = None
     color: ColorStorage = "video"
     fps: float | None = None
-    state: Sequence[str] = ()
-    action: Sequence[str] = ()
+    state: Sequence[str] | str = ()
+    action: Sequence[str] | str = ()
     points: int = 0
     registered_to: str | None = None
     robot_type: str | None = None
@@ -163,7 +164,8 @@ class _Dataset:
         self._signals = signal_columns(f"lerobot: {sample_id}", first.recorded_signals)
         self._derived: dict[str, Sequence[str]] = {}
         self._features: dict[str, dict[str, Any]] = signal_features(self._signals)
-        for option, column, names in (("state", _STATE, options.state), ("action", _ACTION, options.action)):
+        for option, column, given in (("state", _STATE, options.state), ("action", _ACTION, options.action)):
+            names = named_signals("lerobot", option, given)
             feature = derived_columns("lerobot", option, column, names, self._signals)
             if feature is not None:
                 self._features[column] = feature
@@ -279,10 +281,10 @@ class _Dataset:
             self._captures.note("captures have no signals, so the dataset has neither state nor action")
         elif _STATE not in self._features:
             self._captures.note(
-                f"there is no {_STATE}, which LeRobot's policies take; state=[NAME, ...] makes it of signals"
+                f"there is no {_STATE}, which LeRobot's policies take; state=NAME,NAME (--set) makes it of signals"
             )
         if _ACTION not in self._features and self._signals:
-            self._captures.note("there is no action; action=[NAME, ...] makes it of signals")
+            self._captures.note("there is no action; action=NAME,NAME (--set) makes it of signals")
 
     # -- step after step -------------------------------------------------------------------------------------------
 
@@ -415,7 +417,7 @@ class _Dataset:
             ]
             raise CaptureError(
                 f"{sample_id}: its signals are not those of {self._first_id} ({', '.join(unlike)[:200]} differ); a "
-                "dataset has the same in every step"
+                "dataset has the same in every step: write these apart (--only, --skip)"
             )
 
     def end(self, episode: Episode) -> None:

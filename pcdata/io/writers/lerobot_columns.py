@@ -84,6 +84,18 @@ def signal_value(one: SignalFacts, signal: Signal) -> Any:
     return array.reshape(one.shape or (1,))
 
 
+def named_signals(where: str, option: str, names: Any) -> list[str]:
+    """Return the names of signals: a list, or a text with commas in between, as exports take it.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    found = [*map(str.strip, names.split(","))] if isinstance(names, str) else names
+    if not isinstance(found, (list, tuple)) or not all(isinstance(name, str) and name for name in found):
+        raise ConfigError(f"{where}: {option} must be signals, NAME,NAME or a list of names, got {names!r:.100}")
+    return [*found]
+
+
 def derived_columns(
     where: str, option: str, column: str, names: Sequence[str], facts: Mapping[str, SignalFacts]
 ) -> dict[str, Any] | None:
@@ -94,8 +106,6 @@ def derived_columns(
     """
     if not names:
         return None
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"{where}: {option} must be a list of signals, got {names!r:.100}")
     if any(one.column == column for one in facts.values()):
         raise ConfigError(f"{where}: {option}: a signal is the column {column} already; leave the option out")
     width = 0

@@ -30,6 +30,7 @@ from pcdata.structures import DepthFrame, Episode, Signal
 
 SCHEMA = 1  # of the JSON in /pcdata
 START = "start_ns"  # the attribute of an episode: when its first step was, nanoseconds since 1970
+_IMAGES = ("colors", "labels", "mask", "confidence")
 _NO_CLOCK = 10**9  # nanoseconds: where nobody knows when; 0 would mean "no time" to ROS
 _STEP = 10**8  # nanoseconds between captures whose times nobody knows
 _MILLIMETRES = 0.001
@@ -113,6 +114,8 @@ class _Recording:
         self._views: list[str] = []
         self._signals: dict[str, str] = {}  # what its topic is called, by name
         self._told = ""
+        self._alike: tuple[tuple[int, int], set[str]] | None = None
+        self._first = ""
         self._facts: dict[str, Any] = {"schema": SCHEMA, "cameras": {}, "signals": {}, "samples": ids}
         episodes = [] if episode is None else [{"id": episode.id, "first": 0, "length": episode.length}]
         self._facts["episodes"] = [{**one, "attributes": dict(episode.attributes)} for one in episodes]
@@ -129,6 +132,7 @@ class _Recording:
                 f"{frame.sample_id}: has {frame.num_views} views with poses to {frame.frame_id!r}, but those before it "
                 f"{len(self._views)} to {self._facts.get('frame_id')!r}; write these apart (--only, --skip)"
             )
+        self._check_alike(frame)
         unit = frame.provenance.get("metres_per_unit")
         for own, about in zip(self._views, self._facts["cameras"].values()):
             about |= {
@@ -147,6 +151,23 @@ class _Recording:
             self._send("/tf", self.messages.transforms(stamp, frame.frame_id, poses), stamp)
         for name, signal in frame.recorded_signals.items():
             self._add_signal(name, signal, stamp)
+
+    def _check_alike(self, frame: DepthFrame) -> None:
+        """Require what the first capture has: a topic that pauses would be joined as a stream with a gap."""
+        has = {role for role in (*_IMAGES, "world_from_camera") if getattr(frame, role) is not None}
+        has |= {f"the signal {name!r}" for name in frame.recorded_signals}
+        alike = (frame.size, has)
+        if self._alike is None:
+            self._alike, self._first = alike, frame.sample_id
+        if self._alike != alike:
+            size, others = self._alike
+            what = f"{frame.size[1]}x{frame.size[0]} pixels, not {size[1]}x{size[0]}"
+            if frame.size == size:
+                what = f"{', '.join(sorted(has ^ others))} or not"
+            raise CaptureError(
+                f"{frame.sample_id}: has {what}, unlike {self._first}; all captures of a recording have the same: "
+                "write these apart (--only, --skip)"
+            )
 
     def _add_view(self, frame: DepthFrame, own: str, stamp: int) -> None:
         header = self.messages.header(stamp, _optical(own))

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pcdata import open_source
-from pcdata.errors import CacheError, ConfigError, NoReadingError, PcdataError
+from pcdata.errors import CacheError, CaptureError, ConfigError, NoReadingError, PcdataError
 from pcdata.io import WRITERS, SubsetSource, Writer, convert, register_writer
 from pcdata.io.sources.capture_source import episodes_of, signals_of
 from pcdata.io.writers.writer import KEPT
@@ -75,6 +75,33 @@ def test_episodes_come_back_with_times_and_attributes(kind: str, tmp_path: Path)
         assert (after.id, after.first, after.length) == (before.id, before.first, before.length)
         assert after.times == pytest.approx(before.times, abs=1e-9)
         assert before.attributes.items() <= after.attributes.items()
+
+
+@pytest.mark.parametrize("lacks", ["colors", "labels", "world_from_camera", "recorded_signals", "size"])
+def test_captures_that_differ_come_back_as_they_were_or_are_refused(kind: str, lacks: str, tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures(4))
+    second = made.frames["001"]
+    if lacks == "size":
+        small = {role: getattr(second, role)[:, :6, :8] for role in ("depth", *IMAGES.values())}
+        camera = second.camera.resized((6, 8))
+        made.frames["001"] = replace(second, **small, camera=camera)
+    elif lacks == "recorded_signals":
+        kept = {name: one for name, one in second.recorded_signals.items() if name != "joints"}
+        made.frames["001"] = replace(second, recorded_signals=kept)
+    elif lacks == "world_from_camera":
+        kept = {name: one for name, one in second.recorded_signals.items() if one.frame is None}
+        made.frames["001"] = replace(second, world_from_camera=None, frame_id=None, recorded_signals=kept)
+    else:
+        made.frames["001"] = replace(second, **{lacks: None})
+    if kind != "folder" or lacks not in ("recorded_signals", "size"):  # which a folder has of each capture
+        with pytest.raises(CaptureError, match="apart"):
+            convert(made, kind, tmp_path / "out", **OPTIONS.get(kind, {}))
+        assert not (tmp_path / "out").exists()
+        return
+    source = written(made, kind, tmp_path / "out")
+    for name, own in zip(made.ids, source.ids, strict=True):
+        before, after = made.load(name), source.load(own)
+        assert (after.size, after.recorded_signals.keys()) == (before.size, before.recorded_signals.keys())
 
 
 def test_parts_of_an_episode_still_know_the_whole_so_that_no_split_parts_them(kind: str, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from pcdata.io.sources.capture_source import episodes_of
 from pcdata.io.writers import lerobot_tables, lerobot_videos
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.synthetic import TeleopSource
+from tests.exports.samples import tree
 from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
 
 av = pytest.importorskip("av")
@@ -188,7 +189,7 @@ def test_options_and_captures_that_do_not_fit_are_refused(tmp_path: Path) -> Non
         ({"fps": 29.97}, "whole number"),
         ({"points": -1}, "points must be"),
         ({"state": ["jonts"]}, "did you mean 'joints'"),
-        ({"state": "joints"}, "must be a list"),
+        ({"state": 7}, "NAME,NAME or a list"),
         ({"action": ["joints"]}, "is the column action already"),
         ({"depth": "array", "metres_per_unit": 0.001}, "leave out metres_per_unit"),
         ({"robot_type": ""}, "robot_type must be"),
@@ -264,3 +265,12 @@ def test_the_package_lerobot_opens_what_is_written(tmp_path: Path) -> None:
         assert np.abs(np.array(millimetres)[0] - 1000 * frame.depth[0].numpy()).max() <= 0.501
     every = torch.cat([frame.signals["action"] for frame in frames])
     assert told["mean"] == pytest.approx(every.mean(0).tolist(), abs=1e-6)
+
+
+def test_signals_of_a_row_are_named_as_exports_name_them(tmp_path: Path) -> None:
+    made = cut_to_episodes(made_captures())
+    for name, state in (("text", "joints, count"), ("list", ["joints", "count"])):
+        convert(made, "lerobot", tmp_path / name, state=state)
+    assert tree(tmp_path / "text") == tree(tmp_path / "list")
+    with pytest.raises(ConfigError, match="NAME,NAME"):
+        convert(made, "lerobot", tmp_path / "bad", state="joints,,count")

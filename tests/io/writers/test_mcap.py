@@ -135,7 +135,9 @@ def test_a_signal_of_two_kinds_and_topics_of_one_name_are_told_apart(tmp_path: P
     convert(MadeCaptures({"000": frame}), "mcap", tmp_path / "out")
     told = json.loads(messages(tmp_path / "out" / "made.mcap")["/pcdata"][0][1].data)["signals"]
     assert {topic: one["name"] for topic, one in told.items()} == {"a_b": "a b", "a_b_2": "a/b", "signal": "µ"}
-    other = replace(frame, recorded_signals={"a b": Signal(torch.zeros(1, 3), "position", "base")})
+    other = replace(
+        frame, recorded_signals={**frame.recorded_signals, "a b": Signal(torch.zeros(1, 3), "position", "base")}
+    )
     with pytest.raises(CaptureError, match="one kind, frame and type of each"):
         convert(MadeCaptures({"000": frame, "001": other}), "mcap", tmp_path / "mixed")
 
