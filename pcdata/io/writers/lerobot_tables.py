@@ -20,7 +20,7 @@ from pcdata.io.sources.lerobot_files import DATA_PATH, EPISODES_PATH, TASKS_PATH
 from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK
 
 FILE_MEGABYTES = 100
-_GROUP_BYTES = 1 << 26  # of rows that wait for their row group: what is in memory at once
+_GROUP_BYTES = 1 << 22  # of rows in a row group: what waits in memory, and what is decoded to read any one of them
 
 Feature = Mapping[str, Any]
 

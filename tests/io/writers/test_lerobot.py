@@ -274,3 +274,18 @@ def test_signals_of_a_row_are_named_as_exports_name_them(tmp_path: Path) -> None
     assert tree(tmp_path / "text") == tree(tmp_path / "list")
     with pytest.raises(ConfigError, match="NAME,NAME"):
         convert(made, "lerobot", tmp_path / "bad", state="joints,,count")
+
+
+def test_one_row_of_large_arrays_is_read_without_decoding_hundreds(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = lerobot_tables.RowsWriter(tmp_path, {"depth": {"dtype": "float32", "shape": [240, 320]}})
+    rows.begin_episode()
+    for number in range(40):
+        rows.add({"depth": np.full((240, 320), number, np.float32)})
+    rows.end_episode()
+    rows.close()
+    (path,) = tmp_path.rglob("*.parquet")
+    about = parquet.ParquetFile(path).metadata
+    assert about.num_rows == 40
+    groups = [about.row_group(number).num_rows for number in range(about.num_row_groups)]
+    assert max(groups) * 240 * 320 * 4 < 5_000_000
