@@ -41,7 +41,8 @@ _VECTORS = {  # by type: where in a message the vectors of three are; their kind
 }  # fmt: skip
 _NUMBERS = re.compile(r"std_msgs/msg/(Float32|Float64|U?Int(8|16|32|64)|Bool)(MultiArray)?")
 _DTYPES = (
-    "float32", "float64", "float16", "bfloat16", "int64", "int32", "int16", "int8", "uint8", "bool"
+    "float32", "float64", "float16", "bfloat16", "int64", "int32", "int16", "int8", "uint8", "uint16", "uint32",
+    "uint64", "bool",
 )  # fmt: skip
 _TEXT = "std_msgs/msg/String"
 _FIRST = 64  # messages that show whether joints are published together

@@ -142,6 +142,8 @@ class RosMessages:
 
 def exact_as_doubles(values: Tensor) -> bool:
     """Say whether numbers are the same as float64."""
-    if values.dtype is not torch.int64:  # a comparison in fewer bits would wrap
+    if values.dtype not in (torch.int64, torch.uint64):  # a comparison in fewer bits would wrap
         return True
-    return bool(((values <= 1 << 53) & (values >= -(1 << 53))).all())
+    numbers = values.cpu().numpy()
+    most = numbers.dtype.type(1 << 53)
+    return bool((numbers <= most).all()) and (values.dtype is torch.uint64 or bool((numbers >= -most).all()))

@@ -14,6 +14,7 @@ import torch
 pytest.importorskip("rosbags")
 from rosbags.highlevel import AnyReader
 
+from pcdata import open_source
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.geometry import rigid
 from pcdata.io import convert
@@ -108,7 +109,7 @@ def test_signals_are_arrays_and_texts_and_what_they_are_is_told(tmp_path: Path) 
 
 
 def test_only_whole_numbers_that_no_float64_holds_are_told_as_rounded(tmp_path: Path) -> None:
-    small = {"u8": torch.tensor([[255]], dtype=torch.uint8), "i16": torch.tensor([[-300]], dtype=torch.int16)}
+    small = {"u8": torch.tensor([[255]], dtype=torch.uint8), "u32": torch.tensor([[7]], dtype=torch.uint32)}
     for name, values in (
         ("exact", {**small, "count": torch.tensor([[1 << 53]])}),
         ("big", {"id": torch.tensor([[-(1 << 63)]])}),
@@ -116,6 +117,13 @@ def test_only_whole_numbers_that_no_float64_holds_are_told_as_rounded(tmp_path: 
         signals = {key: Signal(one, "invariant") for key, one in values.items()}
         made = MadeCaptures({"000": replace(made_frame(), recorded_signals=signals)})
         assert ("signals" in convert(made, "mcap", tmp_path / name).lost) == (name == "big")
+    again = open_source(tmp_path / "exact").signals("000")
+    assert {key: one.values.tolist() for key, one in again.items()} == {
+        "u8": [[255]],
+        "u32": [[7]],
+        "count": [[1 << 53]],
+    }
+    assert [again[key].values.dtype for key in small] == [torch.uint8, torch.uint32]
 
 
 def test_times_are_those_of_the_episode_on_the_clock_that_it_names(tmp_path: Path) -> None:
