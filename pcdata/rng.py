@@ -6,6 +6,7 @@ device and for any number of workers.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Sequence
 
@@ -43,11 +44,18 @@ class Streams:
 
     def __init__(self, generators: Sequence[Generator]) -> None:
         self.generators = list(generators)
-        self._distinct = list(dict.fromkeys(self.generators))
-        self._which: list[int] | None = None  # of the distinct ones each cloud has; None = its own
-        if len(self._distinct) != len(self.generators):
-            numbers = {one: number for number, one in enumerate(self._distinct)}
-            self._which = [numbers[one] for one in self.generators]
+
+    @functools.cached_property
+    def _distinct(self) -> list[Generator]:
+        return list(dict.fromkeys(self.generators))
+
+    @functools.cached_property
+    def _which(self) -> list[int] | None:
+        """Of the distinct generators each cloud's; None = its own."""
+        if len(self._distinct) == len(self.generators):
+            return None
+        numbers = {one: number for number, one in enumerate(self._distinct)}
+        return [numbers[one] for one in self.generators]
 
     @classmethod
     def of(cls, generator: Generator | Sequence[Generator], num_clouds: int) -> Streams:

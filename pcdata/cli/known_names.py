@@ -136,6 +136,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 WRITERS: dict[str, tuple[str, ...]] = {
     "folder": (),
     "mcap": ("color", "quality", "compression"),
+    "lerobot": ("depth", "metres_per_unit", "color", "fps", "state", "action", "points", "registered_to", "robot_type"),
 }  # with their options
 SENSORS = (
     "realsense_d415",

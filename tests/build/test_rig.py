@@ -42,7 +42,7 @@ def test_the_page_s_commands_find_and_mend_a_camera_and_build_one_cloud(scene: T
     outcomes = [(" ".join(words[:2]) if words[0] == "calib" else words[0], main(words)) for words in commands]
     assert outcomes == [("inspect", 0), ("validate", 1), ("calib overlap", 1), ("calib refine", 0), ("build", 0)]
     told = capsys.readouterr().out
-    assert "left, right, top" in told
+    assert all(f"{name}: 320x240, fx" in told for name in ("left", "right", "top"))
     assert "recalibrate view 1 (right)" in told
     cloud = CachedCloudDataset("dataset", augment=None)[0]
     ones = torch.ones(cloud.num_points, 1, dtype=torch.float64)

@@ -114,7 +114,7 @@ def test_whatever_augments_is_drawn_as_for_single_samples(stores, augment):
         assert_same_cloud(made, singly[index])
 
 
-class ShiftsByTheFirst(SpatialTransform):
+class ShiftsByTheFirst(SpatialTransform, abstract=True):
     """One's own step that takes all clouds for one."""
 
     def make_params(self, data, streams):

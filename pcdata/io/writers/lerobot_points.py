@@ -42,7 +42,8 @@ def point_columns(frame: DepthFrame, count: int) -> dict[str, Any]:
     if frame.world_from_camera is not None:
         points = transform_points(points, made.ptr, frame.world_from_camera)
     number = len(points)
-    keep = torch.arange(number) if number <= count else torch.arange(count) * number // count
+    kept = torch.arange(min(number, count), dtype=torch.int64, device="cpu")
+    keep = kept if number <= count else kept * number // count
     xyz, valid = np.zeros((count, 3), np.float32), np.zeros(count, bool)
     xyz[: len(keep)], valid[: len(keep)] = points[keep].numpy(), True
     columns: dict[str, Any] = {XYZ: xyz, VALID: valid}

@@ -58,7 +58,7 @@ def test_missing_paths_and_foreign_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="no such file or folder"):
         open_source(tmp_path / "absent")
     (tmp_path / "scan.bag").write_bytes(b"x")
-    with pytest.raises(CaptureError, match=r"a \.bag file"):
+    with pytest.raises(CaptureError, match=r"is called \.bag, but does not begin as"):
         open_source(tmp_path / "scan.bag")
 
 
