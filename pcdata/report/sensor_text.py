@@ -51,7 +51,7 @@ def profile_text(name: str) -> str:
 
 
 def _wrapped(line: str) -> str:
-    return textwrap.fill(line, width=110, subsequent_indent="    ")
+    return textwrap.fill(line, 110, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
 
 
 def _figure(profile: SensorProfile, figure: str) -> str:

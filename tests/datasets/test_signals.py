@@ -49,10 +49,11 @@ def test_a_built_dataset_keeps_the_bits_that_the_capture_had(robot, form, tmp_pa
     build_dataset(config, robot, tmp_path / "out")
     cached, fresh = CachedCloudDataset(tmp_path / "out"), CloudDataset(robot, config.pipeline)
     for number in range(2):
-        assert_same(cached[number].recorded_signals, fresh[number].recorded_signals)
-        assert_same(cached[number].recorded_signals, robot.load(robot.ids[number]).recorded_signals)
-        for name, value in cached[number].signals.items():
-            assert_same(value, fresh[number].signals[name])
+        stored, made = cached[number], fresh[number]
+        assert_same(stored.recorded_signals, made.recorded_signals)
+        assert_same(stored.recorded_signals, robot.load(robot.ids[number]).recorded_signals)
+        for name, value in stored.signals.items():
+            assert_same(value, made.signals[name])
     assert "action: Signal('pose xyz_quat_xyzw + invariant 1' in 'base': (1, 3, 8)" in dataset_text(tmp_path / "out")
 
 
