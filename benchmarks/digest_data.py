@@ -209,6 +209,7 @@ def _exported(target: str) -> Many:
         "idp3": (_Recording(before), {}),
         "maniflow": (_Recording(steps), {"next_state": True}),
         "demogen": (_Recording(steps), {}),
+        "diffusion_policy": (_Recording(steps), {}),
         "rise": (_Recording(still), {}),
         "pointnet": (_shapes(2048), {"table": SPLITS}),
         "pointnet_part": (_shapes(2048), {"table": {**SPLITS, "c": {"class": "mug", "split": "val"}}}),
