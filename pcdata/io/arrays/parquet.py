@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, add_note, near_matches
+from pcdata.errors import CaptureError, near_matches
 from pcdata.extras import require
+from pcdata.files.library_errors import read_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 
 _MAX_ROWS = 1 << 31
@@ -139,17 +140,8 @@ class ParquetColumns:
                 )
         return names
 
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        try:
-            yield
-        except PcdataError as error:
-            add_note(error, f"while reading {self._path}")
-            raise
-        except Exception as error:  # Arrow's errors are of many types, some of them of Python's own
-            raise CaptureError(
-                f"{self._where}: {self._path}: not a readable Parquet file: {type(error).__name__}: {str(error)[:300]}"
-            ) from error
+    def _named(self) -> AbstractContextManager[None]:
+        return read_by_library(self._where, self._path, "Parquet file")
 
 
 class _Batches:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, add_note
+from pcdata.errors import CaptureError
 from pcdata.extras import require
+from pcdata.files.library_errors import read_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.io.images.ffv1 import decoded
 from pcdata.io.images.reading import check_pixels
@@ -128,14 +129,5 @@ class VideoFile:
         check_pixels("its pictures", frame.width, frame.height)
         return frame
 
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        try:
-            yield
-        except PcdataError as error:
-            add_note(error, f"while reading {self._path}")
-            raise
-        except Exception as error:  # FFmpeg's errors are of many types, some of them of Python's own
-            raise CaptureError(
-                f"{self._where}: {self._path}: not a readable video: {type(error).__name__}: {str(error)[:300]}"
-            ) from error
+    def _named(self) -> AbstractContextManager[None]:
+        return read_by_library(self._where, self._path, "video")
