@@ -1,5 +1,6 @@
 """Datasets of clouds and the collate functions that feed a DataLoader."""
 
+import pcdata.datasets.batch_transport  # noqa: F401 - how batches are pickled is known once it is imported
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.datasets.clouds import CloudDataset
 from pcdata.datasets.collate import (

@@ -61,14 +61,16 @@ class Structure:
         return self._mapped(lambda tensor: tensor.pin_memory())
 
     def _mapped(self: Movable, move: Callable[[Tensor], Tensor]) -> Movable:
-        return derived(self, **{name: _mapped(value, move) for name, value in vars(self).items()})
+        mapped: Movable = with_tensors(self, move)
+        return mapped
 
 
-def _mapped(value: Any, move: Callable[[Tensor], Tensor]) -> Any:
-    if isinstance(value, Tensor):
-        return move(value)
+def with_tensors(value: Any, swap: Callable[[Any], Any], kind: type = Tensor) -> Any:
+    """Return a value of structures with every tensor in them swapped, in order; or whatever stands for tensors."""
+    if isinstance(value, kind):
+        return swap(value)
     if isinstance(value, Structure):
-        return value._mapped(move)
-    if isinstance(value, Mapping) and any(isinstance(one, (Tensor, Structure)) for one in value.values()):
-        return {name: _mapped(one, move) for name, one in value.items()}
+        return derived(value, **{name: with_tensors(one, swap, kind) for name, one in vars(value).items()})
+    if isinstance(value, Mapping) and any(isinstance(one, (kind, Structure)) for one in value.values()):
+        return {name: with_tensors(one, swap, kind) for name, one in value.items()}
     return value

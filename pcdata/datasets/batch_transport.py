@@ -1,0 +1,287 @@
+"""How batches travel from a DataLoader's workers to its process: in memory that both map, and use again.
+
+torch makes a new piece of shared memory for every tensor of every batch. The system has to clear its pages, one fault
+for each 4 KB, and the two processes hand a file descriptor over: for a batch of some megabytes both cost more than
+reading it. Here a worker keeps a few blocks. A batch is laid into one block, what is sent says where its tensors are,
+and the block is free again when neither process holds a tensor of it. The tensors are ordinary ones: whoever keeps a
+batch keeps its block, and the worker takes another.
+
+A block is a file in memory without a name (``memfd_create``), which the receiver opens through ``/proc`` once; nothing
+remains when the processes end, however they do. Where the system has none of this, and for tensors that are not plain
+ones on the CPU, torch's own way is taken.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import secrets
+import threading
+import weakref
+from collections.abc import Callable, Mapping
+from multiprocessing.reduction import ForkingPickler
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from pcdata.datasets.window_batch import WindowBatch
+from pcdata.errors import CacheError
+from pcdata.structures import PaddedClouds, PointCloud
+from pcdata.structures.structure import Structure, derived, with_tensors
+
+_ALIGNED = 64  # bytes: a line of the processor's cache
+_HEAD = 4096  # bytes before the tensors: who holds the block, and its name
+_NAME = slice(16, 32)
+_WORKER, _RECEIVER = 0, 1  # bytes of the head, 1 = holds it
+_MOST_BLOCKS = 32  # of one worker; a receiver that keeps more batches gets the others as torch sends them
+_MOST_FREE = 8  # that wait to be used again
+
+
+class _Place(NamedTuple):
+    """Where a tensor lies in its block."""
+
+    begin: int
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+
+
+class _Sent(NamedTuple):
+    """Which block it is."""
+
+    process: int
+    file: int
+    size: int
+    name: bytes
+
+
+class _Block:
+    """Memory of this worker that its receiver maps too."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.name = secrets.token_bytes(16)
+        self.file = os.memfd_create("pcdata batch", os.MFD_CLOEXEC)
+        try:
+            os.ftruncate(self.file, _HEAD + size)
+            self.content = mmap.mmap(self.file, _HEAD + size)
+        except OSError:
+            os.close(self.file)
+            raise
+        self.content[_NAME] = self.name
+        self.begin = 0  # its address, while a tensor of it lives
+
+    @property
+    def is_free(self) -> bool:
+        return self.content[_WORKER] == self.content[_RECEIVER] == 0
+
+    def take(self) -> Tensor:
+        """Return the memory, held until nothing uses it."""
+        self.content[_WORKER] = 1
+        memory = _memory(self.content, _WORKER)
+        self.begin = memory.data_ptr()
+        return memory
+
+    def drop(self) -> None:
+        """Forget the memory; the receiver may still have it."""
+        os.close(self.file)
+        self.content = None  # type: ignore[assignment]  # an array may still look at it
+
+
+class _Blocks:
+    """The blocks of this worker."""
+
+    def __init__(self) -> None:
+        self._blocks: list[_Block] = []
+        self._lock = threading.Lock()  # the thread that sends takes blocks too
+        self._process = os.getpid()
+
+    def take(self, size: int) -> Tensor | None:
+        """Return memory of so many bytes, or more; None where there is none."""
+        with self._lock:
+            if self._process != os.getpid():  # what this process was forked from has them
+                self._blocks, self._process = [], os.getpid()
+            free = [block for block in self._blocks if block.is_free]
+            fitting = [block for block in free if size <= block.size]
+            if fitting:
+                return min(fitting, key=lambda block: block.size).take()
+            for block in free if len(free) >= _MOST_FREE else free[:1]:  # too small: make room for a larger one
+                self._blocks.remove(block)
+                block.drop()
+            if len(self._blocks) >= _MOST_BLOCKS:
+                return None
+            try:
+                block = _Block(size + (size >> 3))  # batches of other lengths differ a little
+            except OSError:  # no memory, or no files: torch says so, if it has none either
+                return None
+            self._blocks.append(block)
+            return block.take()
+
+    def holding(self, tensors: list[Tensor]) -> _Block | None:
+        """Return the block that all these tensors lie in."""
+        begins = [(tensor.data_ptr(), tensor.data_ptr() + tensor.nbytes) for tensor in tensors]
+        with self._lock:
+            for block in self._blocks:
+                is_own = block.begin and block.content[_WORKER] and not block.content[_RECEIVER]
+                if is_own and all(block.begin <= begin and end <= block.begin + block.size for begin, end in begins):
+                    return block
+        return None
+
+
+_BLOCKS = _Blocks()
+
+
+def batch_memory(size: int) -> Tensor | None:
+    """Return memory for a batch that this worker makes, (bytes,) uint8; None where there is none, or no worker.
+
+    A batch whose tensors all lie in it is sent without being copied.
+    """
+    return _BLOCKS.take(size) if _is_worker() else None
+
+
+def _is_worker() -> bool:
+    return get_worker_info() is not None and _can_be_opened()
+
+
+def _can_be_opened() -> bool:
+    """Whether processes of this system may open each other's files in memory, as the receiver will."""
+    global _OPENS
+    if _OPENS is None:
+        parent = f"/proc/{os.getppid()}/fd"
+        _OPENS = hasattr(os, "memfd_create") and os.access(parent, os.R_OK | os.X_OK)
+    return _OPENS
+
+
+_OPENS: bool | None = None
+
+
+def _memory(content: mmap.mmap, holder: int) -> Tensor:
+    """Return what lies behind the head as a tensor; when its last view is gone, the holder's mark is taken away."""
+    array = np.frombuffer(content, np.uint8, offset=_HEAD)
+    # Not in a process that was forked since: it has copies of these objects, and holds nothing.
+    weakref.finalize(array, _let_go, content, holder, os.getpid()).atexit = False
+    return torch.from_numpy(array)
+
+
+def _let_go(content: mmap.mmap, holder: int, process: int) -> None:
+    if os.getpid() == process:
+        content[holder] = 0
+        if holder == _RECEIVER:
+            _forget_the_dead()
+
+
+# -- sending ----------------------------------------------------------------------------------------------------------
+
+
+def _reduced(structure: Structure) -> Any:
+    """Return how a batch is pickled for another process."""
+    if _is_worker():
+        tensors: list[Tensor] = []
+        with_tensors(structure, lambda tensor: tensors.append(tensor) or tensor)  # type: ignore[func-returns-value]
+        if tensors and all(map(_is_plain, tensors)):
+            sent = _sent(structure, tensors)
+            if sent is not None:
+                return sent
+    return structure.__reduce_ex__(4)
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return (
+        type(tensor) is Tensor
+        and tensor.is_cpu
+        and tensor.layout is torch.strided
+        and not tensor.requires_grad
+        and not tensor.is_conj()
+        and not tensor.is_neg()
+    )
+
+
+def _sent(structure: Structure, tensors: list[Tensor]) -> Any:
+    block = _BLOCKS.holding(tensors) if all(tensor.is_contiguous() for tensor in tensors) else None
+    if block is None:
+        memory = _BLOCKS.take(sum(tensor.nbytes + -tensor.nbytes % _ALIGNED for tensor in tensors))
+        block = None if memory is None else _BLOCKS.holding([memory])
+        if memory is None or block is None:
+            return None
+        places = iter(_laid(tensors, memory))
+    else:
+        begin = block.begin
+        places = iter([_Place(one.data_ptr() - begin, one.dtype, tuple(one.shape)) for one in tensors])
+    state = {name: with_tensors(value, lambda tensor: next(places)) for name, value in vars(structure).items()}
+    block.content[_RECEIVER] = 1
+    return _received, (type(structure), state, _Sent(os.getpid(), block.file, block.size, block.name))
+
+
+def _laid(tensors: list[Tensor], memory: Tensor) -> list[_Place]:
+    """Copy tensors one after another; return where each is."""
+    places, begin = [], 0
+    for tensor in tensors:
+        places.append(_Place(begin, tensor.dtype, tuple(tensor.shape)))
+        _at(memory, places[-1]).copy_(tensor)
+        begin += tensor.nbytes + -tensor.nbytes % _ALIGNED
+    return places
+
+
+def _at(memory: Tensor, place: _Place) -> Tensor:
+    begin, dtype, shape = place
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    return memory[begin : begin + size].view(dtype).view(shape)
+
+
+# -- receiving --------------------------------------------------------------------------------------------------------
+
+_MAPPED: dict[bytes, tuple[int, mmap.mmap]] = {}  # name -> worker, block
+_MAPPED_BY = os.getpid()
+
+
+def _received(cls: type[Structure], state: Mapping[str, Any], sent: _Sent) -> Structure:
+    """Put a batch together from where the worker laid it."""
+    memory = _memory(_mapped(sent), _RECEIVER)
+    swap: Callable[[Any], Any] = lambda place: _at(memory, place)  # noqa: E731
+    return derived(object.__new__(cls), **{name: with_tensors(value, swap, _Place) for name, value in state.items()})
+
+
+def _mapped(sent: _Sent) -> mmap.mmap:
+    global _MAPPED_BY
+    if os.getpid() != _MAPPED_BY:  # those of the process this one was forked from
+        _MAPPED.clear()
+        _MAPPED_BY = os.getpid()
+    known = _MAPPED.get(sent.name)
+    if known is not None:
+        return known[1]
+    _forget_the_dead()
+    fault: Exception | None = None
+    try:
+        file = os.open(f"/proc/{sent.process}/fd/{sent.file}", os.O_RDWR | os.O_CLOEXEC)
+        try:
+            content = mmap.mmap(file, _HEAD + sent.size)
+        finally:
+            os.close(file)
+        if content[_NAME] == sent.name:
+            _MAPPED[sent.name] = sent.process, content
+            return content
+    except (OSError, ValueError) as error:
+        fault = error
+    raise CacheError(
+        f"a batch of the worker {sent.process} cannot be opened ({fault or 'another file is in its place'}); it must "
+        "be received while its worker runs, by a process of the same user"
+    ) from fault
+
+
+def _forget_the_dead() -> None:
+    """Give back the memory of workers that have ended; batches that are still held keep theirs."""
+    for name, (process, _) in list(_MAPPED.items()):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            _MAPPED.pop(name, None)
+        except OSError:
+            continue
+
+
+for _kind in (PointCloud, PaddedClouds, WindowBatch):
+    ForkingPickler.register(_kind, _reduced)
