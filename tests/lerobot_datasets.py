@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from PIL import Image
 
 LENGTHS = (2, 3)
 STEPS = sum(LENGTHS)
+EPISODE_STEPS = ((0, 1), (2, 3, 4))
 FPS = 10
 HEIGHT, WIDTH = 16, 20  # x265 takes nothing lower
 K = [[20.0, 0.0, 9.5], [0.0, 21.0, 7.5], [0.0, 0.0, 1.0]]
@@ -216,3 +217,104 @@ def lossless(root: Path) -> Path:
         },
         ["depth.front", "observation.images.front"],
     )
+
+
+def lossless_v2(root: Path) -> Path:
+    """Version 2.1 with FFV1 depth that no feature lists."""
+    dataset_v2(root, {}, {})
+    for episode, steps in enumerate(EPISODE_STEPS):
+        file = root / f"videos/chunk-000/observation.depth_ffv1.cam_high/episode_{episode:06d}.mkv"
+        video(file, [tenths(step) for step in steps], "ffv1", "gray16le")
+    return root
+
+
+def quantized(root: Path, true: Sequence[np.ndarray] | None = None, is_lossless: bool = True) -> Path:
+    """The format's own depth: 12-bit codes, even in log(metres + 3.5) from 0.01 m to 10 m, in HEVC."""
+    key = "observation.images.top_depth"
+    codes = [
+        np.rint((np.log(np.maximum(one, 0.01) + 3.5) - np.log(3.51)) / (np.log(13.5) - np.log(3.51)) * 4095)
+        .clip(0, 4095).astype(np.uint16)
+        for one in true or [tenths(step) * 0.0001 for step in range(STEPS)]
+    ]  # fmt: skip
+    about: dict[str, Any] = {"is_depth_map": True, "depth_unit": "mm"}
+    about |= {"video.extra_options": {"x265-params": "lossless=1"}} if is_lossless else {}
+    video(root / f"videos/{key}/chunk-000/file-000.mp4", codes, "libx265", "gray12le", "gray12le")
+    features = {key: {"dtype": "video", "shape": [HEIGHT, WIDTH, 1], "names": IMAGE_NAMES, "info": about}}
+    return dataset(root, features, {}, [key])
+
+
+def arrays(dtype: str, values: Callable[[int], np.ndarray], **said: Any) -> Callable[[Path], Path]:
+    """Arrays in the rows, with matrices of the camera in columns."""
+
+    def write(root: Path) -> Path:
+        return dataset(
+            root,
+            {
+                "observation.depth.cam_0": {**number(dtype, HEIGHT, WIDTH), **said},
+                "observation.intrinsic.cam_0": number("float32", 3, 3),
+                "observation.extrinsic.cam_0": number("float32", 4, 4),
+            },
+            {
+                "observation.depth.cam_0": [values(step) for step in range(STEPS)],
+                "observation.intrinsic.cam_0": [K] * STEPS,
+                "observation.extrinsic.cam_0": [POSE] * STEPS,
+            },
+        )
+
+    return write
+
+
+def per_frame(root: Path, intrinsics: Sequence[Sequence[float]] = K) -> Path:
+    """Float depth with the camera's matrices of every step under names without a camera."""
+    return dataset(
+        root,
+        {
+            "observation.depth.cam_0": number("float32", HEIGHT, WIDTH),
+            "intrinsics": number("float32", 3, 3),
+            "camera_pose": number("float32", 4, 4),
+        },
+        {
+            "observation.depth.cam_0": [(tenths(step) * 0.0001).astype(np.float32) for step in range(STEPS)],
+            "intrinsics": [intrinsics] * STEPS,
+            "camera_pose": [POSE] * STEPS,
+        },
+    )
+
+
+def images(root: Path, stored: Sequence[Mapping[str, Any]] | None = None, unit: str = "mm") -> Path:
+    """Image files of 16 bits, or of floats, in the rows."""
+    key = "observation.images.wrist_depth"
+    said = {"dtype": "image", "shape": [HEIGHT, WIDTH, 1], "names": IMAGE_NAMES}
+    return dataset(
+        root,
+        {
+            key: {**said, "info": {"is_depth_map": True, "depth_unit": unit}},
+            "wrist_intrinsics": number("float32", 3, 3),
+        },
+        {key: stored or [png(tenths(step)) for step in range(STEPS)], "wrist_intrinsics": [K] * STEPS},
+    )
+
+
+def raw(root: Path) -> Path:
+    """Raw 16-bit numbers beside the features, a file an episode."""
+    dataset(root, {}, {})
+    (root / "depth").mkdir()
+    for episode, steps in enumerate(EPISODE_STEPS):
+        content = b"".join(tenths(step).astype("<u2").tobytes() for step in steps)
+        (root / f"depth/episode_{episode:06d}.bin").write_bytes(content)
+    write_json(root / "depth_config.json", {"width": WIDTH, "height": HEIGHT, "unit": "mm", "dtype": "uint16"})
+    return root
+
+
+def described_videos(root: Path) -> Path:
+    """12-bit videos beside the features, even codes of millimetres: 1000 more than the step."""
+    dataset(root, {}, {})
+    episodes = {}
+    for episode, steps in enumerate(EPISODE_STEPS):
+        file = f"depth_videos/camera/episode_{episode:06d}.mp4"
+        codes = [np.full((HEIGHT, WIDTH), 1000 + step, np.uint16) for step in steps]
+        video(root / file, codes, "libx265", "gray12le", "gray12le")
+        episodes[str(episode)] = {"chunk_index": 0, "file": file, "frame_count": len(steps)}
+    about = {"shape": [HEIGHT, WIDTH, 1], "video.depth_min": 0.0, "video.depth_max": 4.095, "video.use_log": False}
+    write_json(root / "depth_meta.json", {"sensors": {"camera": {**about, "episodes": episodes}}})
+    return root

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pcdata.errors import UnitError
 
 CODES = 1 << 12
+_ROUNDED = 0.502  # codes: half of one, and what logarithms of float32 millimetres add to that
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,11 @@ class QuantizedDepth:
     @functools.cached_property
     def metres(self) -> NDArray[np.float64]:
         """(4096,) the depth of each code."""
-        share = np.arange(CODES) / (CODES - 1)
+        return self._at(np.arange(CODES))
+
+    def _at(self, codes: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the depths of codes, which need not be whole."""
+        share = codes / (CODES - 1)
         if not self.is_log:
             return self.near + (self.far - self.near) * share
         low, high = math.log(self.near + self.shift), math.log(self.far + self.shift)
@@ -59,6 +65,7 @@ class QuantizedDepth:
         return table[np.minimum(codes, CODES - 1)]
 
     def error(self, metres: float) -> float:
-        """Return by how many metres rounding to codes may move a depth: half the distance of two codes there."""
-        place = int(np.clip(np.searchsorted(self.metres, metres), 1, CODES - 1))
-        return float(self.metres[place] - self.metres[place - 1]) / 2
+        """Return by how many metres, at most, rounding to codes moved what was decoded as ``metres`` or nearer."""
+        code = np.abs(self.metres - metres).argmin()
+        low, here, high = self._at(np.array([code - _ROUNDED, code, code + _ROUNDED]))
+        return float(max(high - here, here - low))

@@ -118,6 +118,8 @@ class _LeRobotSource(Source):
         self._cloud: CloudColumns | None = None
         self._told: list[str] = []
         found = self._all_depth(where, path)
+        for option, given_of in (("metres_per_unit", metres_per_unit), ("intrinsics", intrinsics)):
+            _check_cameras(where, option, given_of, [one.camera for one in found])
         self.frame_id = frame or "world"
         if clouds is not None:
             check_switch(where, "clouds", clouds)
@@ -176,6 +178,11 @@ class _LeRobotSource(Source):
             stream = replace(stream, metres_per_unit=unit)
         if stream.metres_per_unit is None and stream.quantized is None:
             raise self._no_unit(where, stream)
+        if stream.quantized is not None and not stream.facts.get("codec_is_lossless"):
+            self._told.append(
+                f"what its codec took of the depth of camera {stream.camera!r}: the dataset does not say that it was "
+                "coded without loss, so its error has no bound"
+            )
         return stream, self._lens(where, path, stream, intrinsics, count), self._pose(stream)
 
     def _no_unit(self, where: str, stream: DepthStream) -> UnitError:
@@ -506,6 +513,16 @@ def _chosen(where: str, camera: Any, found: list[DepthStream]) -> list[DepthStre
                 f"{', '.join(names) or 'none'}"
             )
     return [found[names.index(name)] for name in dict.fromkeys(wanted)]
+
+
+def _check_cameras(where: str, option: str, given: Any, names: Sequence[str]) -> None:
+    """Require an option that is told of cameras by name to name those that are there."""
+    for name in given if isinstance(given, Mapping) else ():
+        if name not in names:
+            raise ConfigError(
+                f"{where}: {option}: there is no depth of a camera {name!r:.100}{near_matches(str(name), names)}; "
+                f"there is of {', '.join(names) or 'none'}"
+            )
 
 
 def _check_sizes(where: str, streams: Sequence[DepthStream]) -> None:

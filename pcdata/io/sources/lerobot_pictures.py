@@ -55,8 +55,9 @@ class Pictures:
         if stream.quantized is not None:
             depth = stream.quantized.decoded(stored)
             check_plausible(where, depth, DepthUnit(1.0), depth)
-            error = 1000 * stream.quantized.error(float(depth.max()))
-            return depth, {**stream.facts, "depth_encoding": "quantized", "depth_error_mm": round(error, 4)}
+            error = round(1000 * stream.quantized.error(float(depth.max())), 6)
+            bound = error if stream.facts.get("codec_is_lossless") else None  # what a codec took has none
+            return depth, {**stream.facts, "depth_encoding": "quantized", "depth_error_mm": bound}
         if stored.dtype == np.uint16:
             table = metres_of_value(unit)
             table[[0, *invalid]] = 0.0

@@ -36,25 +36,6 @@ def loaded(path: Path, **options: Any) -> list[DepthFrame]:
     return frames
 
 
-def arrays(dtype: str, values: Callable[[int], np.ndarray], **said: Any) -> Callable[[Path], Path]:
-    def write(root: Path) -> Path:
-        return made.dataset(
-            root,
-            {
-                "observation.depth.cam_0": {**number(dtype, HEIGHT, WIDTH), **said},
-                "observation.intrinsic.cam_0": number("float32", 3, 3),
-                "observation.extrinsic.cam_0": number("float32", 4, 4),
-            },
-            {
-                "observation.depth.cam_0": [values(step) for step in range(STEPS)],
-                "observation.intrinsic.cam_0": [K] * STEPS,
-                "observation.extrinsic.cam_0": [POSE] * STEPS,
-            },
-        )
-
-    return write
-
-
 # -- depth -------------------------------------------------------------------------------------------------------------
 
 
@@ -99,19 +80,9 @@ def test_what_nothing_states_is_asked_for_by_the_name_of_the_camera(tmp_path: Pa
 
 
 def test_quantized_depth_is_read_within_its_stated_error_and_its_clipped_ends_are_no_reading(tmp_path: Path) -> None:
-    key = "observation.images.top_depth"
     true = [metres(step)[0].numpy() for step in range(STEPS)]
     true[0][5, 5] = 12.0  # beyond the range
-    codes = [
-        np.rint((np.log(np.maximum(one, 0.01) + 3.5) - np.log(3.51)) / (np.log(13.5) - np.log(3.51)) * 4095)
-        .clip(0, 4095).astype(np.uint16)
-        for one in true
-    ]  # fmt: skip
-    about = {"is_depth_map": True, "depth_unit": "mm", "video.extra_options": {"x265-params": "lossless=1"}}
-    made.video(tmp_path / f"videos/{key}/chunk-000/file-000.mp4", codes, "libx265", "gray12le", "gray12le")
-    features = {key: {"dtype": "video", "shape": [HEIGHT, WIDTH, 1], "names": IMAGE_NAMES, "info": about}}
-    path = made.dataset(tmp_path, features, {}, [key])
-    for frame, depth in zip(loaded(path, intrinsics=LENS), true):
+    for frame, depth in zip(loaded(made.quantized(tmp_path, true), intrinsics=LENS), true):
         had = (depth > 0) & (depth < 10)
         read = frame.depth[0].numpy()
         assert (read[~had] == 0).all()
@@ -120,10 +91,36 @@ def test_quantized_depth_is_read_within_its_stated_error_and_its_clipped_ends_ar
         assert frame.provenance["codec_is_lossless"] is True
 
 
+def test_no_bound_is_stated_where_a_codec_lost_codes(tmp_path: Path) -> None:
+    source = open_source(made.quantized(tmp_path, is_lossless=False), intrinsics=LENS)
+    assert source.load(IDS[0]).provenance["depth_error_mm"] is None
+    assert any("camera 'top'" in line and "has no bound" in line for line in source.unread())
+
+
+@pytest.mark.parametrize("how", [{}, {"near": 0.2, "far": 2.0, "is_log": False}, {"near": 0.3, "far": 60.0}])
+def test_the_stated_error_holds_at_every_code_and_is_no_wider_than_it_must(how: dict[str, Any]) -> None:
+    quantized = QuantizedDepth(**how)
+    near, far, shift = (np.float32(1000 * one) for one in (quantized.near, quantized.far, quantized.shift))
+    codes, between = np.arange(1, 4094), np.array([-0.4999, 0.4999])
+    places = (codes[:, None] + between) / 4095
+    if quantized.is_log:
+        low, high = np.log(near + shift), np.log(far + shift)
+        depth = np.exp(np.float64(low) + places * np.float64(high - low)) - float(shift)
+        share = (np.log(depth.astype(np.float32) + shift) - low) / (high - low)
+    else:
+        depth = float(near) + places * float(far - near)
+        share = (depth.astype(np.float32) - near) / (far - near)
+    read = quantized.decoded(np.rint(share * 4095).clip(0, 4095).astype(np.uint16))
+    off = np.abs(1000 * read.astype(np.float64) - depth)
+    stated = np.array([[1000 * quantized.error(float(one)) for one in row] for row in read[::97]])
+    assert (off[::97] <= stated).all()
+    assert (off[::97].max(1) > 0.98 * stated.max(1)).all()
+
+
 def test_codes_are_spaced_as_the_feature_says() -> None:
     even = QuantizedDepth(near=0.0, far=4.095, is_log=False)
     assert even.decoded(np.array([0, 1, 4094, 4095])).tolist() == pytest.approx([0.0, 0.001, 4.094, 0.0])
-    assert even.error(2.0) == pytest.approx(0.0005)
+    assert even.error(2.0) == pytest.approx(0.000502)
     default = QuantizedDepth()
     assert 1000 * 2 * default.error(1.0) == pytest.approx(1.5, abs=0.1)
     for wrong in ({"near": 1.0, "far": 1.0}, {"near": float("nan")}, {"shift": -0.01}):
@@ -134,10 +131,10 @@ def test_codes_are_spaced_as_the_feature_says() -> None:
 @pytest.mark.parametrize(
     ("write", "options", "tolerance"),
     [
-        (arrays("float16", lambda n: metres(n)[0].numpy().astype(np.float16)), {}, 5e-4),
-        (arrays("float32", lambda n: metres(n)[0].numpy()), {}, 0.0),
-        (arrays("uint16", tenths, info={"unit": "millimeters"}), {}, None),
-        (arrays("uint16", tenths), {"metres_per_unit": 0.0001}, 0.0),
+        (made.arrays("float16", lambda n: metres(n)[0].numpy().astype(np.float16)), {}, 5e-4),
+        (made.arrays("float32", lambda n: metres(n)[0].numpy()), {}, 0.0),
+        (made.arrays("uint16", tenths, info={"unit": "millimeters"}), {}, None),
+        (made.arrays("uint16", tenths), {"metres_per_unit": 0.0001}, 0.0),
     ],
     ids=["float16", "float32", "millimetres", "stated"],
 )
@@ -156,42 +153,50 @@ def test_arrays_in_rows_are_depth(
 def test_image_features_are_depth_where_they_have_16_bits(kind: str, dtype: Any, tmp_path: Path) -> None:
     is_float = dtype is np.float32
     stored = [metres(n)[0].numpy() if is_float else tenths(n) for n in range(STEPS)]
-    said = {"dtype": "image", "shape": [HEIGHT, WIDTH, 1], "names": IMAGE_NAMES}
-    said |= {"info": {"is_depth_map": True, "depth_unit": "m" if is_float else "mm"}}
-    path = made.dataset(
-        tmp_path,
-        {"observation.images.wrist_depth": said, "wrist_intrinsics": number("float32", 3, 3)},
-        {"observation.images.wrist_depth": [made.png(one, kind) for one in stored], "wrist_intrinsics": [K] * STEPS},
-    )
+    path = made.images(tmp_path, [made.png(one, kind) for one in stored], "m" if is_float else "mm")
     for step, frame in enumerate(loaded(path)):
         assert torch.allclose(frame.depth, metres(step) * (1 if is_float else 10), rtol=0, atol=1e-6)
 
 
 def test_negative_focal_lengths_turn_the_camera_by_half(tmp_path: Path) -> None:
-    path = made.dataset(
-        tmp_path,
-        {
-            "observation.depth.cam_0": number("float32", HEIGHT, WIDTH),
-            "intrinsics": number("float32", 3, 3),
-            "camera_pose": number("float32", 4, 4),
-        },
-        {
-            "observation.depth.cam_0": [metres(step)[0].numpy() for step in range(STEPS)],
-            "intrinsics": [FLIPPED] * STEPS,
-            "camera_pose": [POSE] * STEPS,
-        },
-    )
+    path = made.per_frame(tmp_path, FLIPPED)
     frame = loaded(path)[0]
     assert frame.camera.intrinsics[0].tolist() == K
     turned = torch.tensor(POSE, dtype=torch.float64) @ torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
     assert torch.allclose(frame.world_from_camera[0], turned, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("write", "camera", "options"),
+    [
+        (made.lossless, "front", {"metres_per_unit": 0.0001}),
+        (made.lossless_v2, "cam_high", {"metres_per_unit": 0.0001}),
+        (made.quantized, "top", {}),
+        (made.arrays("float16", lambda n: tenths(n).astype(np.float16) / 8192), "cam_0", {}),
+        (made.per_frame, "cam_0", {}),
+        (made.raw, "camera", {}),
+        (made.described_videos, "camera", {}),
+        (made.images, "wrist", {}),
+    ],
+    ids=["ffv1", "version 2", "quantized", "float16", "per frame", "raw", "described", "images"],
+)
+def test_missing_intrinsics_are_asked_for_by_camera_in_every_layout(
+    write: Callable[[Path], Path], camera: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    path = write(tmp_path)
+    info = json.loads((path / "meta/info.json").read_text())
+    info["features"] = {key: said for key, said in info["features"].items() if "intrinsic" not in key}
+    made.write_json(path / "meta/info.json", info)
+    with pytest.raises(IntrinsicsError, match=rf"intrinsics of camera '{camera}'; say intrinsics={{'{camera}':"):
+        open_source(path, **options)
+    with pytest.raises(ConfigError, match=f"'nobody'.*{camera}"):
+        open_source(path, intrinsics={camera: LENS, "nobody": LENS}, **options)
+    frame = open_source(path, intrinsics={camera: LENS}, **options).load(IDS[0])
+    assert frame.camera.intrinsics[0].tolist() == K
+
+
 def test_version_2_with_unlisted_lossless_videos_and_a_file_of_intrinsics(tmp_path: Path) -> None:
-    path = made.dataset_v2(tmp_path, {}, {})
-    for episode, steps in enumerate(([0, 1], [2, 3, 4])):
-        file = path / f"videos/chunk-000/observation.depth_ffv1.cam_high/episode_{episode:06d}.mkv"
-        made.video(file, [tenths(step) for step in steps], "ffv1", "gray16le")
+    path = made.lossless_v2(tmp_path)
     about = {"fx": 20.0, "fy": 21.0, "cx": 9.5, "cy": 7.5, "width": WIDTH, "height": HEIGHT}
     made.write_json(path / "meta/camera_intrinsics.json", {"cam_high": about})
     for step, frame in enumerate(loaded(path, metres_per_unit=0.0001)):
@@ -200,27 +205,14 @@ def test_version_2_with_unlisted_lossless_videos_and_a_file_of_intrinsics(tmp_pa
 
 
 def test_raw_numbers_and_described_videos_beside_the_features(tmp_path: Path) -> None:
-    raw = made.dataset(tmp_path / "raw", {}, {})
-    (raw / "depth").mkdir()
-    for episode, steps in enumerate(([0, 1], [2, 3, 4])):
-        content = b"".join(tenths(step).astype("<u2").tobytes() for step in steps)
-        (raw / f"depth/episode_{episode:06d}.bin").write_bytes(content)
-    made.write_json(raw / "depth_config.json", {"width": WIDTH, "height": HEIGHT, "unit": "mm", "dtype": "uint16"})
+    raw = made.raw(tmp_path / "raw")
     for step, frame in enumerate(loaded(raw, intrinsics=LENS)):
         assert torch.allclose(frame.depth, 10 * metres(step), rtol=0, atol=1e-6)
     (raw / "depth/episode_000001.bin").write_bytes(b"12")
     with pytest.raises(CaptureError, match="take 1920 bytes, but it has 2"):
         open_source(raw, intrinsics=LENS).load(IDS[2])
 
-    beside = made.dataset(tmp_path / "beside", {}, {})
-    episodes = {}
-    for episode, steps in enumerate(([0, 1], [2, 3, 4])):
-        file = f"depth_videos/camera/episode_{episode:06d}.mp4"
-        codes = [np.full((HEIGHT, WIDTH), 1000 + step, np.uint16) for step in steps]
-        made.video(beside / file, codes, "libx265", "gray12le", "gray12le")
-        episodes[str(episode)] = {"chunk_index": 0, "file": file, "frame_count": len(steps)}
-    about = {"shape": [HEIGHT, WIDTH, 1], "video.depth_min": 0.0, "video.depth_max": 4.095, "video.use_log": False}
-    made.write_json(beside / "depth_meta.json", {"sensors": {"camera": {**about, "episodes": episodes}}})
+    beside = made.described_videos(tmp_path / "beside")
     for step, frame in enumerate(loaded(beside, intrinsics=LENS)):
         assert torch.allclose(frame.depth, torch.tensor((1000 + step) / 1000), rtol=0, atol=1e-6)
 

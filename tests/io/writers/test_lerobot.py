@@ -23,6 +23,7 @@ from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.synthetic import TeleopSource
 from tests.exports.samples import tree
 from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
+from tests.signals import markers
 
 av = pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -214,21 +215,29 @@ def test_options_and_captures_that_do_not_fit_are_refused(tmp_path: Path) -> Non
 
 OFFICIAL = """
 import json, sys
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 import torch
-data = LeRobotDataset("made/here", root=sys.argv[1], video_backend="pyav", depth_output_unit="mm")
-items = [data[n] for n in range(len(data))]
-batch = next(iter(torch.utils.data.DataLoader(data, batch_size=2, num_workers=1)))
-part = LeRobotDataset("made/here", root=sys.argv[1], episodes=[1], video_backend="pyav",
-                      delta_timestamps={"action": [0.0, 1 / data.fps]})
-print(json.dumps({
-    "frames": data.num_frames, "episodes": data.num_episodes, "fps": data.fps,
-    "action": [item["action"].tolist() for item in items], "task": [item["task"] for item in items],
-    "image": list(items[0]["observation.images.view0"].shape),
-    "depth": [item["observation.images.view0_depth"].tolist() for item in items],
-    "batch": list(batch["action"].shape), "windows": list(part[0]["action"].shape),
-    "mean": data.meta.stats["action"]["mean"].tolist(),
-}))
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+def opened(path, **options):
+    return LeRobotDataset("made/here", root=path, video_backend="pyav", depth_output_unit="mm", **options)
+def plain(value):
+    return value.tolist() if hasattr(value, "tolist") else value
+def told(path):
+    data = opened(path)
+    keys = [key for key in data.features if key not in data.meta.video_keys]
+    delta = {key: [-1 / data.fps, 0.0, 1 / data.fps] for key in ("action", "observation.images.view0")}
+    part = opened(path, episodes=[1], delta_timestamps=delta)
+    batches = [*torch.utils.data.DataLoader(data, batch_size=2, num_workers=2)]
+    windows = next(iter(torch.utils.data.DataLoader(part, batch_size=2, num_workers=1)))
+    return {
+        "frames": data.num_frames, "episodes": data.num_episodes, "fps": data.fps, "task": [i["task"] for i in data],
+        "rows": {key: [plain(item[key]) for item in data] for key in keys},
+        "images": {key: list(data[0][key].shape) for key in data.meta.video_keys},
+        "batches": [plain(batch["action"]) for batch in batches], "batch_keys": sorted(batches[0]),
+        "windows": plain(windows["action"]), "window_pad": plain(windows["action_is_pad"]),
+        "window_images": list(windows["observation.images.view0"].shape),
+        "stats": {key: plain(one["mean"]) for key, one in data.meta.stats.items()},
+    }
+print(json.dumps([told(path) for path in sys.argv[1:]]))
 """
 
 
@@ -243,28 +252,64 @@ def official_python() -> str:
     return python
 
 
+def captures_of_all_kinds() -> MadeCaptures:
+    """Two cameras with labels, mask and confidence, and signals of every kind, of each kind of pose in one layout."""
+    made = made_captures(views=2)
+    for number, (name, frame) in enumerate(made.frames.items()):
+        for signal, (values, kind) in markers(1, seed=number).items():
+            is_more = "/" not in signal or signal in ("pose/xyz_quat_xyzw", "delta/matrix")
+            if is_more and signal not in frame.signals:
+                frame = frame.with_signal(signal, values, kind, frame_of(kind))
+        made.frames[name] = frame
+    return cut_to_episodes(made)
+
+
+def frame_of(kind: str) -> str | None:
+    return None if kind.split()[0] in ("invariant", "text") else "base"
+
+
 @pytest.mark.slow
 def test_the_package_lerobot_opens_what_is_written(tmp_path: Path) -> None:
     python = official_python()
-    made = cut_to_episodes(made_captures())
-    convert(made, "lerobot", tmp_path / "out", depth="image", metres_per_unit=0.001, fps=20)
+    made = captures_of_all_kinds()
+    ways = {"image": {"depth": "image", "metres_per_unit": 0.001}, "ffv1": {}, "array": {"depth": "array"}}
+    for name, options in ways.items():
+        convert(made, "lerobot", tmp_path / name, fps=20, points=300, state=["joints", "gripper"], **options)
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
+    paths = [str(tmp_path / name) for name in ways]
     done = subprocess.run(
-        [python, "-c", OFFICIAL, str(tmp_path / "out")], capture_output=True, text=True, check=False, env=environment
+        [python, "-c", OFFICIAL, *paths], capture_output=True, text=True, check=False, env=environment
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    told = json.loads(done.stdout.splitlines()[-1])
     frames = [made.load(name) for name in made.ids]
-    assert (told["frames"], told["episodes"], told["fps"]) == (len(made), len(made.episodes), 20)
-    assert told["action"] == [frame.signals["action"][0].tolist() for frame in frames]
-    assert told["task"] == [frame.signals["task"][0] for frame in frames]
-    assert told["image"] == [3, 12, 16]
-    assert told["batch"] == [2, 4]
-    assert told["windows"] == [2, 4]
-    for millimetres, frame in zip(told["depth"], frames):
-        assert np.abs(np.array(millimetres)[0] - 1000 * frame.depth[0].numpy()).max() <= 0.501
-    every = torch.cat([frame.signals["action"] for frame in frames])
-    assert told["mean"] == pytest.approx(every.mean(0).tolist(), abs=1e-6)
+    actions = [frame.signals["action"][0].tolist() for frame in frames]
+    for (name, told), path in zip(zip(ways, json.loads(done.stdout.splitlines()[-1])), paths):
+        assert (told["frames"], told["episodes"], told["fps"]) == (len(made), len(made.episodes), 20)
+        assert told["task"] == [frame.signals["task"][0] for frame in frames]
+        assert told["images"] == {f"observation.images.view{view}": [3, 12, 16] for view in range(2)}
+        assert told["rows"]["action"] == actions
+        assert [action for batch in told["batches"] for action in batch] == actions
+        assert told["windows"] == [[actions[place] for place in places] for places in ((2, 2, 3), (2, 3, 3))]
+        assert told["window_pad"] == [[True, False, False], [False, False, True]]
+        assert told["window_images"] == [2, 3, 3, 12, 16]
+        assert told["stats"]["action"] == pytest.approx(np.mean(actions, 0).tolist(), abs=1e-6)
+        rows = parquet.read_table(Path(path) / ROWS).to_pylist()
+        for key, values in told["rows"].items():
+            if not key.endswith("_depth"):
+                assert values == [row[key] for row in rows], key
+        assert {"observation.pointcloud.xyz", "observation.joints", "observation.force", "text.language"} < {*rows[0]}
+        if name == "image":
+            for millimetres, frame in zip(told["rows"]["observation.images.view1_depth"], frames):
+                assert np.abs(np.array(millimetres)[0] - 1000 * frame.depth[1].numpy()).max() <= 0.501
+        source = open_source(path)
+        for own, frame in zip(source.ids, frames):
+            read = source.load(own)
+            assert torch.equal(read.depth, frame.depth) or name == "image"
+            assert torch.equal(read.labels, frame.labels)
+            assert torch.equal(read.mask, frame.mask)
+            assert read.signals.keys() == frame.signals.keys()
+            for key, signal in frame.recorded_signals.items():
+                assert read.recorded_signals[key].same_bits(signal), key
 
 
 def test_signals_of_a_row_are_named_as_exports_name_them(tmp_path: Path) -> None:
