@@ -28,7 +28,7 @@ from pcdata.io.messages.signal_streams import SignalStream, chosen_signals
 from pcdata.io.messages.statement import TOPIC, Statement, read_statement
 from pcdata.io.messages.transforms import FrameTree, TreeBuilder
 from pcdata.io.sources.recording import READ_COLOR
-from pcdata.io.sources.synchronized import Joined, joined
+from pcdata.io.sources.synchronized import Joined, allow_more, joined
 
 _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 _STATIC = "tf_static"
@@ -134,7 +134,9 @@ class JoinedTopics:
                     f"joins all by the times of recording; or {_left_out(signals)}"
                 )
         leave = _left_out(signals) if signals else "leave the stream out"
-        return f"allow more by max_time_apart (images) or max_gap (what is interpolated), or {leave}"
+        option = "max_time_apart" if worst["rule"] == "nearest" else "max_gap"
+        nearest = float(self._joins[f"{worst['role']} {worst['topic']}"].gap.min(initial=math.inf)) / 1e9
+        return f"{allow_more(option, nearest)}, or {leave}"
 
     def _join(self) -> None:
         limit = self._joining.max_time_apart * 1e9

@@ -25,7 +25,7 @@ from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_seconds, check_switch
 from pcdata.io.sources.source import Source
-from pcdata.io.sources.synchronized import nearest
+from pcdata.io.sources.synchronized import allow_more, nearest
 from pcdata.structures import Camera, DepthFrame, register_to_color
 
 READ_COLOR = "registered=True (--registered) reads it"  # what to do about a color stream that is not read
@@ -213,10 +213,10 @@ class RecordingSource(Source):
         )
         apart = {number: ticks / self.ticks_per_second for number, ticks in found.apart.items()}
         if depth and not found.place:
+            nearest_one = min(apart.values(), default=math.inf)
             raise CaptureError(
-                f"{where}: no depth image has a color image within {limit:g} s; the nearest is "
-                f"{min(apart.values(), default=math.inf):.3g} s off: allow more by max_time_apart, or leave out "
-                "registered"
+                f"{where}: no depth image has a color image within {limit:g} s; the nearest is {nearest_one:.3g} s "
+                f"off: {allow_more('max_time_apart', nearest_one)}, or leave out registered"
             )
         skipped = {
             _name(number): f"no color image within {limit:g} s, the nearest is {apart[number]:.3g} s off"

@@ -6,6 +6,7 @@ which are compared exactly, or seconds. Nothing is filled in: what has no partne
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -22,6 +23,15 @@ RULES = ("nearest", "linear", "slerp", "step")
 _PARALLEL = 0.9995  # cosine of half the turn above which slerp and a straight line are the same in float64
 
 Times = Sequence[int] | Sequence[float] | NDArray[Any]
+
+
+def allow_more(option: str, seconds: float) -> str:
+    """Say which value of an option lets streams join that are so far apart, or that none does."""
+    if not math.isfinite(seconds):
+        return "there is nothing to join with"
+    digit = 10.0 ** (math.floor(math.log10(seconds)) - 2) if seconds > 0 else 0.001
+    enough = f"{math.ceil(seconds / digit + 1e-6) * digit:.3g}"  # the third digit rounded up, or it would not be
+    return f"allow more by {option}={enough} (--{option.replace('_', '-')} {enough})"
 
 
 class Joined(NamedTuple):

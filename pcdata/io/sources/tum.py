@@ -22,7 +22,7 @@ from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, s
 from pcdata.io.sources.listing import LinkTargets, has_file, is_file, link_targets
 from pcdata.io.sources.option_checks import check_seconds
 from pcdata.io.sources.registry import register_layout
-from pcdata.io.sources.synchronized import Trajectory, nearest
+from pcdata.io.sources.synchronized import Trajectory, allow_more, nearest
 from pcdata.io.sources.timestamps import LONGEST
 
 _LISTS = {"depth": "depth.txt", "color": "rgb.txt"}
@@ -108,8 +108,12 @@ class _TumSource(ListedSource):
             )
         if not views:
             reason = next(iter(skipped.values()), "depth.txt lists none")
+            gaps = [0.0 if track is None else track.gap(time) / _MOST_POSE_GAP for time in times]
+            apart = [0.0 if place in colors.place else colors.apart.get(place, math.inf) for place in range(len(times))]
+            needed = min(map(max, gaps, apart if "color" in rows else gaps), default=math.inf)
             raise CaptureError(
-                f"{where}: no depth image of {len(times)} has all its partners: {reason}; allow more by max_time_apart"
+                f"{where}: no depth image of {len(times)} has all its partners: {reason}; "
+                f"{allow_more('max_time_apart', needed)}"
             )
         told = []
         if colors.unused and "color" in rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from pcdata import Deproject, ToFrame, open_source, validate_source
+from pcdata import Deproject, open_source, validate_source
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, UnitError
-from pcdata.io.sources.synchronized import Trajectory, nearest
+from pcdata.io.sources.synchronized import Trajectory, allow_more, nearest
 from pcdata.verdicts import Verdict
 from tests import published_captures as made
 from tests.published_captures import COLOR_FROM_DEPTH, FAR, INTRINSICS, NEAR, depth_mm, turned
@@ -42,6 +42,13 @@ def test_the_nearest_of_another_stream_is_taken_within_a_gap_and_the_rest_is_cou
     assert nearest([0.0, 0.1], [0.05], 1.0).doubled == 1
     assert nearest([1.0], [0.0, 2.0], 1.0).place == {0: 0}, "of two equally near, the earlier"
     assert nearest([1.0], [], 1.0).place == {}
+
+
+def test_the_gap_that_is_said_to_be_enough_is() -> None:
+    for apart in (0.0544, 0.03, 0.0300001, 1.0, 0.999, 12.34, 3e-7):
+        (enough,) = re.findall(r"--max-gap (\S+)\)", allow_more("max_gap", apart))
+        assert apart < float(enough) <= 1.02 * apart
+    assert "nothing to join with" in allow_more("max_gap", float("inf"))
 
 
 def test_poses_between_two_are_interpolated_as_scipy_does() -> None:
@@ -74,7 +81,9 @@ def test_tum_leaves_out_and_names_depth_without_partners(tmp_path: Path) -> None
     late = made.tum(tmp_path / "late", color_late=0.03)
     with pytest.raises(CaptureError, match=r"no color image within 0.02 s, the nearest is 0.03 s off.*max_time_apart"):
         open_source(late, intrinsics=INTRINSICS)
-    assert len(open_source(late, intrinsics=INTRINSICS, max_time_apart=0.04)) == 3
+    with pytest.raises(CaptureError, match=r"--max-time-apart 0\.0301\)"):
+        open_source(late, intrinsics=INTRINSICS, max_time_apart=0.001)
+    assert len(open_source(late, intrinsics=INTRINSICS, max_time_apart=0.0301)) == 3
     short = made.tum(tmp_path / "short", poses="9.95 0 0 0 0 0 0 1\n10.15 2 0 0 0 0 1 0\n")
     source = open_source(short, intrinsics=INTRINSICS, max_time_apart=0.04)
     assert source.ids == ["10.000000", "10.100000"]
@@ -494,90 +503,3 @@ def test_a_file_that_is_a_link_out_of_the_capture_is_not_read(name: str, tmp_pat
     allowed = open_source(root, kind=name, links_to=str(outside), **options)
     assert allowed.load(source.ids[0]).depth.max() > 0
     assert Deproject()(allowed.load(source.ids[0])).num_points > 0
-
-
-# -- real captures -----------------------------------------------------------------------------------------------------
-
-REAL = {  # by path: options that files cannot answer; kind, samples, views, bounds of a median depth in metres
-    "apc_multiview_shelf": ({}, "apc", 15, 1, (0.5, 0.6)),
-    "azure_kinect_mkv": ({}, "azure_kinect", 1, 1, (1.48, 1.5)),
-    "d3roma_ir_stereo": ({}, "pairs", 1, 1, (0.42, 0.45)),
-    "gqcnn_phoxi": ({}, "pairs", 1, 1, (0.6, 1.0)),
-    "m2t2_real_tabletop/03": ({}, "pairs", 1, 1, (0.9, 1.3)),
-    "open3d_rgbd": ({}, "open3d", 5, 1, (1.0, 2.7)),
-    "open3d_rgbd/other_formats/NYU_depth.pgm": ({"intrinsics": (582.6, 582.7, 313, 238)}, "nyu_raw", 1, 1, (2.0, 5.0)),
-    "rlbench_five_cameras": ({}, "rlbench", 6, 5, (0.5, 2.0)),
-    "tabletop_stream": (
-        {"intrinsics": (927.17, 927.37, 651.32, 349.62), "metres_per_unit": 0.001}, "pairs", 10, 1, (0.45, 0.59)
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_captures_open_with_what_their_files_cannot_answer(name: str, test_data: Path) -> None:
-    options, kind, count, views, (low, high) = REAL[name]
-    if kind == "azure_kinect":
-        pytest.importorskip("av")
-    source = open_source(test_data / name, **options)
-    frame = source.load(source.ids[0])
-    assert (source.kind, len(source), frame.num_views) == (kind, count, views)
-    assert low < float(frame.depth[frame.depth > 0].median()) < high
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [
-        ("tabletop_stream", "metres_per_unit=0.001 (--metres-per-unit 0.001)"),
-        ("open3d_rgbd/other_formats/TUM_depth.png", "metres_per_unit=0.0002 (--metres-per-unit 0.0002)"),
-        ("open3d_rgbd/other_formats/SUN_depth.png", "(--metres-per-unit 0.001 --depth-encoding rotated)"),
-    ],
-)
-def test_units_of_real_captures_are_named_and_not_guessed(name: str, unit: str, test_data: Path) -> None:
-    source = open_source(test_data / name, intrinsics=(582.6, 582.7, 313.0, 238.0))
-    with pytest.raises(UnitError) as caught:
-        source.load(source.ids[0])
-    assert unit in str(caught.value)
-
-
-def test_images_of_different_units_in_one_folder_are_not_named_one(test_data: Path) -> None:
-    lens = (582.6, 582.7, 313.0, 238.0)
-    source = open_source(test_data / "open3d_rgbd" / "other_formats", intrinsics=lens)
-    for name in source.ids:
-        with pytest.raises(UnitError, match=r"images are not of the same: .*Give the path of one image") as caught:
-            source.load(name)
-        assert "--metres-per-unit" not in str(caught.value)
-    with pytest.raises(IntrinsicsError, match=r"no file states the intrinsics.*the images are not of the same"):
-        open_source(test_data / "open3d_rgbd" / "other_formats")
-
-
-def test_five_simulated_cameras_meet_on_the_table(test_data: Path) -> None:
-    frame = open_source(test_data / "rlbench_five_cameras").load("0")
-    clouds = [cloud.points.double().numpy() for cloud in _in_world(frame)]
-    trees, gaps = [cKDTree(cloud) for cloud in clouds], []
-    for one in range(5):
-        for other in range(one + 1, 5):
-            some = clouds[one][::7]
-            distance, nearest_nine = trees[other].query(some, k=9)
-            near = nearest_nine[distance[:, 8] < 0.03]
-            patch = clouds[other][near]
-            center = patch.mean(1, keepdims=True)
-            spread, axes = np.linalg.eigh((patch - center).transpose(0, 2, 1) @ (patch - center))
-            off = np.abs(((some[distance[:, 8] < 0.03] - center[:, 0]) * axes[:, :, 0]).sum(1))
-            gaps.append(float(np.median(off[spread[:, 0] < 1e-7])))
-    assert len(gaps) == 10
-    assert max(gaps) < 0.0002, "half a pixel off or axes not turned: 2 mm or metres"
-
-
-def _in_world(frame: Any) -> Any:
-    return ToFrame(frame="world")(Deproject()(frame))
-
-
-@pytest.mark.parametrize("name", ["d435_transparent"])
-def test_openexr_depth_is_read_as_metres(name: str, test_data: Path) -> None:
-    pytest.importorskip("OpenEXR")
-    source = open_source(test_data / name)
-    assert source.ids == ["000000080-opaque", "000000080-transparent", "000000123-opaque", "000000123-transparent"]
-    frame = source.load("000000080-opaque")
-    assert frame.camera.intrinsics[0].tolist() == [[921, 0, 642], [0, 921, 359], [0, 0, 1]]
-    assert float(frame.depth[frame.depth > 0].median()) == pytest.approx(0.599, abs=0.01)
-    assert set(frame.labels.unique().tolist()) == {0, 255}
