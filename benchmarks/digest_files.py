@@ -244,9 +244,9 @@ def _stored(kind: str, compression: str) -> Many:
     folder = dataset(kind, compression)
     read = pcdata.CachedCloudDataset(folder, augment=None)
     samples = list(zip(read.ids, read, strict=True))
-    raw = files_of(folder / "raw")
+    raw = files_of(folder / "shards/00000/raw")
     bytes_of = files_of(folder, leave_out=("dataset.json", "pipeline.yaml", "load.py"))
-    written = {name: content for name, content in bytes_of.items() if not name.startswith("raw/")}
+    written = {name: content for name, content in bytes_of.items() if "/raw/" not in name}
     return Many({"ids": list(read.ids), "clouds": [cloud for _, cloud in samples], "raw": raw, "files": written})
 
 

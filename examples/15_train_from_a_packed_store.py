@@ -19,7 +19,8 @@ output: {format: packed}
 folder = Path(tempfile.mkdtemp()) / "set"
 source = TeleopSource(num_episodes=2, num_views=1, size=(24, 32))
 pcdata.build_dataset(pcdata.build.config_from_yaml(CONFIG), source, folder)
-print(f"{(folder / 'clouds.packed').stat().st_size} bytes in one file")
+size = sum(path.stat().st_size for path in folder.glob("shards/*/clouds.packed"))
+print(f"{size} bytes in one file a shard")
 
 dataset = pcdata.CachedCloudDataset(folder, seed=0)
 sampler = pcdata.CountedSampler(RandomSampler(dataset))

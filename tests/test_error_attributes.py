@@ -16,6 +16,7 @@ from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.stores import STORES
 from pcdata.synthetic import SyntheticSource
 from pcdata.transforms import Compose, Deproject, MaskDepth, Transform
+from tests.io.forged import first_shard
 
 FAILING = "depth: [MaskDepth: {near: 5.0, far: 6.0}, Deproject]"
 
@@ -70,7 +71,7 @@ def test_what_fails_in_a_worker_reaches_the_parent_with_its_place(source, num_wo
 def test_a_broken_file_of_a_dataset_is_named(source, tmp_path, format):
     config = config_from_yaml(f"depth: [Deproject]\noutput: {{format: {format}}}")
     build_dataset(config, source, tmp_path / "out")
-    store = STORES[format](tmp_path / "out")
+    store = STORES[format](first_shard(tmp_path / "out"))
     broken = store.path_of(Manifest.read(tmp_path / "out").samples[1].key)
     broken.write_bytes(broken.read_bytes()[:100])
     dataset = CachedCloudDataset(tmp_path / "out")

@@ -21,6 +21,7 @@ from pcdata.io.sources.registry import LAYOUTS
 from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
 from pcdata.synthetic import SyntheticSource
 from pcdata.transforms.base import REGISTRY
+from tests.io.forged import first_shard
 from tests.warm import run_script
 
 ROOT = Path(__file__).parents[1]
@@ -319,7 +320,7 @@ def test_stores_collates_and_targets_of_ones_own_are_used_by_their_names(tmp_pat
     source = SyntheticSource(num_scenes=1, num_objects=1, size=(24, 32))
     out = build_dataset(config_from_yaml(text), source, tmp_path / "d").folder
     assert [one["file"] for one in Manifest.read(out).imports] == ["others.py"]
-    assert list((out / "clouds").glob("*.own"))
+    assert list((first_shard(out) / "clouds").glob("*.own"))
     count = pcdata.CachedCloudDataset(out)[0].num_points
     assert pcdata.export_dataset(out, "own_target", tmp_path / "e").written == 1
     assert (tmp_path / "e" / "tabletop-0000.txt").read_text() == str(count)

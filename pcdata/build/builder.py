@@ -44,7 +44,10 @@ from pcdata.io.sources.capture_source import (
     streams_of,
 )
 from pcdata.io.store.cloud_record import record_from_cloud, record_from_signals
-from pcdata.io.store.manifest import SIGNALS_KEY, Manifest, Sample, key_of
+from pcdata.io.store.manifest import Manifest
+from pcdata.io.store.sample_index import Sample
+from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, seal_shard, shard_folder, shard_size_of
 from pcdata.io.store.stores import STORES, Store
 from pcdata.io.writers.capture_folder import write_capture
 from pcdata.progress import Progress
@@ -126,6 +129,8 @@ def build_dataset(
             fingerprint=config.pipeline.stored_fingerprint(),
             pipeline=sections,
             samples=samples,
+            keep_raw=config.output.keep_raw,
+            shard_size=config.output.shard_size,
             episodes=tuple(_episodes(source, samples)),
             signals=signals,
             skipped=report.skipped,
@@ -160,7 +165,8 @@ def _write_samples(
     skip_refused: bool,
     progress: Progress | None,
 ) -> tuple[list[Sample], dict[str, str]]:
-    store = STORES[config.output.format](partial, config.output.compression)
+    each = shard_size_of(len(source.ids), config.output.shard_size)
+    store, shard = _store_of(config, shard_folder(partial, 0)), 0
     prefix, _ = config.pipeline.split()
     ids = list(source.ids)
     written: list[Sample] = []
@@ -169,6 +175,10 @@ def _write_samples(
     inputs = inputs_of(source)
     try:
         for position, sample_id in enumerate(ids):
+            if position // each != shard:
+                _seal(store)
+                shard = position // each
+                store = _store_of(config, shard_folder(partial, shard))
             started = time.perf_counter()
             try:
                 try:
@@ -185,20 +195,22 @@ def _write_samples(
                 key = key_of(sample_id)
                 store.write(key, record)
                 if config.output.keep_raw:
-                    _keep_raw(capture, partial / "raw" / key)
+                    _keep_raw(capture, store.folder / "raw" / key)
             except Exception as error:
                 way_out = isinstance(error, REFUSALS) and not skip_refused
                 hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
                 add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}", sample_id=sample_id)
                 raise
             inputs.check_latest("build_dataset")
-            written.append(Sample(sample_id, key, cloud.num_points, record.digest()))
+            written.append(Sample(sample_id, key, cloud.num_points, record.digest(), shard))
             signals.append(_one_each(cloud))
             report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))
             if progress is not None:
                 progress(position + 1, len(ids), sample_id)
         inputs.check("build_dataset")
+        _seal(store)
         if any(signals):
+            store = _store_of(config, partial / SIGNALS_FOLDER)
             told = _write_signals(store, [sample.id for sample in written], signals)
     finally:
         store.close()
@@ -208,6 +220,16 @@ def _write_samples(
             f"build_dataset: all {len(ids)} captures were refused, so there is nothing to store; {first!r}: {reason}"
         )
     return written, told
+
+
+def _store_of(config: BuildConfig, folder: Path) -> Store:
+    return STORES[config.output.format](folder, config.output.compression)
+
+
+def _seal(store: Store) -> None:
+    """End a shard: nothing is added to it any more."""
+    store.close()
+    seal_shard(store.folder)
 
 
 def _one_each(cloud: PointCloud) -> Mapping[str, Signal]:

@@ -50,6 +50,7 @@ class _Output(BaseModel):
     format: Format = "hdf5"
     compression: Compression = "none"  # lzf (hdf5) or gzip; reads are 2-4 times faster without
     keep_raw: bool = False  # also deliver depth, color and calibration beside the clouds
+    shard_size: Annotated[int, Ge(1)] | None = None  # captures; None = such that there are at most 1,000 shards
 
 
 class Windows(BaseModel):
@@ -200,7 +201,8 @@ def _config_of_dataset(folder: Path) -> BuildConfig:
     output = {
         "format": manifest.format,
         "compression": manifest.compression,
-        "keep_raw": (folder / "raw").is_dir(),
+        "keep_raw": manifest.keep_raw,
+        "shard_size": manifest.shard_size,
     }
     common = {"source": dict(manifest.source), "output": output}
     name = str(folder / FILE_NAME)

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from pcdata.errors import CacheError
-from pcdata.io.store.manifest import FILE_NAME, SIGNALS_KEY, Manifest
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.sample_index import FILES as INDEX_FILES
+from pcdata.io.store.sample_index import FOLDER as INDEX
+from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.shards import FOLDER as SHARDS
+from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, TABLE, shard_folder
 from pcdata.io.store.stores import STORES
 
 _TOP = {FILE_NAME, "pipeline.yaml", "load.py"}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
-_IN_VIEW = re.compile(  # what write_capture writes below raw/KEY
-    r"view[0-9]+(/intrinsics\.json|/depth(/0\.(png|npy))?|/(labels|masks|color|confidence)(/0\.png)?|/poses(/0\.txt)?)?"
+_IN_VIEW = re.compile(  # what write_capture writes below raw/KEY of a shard
+    r"|view[0-9]+(/intrinsics\.json|/depth(/0\.(png|npy))?|/(labels|masks|color|confidence)(/0\.png)?|/poses(/0\.txt)?)?"
 )
+_RAW = re.compile(rf"({SHARDS}/[0-9]+)/raw/([^/]+)(?:/(.+))?", re.DOTALL)
 _SHOWN = 5
 
 
@@ -27,8 +34,7 @@ def check_only_dataset(folder: Path) -> None:
     try:
         if not os.path.lexists(folder / FILE_NAME):
             raise CacheError(f"{folder} is not a pcdata dataset, so it is not overwritten; choose another folder")
-        manifest = Manifest.read(folder)
-        foreign = _foreign(folder, manifest)
+        foreign = _foreign(folder, _manifest_of(folder))
     except OSError as error:
         raise CacheError(f"{folder}: cannot be examined: {error}") from error
     if foreign:
@@ -39,12 +45,21 @@ def check_only_dataset(folder: Path) -> None:
         )
 
 
-def _foreign(folder: Path, manifest: Manifest) -> list[str]:
-    store = STORES[manifest.format](folder)
-    keys = {sample.key for sample in manifest.samples}
-    stored = keys | ({SIGNALS_KEY} if "digest" in manifest.signals else set())
-    known = _TOP | {store.path_of(key).relative_to(folder).as_posix() for key in stored}
-    folders = {"raw"} | {os.path.dirname(name) for name in known}
+def _manifest_of(folder: Path) -> Manifest | None:
+    """Return the manifest; None where nothing is left but itself and a part of its index."""
+    try:
+        return Manifest.read(folder)
+    except CacheError:
+        if Manifest.is_one(folder) and not _foreign(folder, None):
+            return None
+        raise
+
+
+def _foreign(folder: Path, manifest: Manifest | None) -> list[str]:
+    """Return what no build wrote; of a removal that was killed late the index is not whole, and little else is left."""
+    known, raw = _known(folder, manifest)
+    folders = {parent.as_posix() for name in known for parent in Path(name).parents}
+    folders |= {f"{shard}/raw" for shard in raw}
     foreign = []
 
     def refuse(error: OSError) -> None:
@@ -55,17 +70,38 @@ def _foreign(folder: Path, manifest: Manifest) -> list[str]:
         names[:] = [name for name in names if name not in _LITTER]
         for name in names:
             path = (relative / name).as_posix()
-            if os.path.islink(os.path.join(place, name)) or not (path in folders or _is_raw(path, keys)):
+            if os.path.islink(os.path.join(place, name)) or not (path in folders or _is_raw(path, raw)):
                 foreign.append(path)
         names[:] = [name for name in names if (relative / name).as_posix() not in foreign]  # their name says enough
         for name in files:
             path = (relative / name).as_posix()
-            if os.path.islink(os.path.join(place, name)) or not (path in known or _is_raw(path, keys)):
+            if os.path.islink(os.path.join(place, name)) or not (path in known or _is_raw(path, raw)):
                 foreign += [] if name in _LITTER else [path]
     return sorted(foreign)
 
 
-def _is_raw(path: str, keys: set[str]) -> bool:
-    top, _, below = path.partition("/")
-    key, _, inside = below.partition("/")
-    return top == "raw" and key in keys and (not inside or _IN_VIEW.fullmatch(inside) is not None)
+def _known(folder: Path, manifest: Manifest | None) -> tuple[set[str], dict[str, set[str]]]:
+    """Return the files that a build writes, and of every shard the keys of the captures that may lie beside it."""
+    known = _TOP | {f"{INDEX}/{name}" for name in INDEX_FILES}
+    raw: dict[str, set[str]] = {}
+    if manifest is None:
+        return known, raw
+    for number in range(manifest.index.num_shards):
+        shard = shard_folder(folder, number)
+        store = STORES[manifest.format](shard)
+        keys = {key_of(sample_id) for sample_id in manifest.index.ids[_as_slice(manifest.index.of_shard(number))]}
+        raw[shard.relative_to(folder).as_posix()] = keys
+        known |= {path.relative_to(folder).as_posix() for path in (shard / TABLE, *map(store.path_of, keys))}
+    if "digest" in manifest.signals:
+        path = STORES[manifest.format](folder / SIGNALS_FOLDER).path_of(SIGNALS_KEY)
+        known.add(path.relative_to(folder).as_posix())
+    return known, raw
+
+
+def _as_slice(numbers: range) -> slice:
+    return slice(numbers.start, numbers.stop)
+
+
+def _is_raw(path: str, raw: Mapping[str, set[str]]) -> bool:
+    found = _RAW.fullmatch(path)
+    return found is not None and found[2] in raw.get(found[1], ()) and _IN_VIEW.fullmatch(found[3] or "") is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Generator, Tensor
@@ -15,8 +15,9 @@ from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning, ShapeError, locate
 from pcdata.imports import imported_files
 from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
-from pcdata.io.store.manifest import FILE_NAME, SIGNALS_KEY, Manifest
-from pcdata.io.store.stores import STORES
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.sample_index import SampleIndex
+from pcdata.io.store.shards import SIGNALS_KEY, Shards, shard_folder
 from pcdata.rng import child_seed, seeded
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.unbatched import Unbatched
@@ -76,9 +77,9 @@ class CachedCloudDataset(SampleDataset):
             )
         self.pipeline = wanted
         transform = wanted.split()[1] if isinstance(augment, str) else augment
-        super().__init__([sample.id for sample in self.manifest.samples], transform, seed, repeats)
-        self._store = STORES[self.manifest.format](self.folder)
-        self._touched = _FirstTouch(len(self.ids))
+        super().__init__(self.manifest.index.ids, transform, seed, repeats)
+        self._shards = Shards(self.folder, self.manifest.format, self.manifest.index)
+        self._touched = _FirstTouch(self.manifest.index)
 
     def _stored_pipeline(self) -> Compose:
         try:
@@ -113,6 +114,10 @@ class CachedCloudDataset(SampleDataset):
                     stacklevel=4,
                 )
 
+    def shard_of(self, number: int) -> Path:
+        """Return the folder of the shard that one sample lies in."""
+        return shard_folder(self.folder, int(self.manifest.index.shards[number]))
+
     @property
     def episodes(self) -> list[Episode]:
         """The episodes over ``ids``, as the build kept them."""
@@ -130,7 +135,7 @@ class CachedCloudDataset(SampleDataset):
             raise ShapeError(f"{self.folder}: its samples have no signals in common: {told['fault']}; build it again")
         if "digest" not in told:
             return {}
-        record, path = self._store.read(SIGNALS_KEY), self._store.path_of(SIGNALS_KEY)
+        record, path = self._shards.signals(), self._shards.signals_store().path_of(SIGNALS_KEY)
         if record.digest() != told["digest"]:
             raise CacheError(f"{path}: the signals differ from what was written; rebuild the dataset")
         try:
@@ -139,44 +144,44 @@ class CachedCloudDataset(SampleDataset):
             raise CacheError(f"{path}: {error}; rebuild the dataset") from error
 
     def _load(self, index: int) -> PointCloud:
-        sample = self.manifest.samples[index]
         record = None
-        if (identity := self._store.identity()) is None:
-            record = self._store.read(sample.key)
-            self._check_digest(index, record.digest())
+        if self._compared([index]):
+            record = self._shards.read_joined([index]) or self._shards.read(index)
         else:
-            for fresh in self._touched.fresh([index], identity):
-                self._check_digest(fresh, self._store.digest(sample.key))
-                self._touched.note(fresh)
-            record = self._store.read_joined([sample.key]) or self._store.read(sample.key)
+            record = self._shards.read(index)
+            self._check_digest(index, record.digest())
         try:
             cloud = cloud_from_record(record)
         except CacheError as error:
             raise self._fault(index, f": {error}") from error
-        if cloud.num_points != sample.num_points:
-            raise self._fault(index, f" has {cloud.num_points} points, but {FILE_NAME} says {sample.num_points}")
+        wanted = int(self.manifest.index.num_points[index])
+        if cloud.num_points != wanted:
+            raise self._fault(index, f" has {cloud.num_points} points, but the index says {wanted}")
         return cloud
 
+    def _compared(self, numbers: Sequence[int]) -> bool:
+        """Compare the digests of samples that nobody has read yet; False where every read must compare its own."""
+        files = self._shards.identities(numbers)
+        if files is None:
+            return False
+        for fresh in self._touched.fresh(numbers, files):
+            self._check_digest(fresh, self._shards.digest(fresh))
+            self._touched.note(fresh)
+        return True
+
     def _check_digest(self, index: int, digest: str) -> None:
-        if digest != self.manifest.samples[index].digest:
+        if digest != self.manifest.index.digest(index):
             raise self._fault(index, " differs from what was written")
 
     def _fault(self, index: int, what: str) -> CacheError:
-        sample = self.manifest.samples[index]
-        path = self._store.path_of(sample.key)
-        error = CacheError(f"{path}: sample {sample.id!r}{what}; rebuild the dataset")
+        path = self._shards.path_of(index)
+        error = CacheError(f"{path}: sample {self.ids[index]!r}{what}; rebuild the dataset")
         locate(error, path=path)
         return error
 
     def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
         """Return the clouds of some samples as one batch; None where that of one by one would be another."""
-        samples = [self.manifest.samples[number] for number in numbers]
-        record = None
-        if (identity := self._store.identity()) is not None:
-            for fresh in self._touched.fresh(numbers, identity):
-                self._check_digest(fresh, self._store.digest(self.manifest.samples[fresh].key))
-                self._touched.note(fresh)
-            record = self._store.read_joined([sample.key for sample in samples])
+        record = self._shards.read_joined(numbers) if self._compared(numbers) else None
         if record is None:
             single = [self._load(number) for number in numbers]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
@@ -185,8 +190,8 @@ class CachedCloudDataset(SampleDataset):
         else:
             clouds = cloud_from_record(record)
         # One cloud each, since none has fewer.
-        fits = clouds.num_clouds == len(samples) and clouds.counts.tolist() == [one.num_points for one in samples]
-        return clouds if fits else None
+        wanted = self.manifest.index.num_points[numbers].tolist()
+        return clouds if clouds.num_clouds == len(numbers) and clouds.counts.tolist() == wanted else None
 
     def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
         if not runs_on_batches(self.transform):
@@ -203,7 +208,7 @@ class CachedCloudDataset(SampleDataset):
     def _parts(self, numbers: Sequence[int], each: int = 1) -> Iterator[slice]:
         """Cut samples, ``each`` of which belong together, into parts that the memory of a processor can hold."""
         begin = points = 0
-        counts = [self.manifest.samples[number].num_points for number in numbers]
+        counts = self.manifest.index.num_points[numbers].tolist()
         if sum(counts) <= _MOST_POINTS:
             yield slice(0, len(numbers))
             return
@@ -222,24 +227,28 @@ class CachedCloudDataset(SampleDataset):
 class _FirstTouch:
     """Which records were compared with their digests, in shared memory: workers that start anew compare none again.
 
-    The marks are of the file that :meth:`fresh` was asked about first; a process that meets another file under the name
-    begins anew, for itself.
+    The marks are of the files that :meth:`fresh` was asked about first; a process that meets another file under the
+    name of one begins anew with its records, for itself.
     """
 
-    def __init__(self, size: int) -> None:
-        self._seen = shared(torch.zeros(size, dtype=torch.bool, device="cpu"))
-        self._file = shared(torch.zeros(4, dtype=torch.int64, device="cpu"))  # all zero: not known yet
-        self._mine: tuple[int, ...] | None = None  # what this process has seen of the file
+    def __init__(self, index: SampleIndex) -> None:
+        self._index = index
+        self._seen = shared(torch.zeros(len(index), dtype=torch.bool, device="cpu"))
+        self._files = shared(torch.zeros(index.num_shards, 4, dtype=torch.int64, device="cpu"))  # 0: not known yet
+        self._mine: dict[int, tuple[int, ...]] = {}  # what this process has seen of them
 
-    def fresh(self, numbers: Sequence[int], identity: tuple[int, ...]) -> list[int]:
-        """Return those of some records that nobody has compared yet."""
-        if self._mine != identity:
-            known = tuple(self._file.tolist())
-            if known != identity and any(known):
-                self._seen = torch.zeros_like(self._seen)
-            else:
-                self._file.copy_(torch.tensor(identity, dtype=torch.int64, device="cpu"))
-            self._mine = identity
+    def fresh(self, numbers: Sequence[int], files: Mapping[int, tuple[int, ...]]) -> list[int]:
+        """Return those of some records that nobody has compared yet; ``files`` tells the files of their shards."""
+        for shard, identity in files.items():
+            if self._mine.get(shard) != identity:
+                known = tuple(self._files[shard].tolist())
+                if known != identity and any(known):
+                    self._seen = self._seen.clone()
+                    own = self._index.of_shard(shard)
+                    self._seen[own.start : own.stop] = False
+                else:
+                    self._files[shard] = torch.tensor(identity, dtype=torch.int64, device="cpu")
+                self._mine[shard] = identity
         seen = self._seen[torch.tensor(numbers, dtype=torch.int64, device="cpu")].tolist()
         return [number for number, is_seen in zip(numbers, seen, strict=True) if not is_seen]
 
@@ -247,9 +256,9 @@ class _FirstTouch:
         """Note that a record is what was written."""
         self._seen[number] = True
 
-    def __getstate__(self) -> dict[str, Tensor]:
-        return {"_seen": self._seen, "_file": self._file}
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_index": self._index, "_seen": self._seen, "_files": self._files}
 
-    def __setstate__(self, state: dict[str, Tensor]) -> None:
-        self.__dict__.update({name: shared(tensor) for name, tensor in state.items()})
-        self._mine = None
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: shared(one) if isinstance(one, Tensor) else one for name, one in state.items()})
+        self._mine = {}

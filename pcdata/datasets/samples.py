@@ -16,6 +16,7 @@ from pcdata.datasets.errors_in_workers import for_the_parent
 from pcdata.datasets.passes import PassWatch, shared
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
+from pcdata.io.store.sample_index import SampleIds
 from pcdata.rng import generator_for
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.unbatched import Unbatched
@@ -45,7 +46,9 @@ class SampleDataset(Dataset[PointCloud]):
     def __init__(self, ids: Sequence[str], transform: Transform | None, seed: int, repeats: int = 1) -> None:
         if transform is not None and not isinstance(transform, Transform):
             raise DTypeError(f"a dataset's transform must be a pcdata Transform, not a {type(transform).__name__}")
-        if len(set(ids)) != len(ids):
+        if not isinstance(ids, SampleIds):  # which are
+            ids = list(ids)
+        if isinstance(ids, list) and len(set(ids)) != len(ids):
             raise ConfigError("a dataset's sample ids must be unique: they key the random draws")
         if not (type(seed) is type(repeats) is int):  # of NumPy, or no numbers at all
             where = type(self).__name__
@@ -53,7 +56,7 @@ class SampleDataset(Dataset[PointCloud]):
         if repeats < 1:
             raise ConfigError(f"repeats must be how often every sample is in the dataset, 1 or more, got {repeats!r}")
         warn_if_slow()  # workers stay silent
-        self.ids = list(ids)
+        self.ids: list[str] | SampleIds = ids
         self.repeats = repeats
         self.transform = transform
         self.seed = seed

@@ -21,7 +21,7 @@ from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npz import write_npz
 from pcdata.files.opening import check_inside
 from pcdata.io.arrays.stored_arrays import stored_arrays
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, PointCloud
 

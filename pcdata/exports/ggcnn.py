@@ -24,7 +24,7 @@ from pcdata.exports.sample_needs import check_size, colors_of, one_view
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.opening import read_text
 from pcdata.io.images.writing import write_color
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import CompleteDepth, InpaintDepth
 

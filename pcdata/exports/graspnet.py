@@ -26,7 +26,7 @@ from pcdata.files.opening import check_inside
 from pcdata.io.images.reading import read_mask
 from pcdata.io.images.writing import depth_units, write_color, write_depth
 from pcdata.io.sources.graspnet import read_meta
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.structures import DepthFrame, PointCloud
 
 _WHY_SIZE = "graspnet-baseline asserts it"

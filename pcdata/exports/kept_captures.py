@@ -12,10 +12,10 @@ from pcdata.errors import CacheError, ConfigError
 from pcdata.files.sample_names import check_known
 from pcdata.io import open_source
 from pcdata.io.sources.capture_source import CaptureSource
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.structures import DepthFrame, Episode, Signal
 
-_FOLDER = "raw"  # beside the clouds, where the configuration says keep_raw
+_FOLDER = "raw"  # beside the clouds of a shard, where the configuration says keep_raw
 
 
 class _KeptCaptures:
@@ -46,7 +46,7 @@ class _KeptCaptures:
             CacheError: nothing was kept of it.
         """
         check_known(repr(self), sample_id, self._known)
-        folder = self._dataset.folder / _FOLDER / key_of(sample_id)
+        folder = self._dataset.shard_of(self._known[sample_id]) / _FOLDER / key_of(sample_id)
         views = sorted(folder.glob("view*"))
         if not views:
             raise CacheError(f"{folder}: the capture of sample {sample_id!r} is not there; rebuild the dataset")
@@ -74,7 +74,7 @@ def captures_of(target: str, dataset: SampleDataset) -> CaptureSource:
         ConfigError: a built dataset kept none, or the dataset gives every sample several times.
     """
     if isinstance(dataset, CachedCloudDataset):
-        if not (dataset.folder / _FOLDER).is_dir():
+        if not dataset.manifest.keep_raw:
             raise ConfigError(
                 f"export: {target} is made of depth images, but {dataset!r} has clouds alone; give the captures that "
                 "it was built from, or build it with output: {keep_raw: true}, which keeps them"

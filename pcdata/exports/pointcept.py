@@ -22,7 +22,7 @@ from pcdata.exports.sample_needs import check_channels, one_cloud
 from pcdata.exports.target import Item, Note, Samples, Target
 from pcdata.files.npy import write_npy
 from pcdata.files.opening import MAX_STREAMED_BYTES, map_npy
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.structures import DepthFrame, PointCloud
 
 

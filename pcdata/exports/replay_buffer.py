@@ -28,7 +28,7 @@ from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, Episode, PointCloud
 

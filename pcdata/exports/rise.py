@@ -31,7 +31,7 @@ from pcdata.files.npy import write_npy
 from pcdata.files.opening import read_text
 from pcdata.geometry import rigid, rotations
 from pcdata.io.images.writing import depth_units, write_color, write_depth
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 from pcdata.structures import CAMERA_FRAME, DepthFrame, Episode, PointCloud
 from pcdata.structures.pose_layouts import LAYOUTS
 

@@ -32,15 +32,20 @@ _ITEMS = re.compile(rf"\s*{_ITEM}\s*(?:,|(?=\}}))", re.ASCII)
 _LARGEST = 1 << 62  # bytes: beyond it, products of sizes overflow in NumPy
 
 
+def npy_bytes(array: NDArray) -> memoryview:
+    """Return the bytes of a ``.npy`` file."""
+    packed = io.BytesIO()
+    np.save(packed, array, allow_pickle=False)
+    return packed.getbuffer()
+
+
 def write_npy(path: Path, array: NDArray) -> None:
     """Write a ``.npy`` file, through memory: NumPy itself does not say why a disk takes no more.
 
     Raises:
         OSError: it cannot be written.
     """
-    packed = io.BytesIO()
-    np.save(packed, array, allow_pickle=False)
-    path.write_bytes(packed.getbuffer())
+    path.write_bytes(npy_bytes(array))
 
 
 @dataclass(frozen=True)

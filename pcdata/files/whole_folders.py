@@ -27,6 +27,7 @@ from pcdata.files.scratch import (
 
 # The file at the top of a folder that says what it is; without it nobody could tell what a killed removal left.
 DATASET, EXPORT = "dataset.json", "pcdata_export.json"
+INDEX = "index"  # the folder of a dataset that says what else is in it
 Owned = Callable[[Path], None]  # raises CacheError where a folder holds anything that deleting it would lose
 
 
@@ -96,14 +97,15 @@ def restore_retired(folder: Path, owned: Owned, note: Note) -> None:
 def remove_owned(folder: Path, owned: Owned) -> None:
     """Delete a folder that holds only what ``owned`` accepts; a file that comes meanwhile stays, in its folder.
 
-    The files at the top go last, and of them the one that says what the folder is, so that what is left of a removal
-    that was killed can be removed too.
+    A dataset's index and the files at the top go last, and of them the one that says what the folder is, so that what
+    is left of a removal that was killed can be removed too.
     """
     if not any(folder.iterdir()):
         os.rmdir(folder)
         return
     below: list[tuple[str, list[str], list[str]]] = list(os.walk(folder, topdown=False))
     owned(folder)
+    below.sort(key=lambda walked: (walked[0] == str(folder)) * 2 + (walked[0] == str(folder / INDEX)))
     for place, folders, files in below:
         files.sort(key=lambda name: name in (DATASET, EXPORT))
         for name in files + [name for name in folders if os.path.islink(os.path.join(place, name))]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import re
 
 import h5py
 import numpy as np
@@ -14,7 +14,9 @@ import torch
 from pcdata import CachedCloudDataset, PointCloud, open_source
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PcdataError
-from pcdata.io.store.manifest import Manifest, key_of
+from pcdata.io.store.manifest import Manifest
+from pcdata.io.store.sample_keys import key_of
+from tests.io.forged import first_shard
 from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "packed", "pt"]
@@ -130,7 +132,7 @@ def test_keep_raw_delivers_captures_that_open_source_reads_back(tmp_path, source
     for name in source.ids:
         frame = source.load(name)
         for v in range(2):
-            raw = open_source(tmp_path / "out" / "raw" / key_of(name) / f"view{v}")
+            raw = open_source(first_shard(tmp_path / "out") / "raw" / key_of(name) / f"view{v}")
             read = raw.load(raw.ids[0])
             assert torch.equal(read.depth[0], frame.depth[v])
             assert torch.equal(read.colors[0], frame.colors[v])
@@ -347,10 +349,11 @@ def test_a_target_below_a_file_is_a_cache_error(tmp_path, source, configure):
 # -- what other tools see ------------------------------------------------------------------------------------------
 
 
-def test_an_hdf5_dataset_is_one_file_with_a_group_per_scene(tmp_path, source, configure):
+def test_a_shard_of_an_hdf5_dataset_is_one_file_with_a_group_per_scene(tmp_path, source, configure):
     build_dataset(configure(), source, tmp_path / "out")
-    assert sorted(os.listdir(tmp_path / "out")) == ["clouds.h5", "dataset.json", "load.py", "pipeline.yaml"]
-    with h5py.File(tmp_path / "out" / "clouds.h5", "r") as file:
+    assert sorted(os.listdir(tmp_path / "out")) == ["dataset.json", "index", "load.py", "pipeline.yaml", "shards"]
+    assert sorted(os.listdir(first_shard(tmp_path / "out"))) == ["clouds.h5", "files.tsv"]
+    with h5py.File(first_shard(tmp_path / "out") / "clouds.h5", "r") as file:
         assert list(file) == source.ids
         frame = source.load(source.ids[0])
         group = file[source.ids[0]]
@@ -364,8 +367,14 @@ def test_the_manifest_is_readable_by_people_and_other_programs(tmp_path, source,
     build_dataset(configure("output: {format: npz, compression: gzip}"), source, tmp_path / "out")
     content = json.loads((tmp_path / "out" / "dataset.json").read_text())
     assert (content["format"], content["compression"]) == ("npz", "gzip")
-    assert [sample["id"] for sample in content["samples"]] == source.ids
-    assert all(re.fullmatch("[0-9a-f]{64}", sample["digest"]) for sample in content["samples"])
+    assert content["num_samples"] == len(source.ids)
+    index = {name: np.load(tmp_path / "out" / "index" / name) for name in content["index"]}
+    assert bytes(index["ids.npy"]).decode() == "".join(source.ids)
+    assert [*index["id_ends.npy"]] == [*np.cumsum([len(sample_id) for sample_id in source.ids])]
+    assert index["digests.npy"].shape == (3, 32)
+    for name, written in content["index"].items():
+        content = (tmp_path / "out" / "index" / name).read_bytes()
+        assert (len(content), hashlib.sha256(content).hexdigest()) == (written["bytes"], written["sha256"])
 
 
 def test_the_stored_yaml_makes_the_same_pipeline(tmp_path, source, configure):

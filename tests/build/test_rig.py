@@ -52,4 +52,4 @@ def test_the_page_s_commands_find_and_mend_a_camera_and_build_one_cloud(scene: T
     off = scene.surface_distance(metres[cloud.extra["view"] == 1])
     assert float(off.median()) < 0.004  # noise and voxels; 10 mm out of place would be 6 mm from the surfaces
     assert float(metres[:, 2].min()) > 0.002  # the table is gone
-    assert open_source("dataset/raw/f0").kind == "rig"
+    assert open_source("dataset/shards/00000/raw/f0").kind == "rig"

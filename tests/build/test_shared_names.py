@@ -73,7 +73,12 @@ def test_a_folder_made_at_the_last_moment_keeps_its_files(tmp_path, source, conf
     assert tree(tmp_path) == {"out": None, "out/thesis.tex": b"years"}
 
 
-@pytest.mark.parametrize("place", [".", "clouds", "raw", "clouds/deeper", "raw/0000/view0/depth"])
+SHARD = "shards/00000"
+PLACES = [".", "index", "shards", *(f"{SHARD}/{place}" for place in ("", "clouds", "raw", "clouds/deeper"))]
+PLACES += [f"{SHARD}/raw/0000/view0/depth"]
+
+
+@pytest.mark.parametrize("place", PLACES)
 def test_a_file_put_anywhere_into_a_dataset_stops_overwriting(tmp_path, source, configure, way, place):
     config = configure("output: {format: npz, keep_raw: true}")
     build_dataset(config, source, tmp_path / "out")
@@ -84,7 +89,7 @@ def test_a_file_put_anywhere_into_a_dataset_stops_overwriting(tmp_path, source, 
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("place", [".", "clouds"])
+@pytest.mark.parametrize("place", [".", f"{SHARD}/clouds"])
 def test_a_file_put_into_a_dataset_during_overwriting_stays_and_the_old_dataset_too(
     tmp_path, source, configure, way, place
 ):
@@ -135,8 +140,8 @@ def test_a_dataset_that_another_build_put_there_meanwhile_is_not_replaced(tmp_pa
 def test_a_link_in_a_dataset_is_not_what_a_build_wrote(tmp_path, source, configure):
     config = configure("output: {format: npz}")
     build_dataset(config, source, tmp_path / "out")
-    (tmp_path / "out" / "clouds").rename(tmp_path / "big_disk")
-    (tmp_path / "out" / "clouds").symlink_to(tmp_path / "big_disk")
+    (tmp_path / "out" / SHARD / "clouds").rename(tmp_path / "big_disk")
+    (tmp_path / "out" / SHARD / "clouds").symlink_to(tmp_path / "big_disk")
     with pytest.raises(CacheError, match="clouds"):
         build_dataset(config, source, tmp_path / "out", overwrite=True)
     assert len(list((tmp_path / "big_disk").iterdir())) == 3
@@ -235,14 +240,16 @@ def test_opening_a_dataset_that_a_killed_overwrite_had_set_aside_says_where_it_i
 
 
 @pytest.mark.parametrize("what", ["replaced", "retired"])
-@pytest.mark.parametrize("removed", [[], ["load.py", "clouds.h5"]], ids=["whole", "in part"])
+@pytest.mark.parametrize(
+    "removed", [[], [f"{SHARD}/clouds.h5"], ["shards", "index/ids.npy", "load.py"]], ids=["whole", "in part", "mostly"]
+)
 def test_an_old_dataset_whose_removal_was_killed_is_removed_by_the_next_build(
     tmp_path, source, configure, what, removed
 ):
     build_dataset(configure(), source, tmp_path / "out")
     shutil.copytree(tmp_path / "out", old := of_a_dead_process(tmp_path / "out", what))
     for name in removed:
-        (old / name).unlink()
+        shutil.rmtree(old / name) if (old / name).is_dir() else (old / name).unlink()
     report = build_dataset(configure(), source, tmp_path / "out", overwrite=True)
     assert any(old.name in note for note in report.notes)
     assert [path.name for path in tmp_path.iterdir()] == ["out"], report.notes

@@ -81,7 +81,7 @@ def test_a_dataset_is_built_again_from_what_it_remembers(captures, tmp_path):
     again = built(tmp_path / "a", tmp_path / "b", "--source", str(tmp_path / "elsewhere" / "captures"))
     for name in ("source", "format", "compression", "fingerprint", "pipeline", "samples", "skipped"):
         assert getattr(again, name) == getattr(first, name), name
-    assert (tmp_path / "b" / "raw").is_dir()
+    assert (tmp_path / "b" / "shards" / "00000" / "raw").is_dir()
     assert same_clouds(tmp_path / "a", tmp_path / "b")
 
 

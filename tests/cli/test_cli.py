@@ -29,6 +29,7 @@ from pcdata.cli import main
 from pcdata.io import write_ply
 from pcdata.io.sources.cloud_files import CloudFilesSource
 from pcdata.synthetic import SyntheticSource
+from tests.io.forged import first_shard
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """\
@@ -256,7 +257,7 @@ def test_inspect_tells_of_captures_and_of_one_file(capsys, captures):
 
 def test_inspect_of_a_damaged_dataset_is_exit_1(capsys, config, captures, tmp_path):
     run(capsys, "build", config, "--source", captures, "--out", tmp_path / "out")
-    (tmp_path / "out" / "clouds.h5").write_bytes(b"x" * 100)
+    (first_shard(tmp_path / "out") / "clouds.h5").write_bytes(b"x" * 100)
     code, out, err = run(capsys, "inspect", tmp_path / "out")
     assert (code, out) == (1, "")
     assert "clouds.h5" in err

@@ -12,7 +12,7 @@ import pytest
 from pcdata.cli import main
 from pcdata.cli.printable import printable, printable_output
 from pcdata.errors import CacheError
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 
 ORDERS = {
     "escape": "\x1b]0;title\x07",

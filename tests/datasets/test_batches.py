@@ -25,11 +25,13 @@ from pcdata import (
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.datasets import RepeatedEpochWarning, cached
 from pcdata.errors import CacheError
+from pcdata.io.store.shards import Shards
 from pcdata.structures.stored_steps import StoredSteps
 from pcdata.structures.unbatched import Unbatched
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import RandomJitter, RandomPointDropout, RandomRotation
 from pcdata.transforms.families import SpatialTransform
+from tests.io.forged import first_shard
 from tests.io.store.test_stores import assert_same_cloud
 from tests.loaders import packed_loader
 
@@ -149,7 +151,7 @@ def test_workers_give_the_batches_of_single_samples(stores, start):
         for place, batch in enumerate(loader):
             wanted = PointCloud.cat([singly[index] for index in order[2 * place : 2 * place + 2]])
             assert_same_cloud(batch, wanted)
-    assert dataset._touched.fresh(order, dataset._store.identity()) == []  # the workers compared them, once
+    assert dataset._touched.fresh(order, dataset._shards.identities(order)) == []  # the workers compared them, once
 
 
 def test_a_history_that_nobody_read_crosses_to_another_process_and_is_read_there(stores):
@@ -196,7 +198,7 @@ def damaged(folder: Path, tmp_path: Path, sample: int) -> tuple[Path, int]:
     """Copy a packed dataset and flip a bit of one sample's points; return the folder and the place of the byte."""
     shutil.copytree(folder, tmp_path / "copy")
     dataset = CachedCloudDataset(folder, augment=None)
-    path = tmp_path / "copy" / "clouds.packed"
+    path = first_shard(tmp_path / "copy") / "clouds.packed"
     content = bytearray(path.read_bytes())
     place = content.index(dataset[sample].points.numpy().tobytes())
     content[place] ^= 1
@@ -212,7 +214,7 @@ def test_a_flipped_bit_is_found_when_its_sample_is_first_read_and_the_sample_is_
         with pytest.raises(CacheError, match="differs from what was written") as caught:
             read()
         assert caught.value.sample_id == dataset.ids[2]
-        assert caught.value.path == str(folder / "clouds.packed")
+        assert caught.value.path == str(first_shard(folder) / "clouds.packed")
     with pytest.raises(CacheError, match="differs from what was written"):
         EpisodeWindows(CachedCloudDataset(folder), 2, 4).__getitems__([0, 2])
 
@@ -222,10 +224,8 @@ def test_a_sample_is_compared_once_for_a_file_and_again_for_another_file_of_its_
     shutil.copytree(stores["packed"], folder)
     dataset = CachedCloudDataset(folder)
     compared = []
-    digest = type(dataset._store).digest
-    monkeypatch.setattr(
-        type(dataset._store), "digest", lambda store, key: compared.append(key) or digest(store, key), raising=True
-    )
+    digest = Shards.digest
+    monkeypatch.setattr(Shards, "digest", lambda own, number: compared.append(number) or digest(own, number))
     for _ in range(2):
         dataset.__getitems__([0, 1])
         dataset[1]
@@ -233,8 +233,8 @@ def test_a_sample_is_compared_once_for_a_file_and_again_for_another_file_of_its_
     copy[0]
     assert len(compared) == 2
     other, _ = damaged(stores["packed"], tmp_path, 1)
-    (folder / "clouds.packed").unlink()
-    shutil.copy(other / "clouds.packed", folder)
+    (first_shard(folder) / "clouds.packed").unlink()
+    shutil.copy(first_shard(other) / "clouds.packed", first_shard(folder))
     dataset[1]  # still mapped
     with pytest.raises(CacheError, match="differs from what was written"):
         pickle.loads(pickle.dumps(dataset))[1]

@@ -16,6 +16,7 @@ from pcdata import CachedCloudDataset, CloudDataset, PointCloud
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataError
 from pcdata.io.store.manifest import checksum_of
 from pcdata.transforms import Compose, MaskDepth, RandomJitter, RemoveRadiusOutliers, VoxelDownsample
+from tests.io.forged import edit_samples, first_shard
 from tests.messages import told
 
 FORMATS = ["hdf5", "npz", "packed", "pt"]
@@ -180,9 +181,16 @@ def edited(folder, tmp_path, edit):
     return copied
 
 
+def changed(folder, tmp_path, number=0, **told):
+    """Copy a dataset whose index says something else of one sample."""
+    shutil.copytree(folder, tmp_path / "changed")
+    edit_samples(tmp_path / "changed", lambda each, sample: sample | (told if each == number else {}))
+    return tmp_path / "changed"
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_changed_digest_is_refused_and_names_file_and_sample(caches, tmp_path, form):
-    folder = edited(caches[form], tmp_path, lambda c: c["samples"][2].update(digest="0" * 64))
+    folder = changed(caches[form], tmp_path, digest="0" * 64, number=2)
     dataset = CachedCloudDataset(folder)
     assert dataset[0].num_points
     with pytest.raises(CacheError, match=r"tabletop-0002.*differs") as caught:
@@ -191,14 +199,15 @@ def test_a_changed_digest_is_refused_and_names_file_and_sample(caches, tmp_path,
 
 
 def test_a_changed_count_is_refused(caches, tmp_path):
-    folder = edited(caches["npz"], tmp_path, lambda c: c["samples"][0].update(num_points=65))
-    with pytest.raises(CacheError, match=r"64 points, but dataset\.json says 65"):
+    folder = changed(caches["npz"], tmp_path, num_points=65)
+    with pytest.raises(CacheError, match="64 points, but the index says 65"):
         CachedCloudDataset(folder)[0]
 
 
 def test_a_file_swapped_for_that_of_another_sample_is_refused(caches, tmp_path):
     folder = edited(caches["npz"], tmp_path, lambda c: None)
-    (folder / "clouds" / "tabletop-0001.npz").replace(folder / "clouds" / "tabletop-0000.npz")
+    clouds = first_shard(folder) / "clouds"
+    (clouds / "tabletop-0001.npz").replace(clouds / "tabletop-0000.npz")
     dataset = CachedCloudDataset(folder)
     with pytest.raises(CacheError, match="differs"):
         dataset[0]

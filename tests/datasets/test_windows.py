@@ -26,10 +26,12 @@ from pcdata import (
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.datasets.window_batch import WindowBatch
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, FrameError, PcdataWarning, ShapeError
-from pcdata.io.store.manifest import SIGNALS_KEY, checksum_of
+from pcdata.io.store.manifest import checksum_of
+from pcdata.io.store.shards import SIGNALS_KEY
 from pcdata.structures import Signal
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import MergeViews, RandomJitter, RandomRotation, ToFrame
+from tests.io.forged import first_shard
 
 # Workers are counted against the cores of the machine; here there must be more workers than some machines have cores.
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
@@ -473,8 +475,8 @@ def test_a_manifest_with_episodes_that_cannot_be_is_refused(case, tmp_path):
 def test_damaged_signals_are_refused_by_their_path(tmp_path):
     build_dataset(config_from_yaml("cloud: [Center]\noutput: {format: npz}\n"), Cloudy(), tmp_path / "set")
     data = CachedCloudDataset(tmp_path / "set")
-    path = tmp_path / "set" / "clouds" / f"{SIGNALS_KEY}.npz"
-    other = tmp_path / "set" / "clouds" / "0-0.npz"
+    path = tmp_path / "set" / "signals" / "clouds" / f"{SIGNALS_KEY}.npz"
+    other = first_shard(tmp_path / "set") / "clouds" / "0-0.npz"
     path.write_bytes(other.read_bytes())
     with pytest.raises(CacheError, match="the signals differ from what was written"):
         data.signal_table()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import os
 import pickle
 import shutil
@@ -15,9 +14,10 @@ from torch.utils.data import DataLoader
 from pcdata import CachedCloudDataset, CloudDataset, PointCloud, collate_fixed, collate_packed, collate_padded
 from pcdata.errors import CacheError, CaptureError, ShapeError
 from pcdata.io.store.cloud_record import record_from_cloud
-from pcdata.io.store.manifest import Manifest, Sample, checksum_of
+from pcdata.io.store.sample_index import Sample
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose, RandomJitter
+from tests.io.forged import edit_samples, first_shard, write_manifest
 from tests.loaders import packed_loader
 
 # Workers are counted against the cores of the machine; here there must be more workers than some machines have cores.
@@ -116,8 +116,7 @@ def test_padded_and_fixed_batches_come_through_workers_whole(caches):
 def big_h5(tmp_path_factory):
     """Enough bytes that a file position shared between processes would mix them up."""
     folder = tmp_path_factory.mktemp("big") / "dataset"
-    folder.mkdir()
-    store, samples = STORES["hdf5"](folder, "lzf"), []
+    store, samples = STORES["hdf5"](first_shard(folder), "lzf"), []
     for number in range(24):
         draw = torch.Generator().manual_seed(number)
         cloud = PointCloud(
@@ -128,7 +127,7 @@ def big_h5(tmp_path_factory):
         samples.append(Sample(f"s{number}", f"s{number}", 20_000, record.digest()))
     store.close()
     pipeline = Compose([RandomJitter(sigma=0.001)])
-    Manifest("hdf5", "lzf", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(folder)
+    write_manifest(folder, "hdf5", samples, compression="lzf", pipeline=pipeline)
     return folder
 
 
@@ -149,8 +148,8 @@ def test_a_child_that_closes_an_inherited_handle_leaves_the_parent_s_alone(cache
     wanted = dataset[0].points
     child = os.fork()
     if child == 0:  # pragma: no cover
-        dataset._store.close()
-        dataset._store.close()
+        dataset._shards.close()
+        dataset._shards.close()
         os._exit(0 if torch.equal(dataset[0].points, wanted) else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert torch.equal(dataset[0].points, wanted)
@@ -199,11 +198,7 @@ def error_of(loader: DataLoader) -> tuple[type, str]:
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_damaged_sample_keeps_its_error_type_and_names_itself(caches, tmp_path, num_workers):
     shutil.copytree(caches["npz"], tmp_path / "copy")
-    content = json.loads((tmp_path / "copy" / "dataset.json").read_text())
-    content["samples"][5]["digest"] = "0" * 64
-    del content["checksum"]
-    content["checksum"] = checksum_of(content)
-    (tmp_path / "copy" / "dataset.json").write_text(json.dumps(content))
+    edit_samples(tmp_path / "copy", lambda number, told: told | ({"digest": "0" * 64} if number == 5 else {}))
     dataset = CachedCloudDataset(tmp_path / "copy")
     kind, text = error_of(DataLoader(dataset, num_workers=num_workers, collate_fn=collate_packed))
     assert kind is CacheError

@@ -79,7 +79,7 @@ def facts(folder: Path, edit: Callable[[str], str]) -> Any:
 
 
 def manifest(folder: Path, edit: Callable[[str], str]) -> Any:
-    whole = {"schema": "pcdata.dataset/1", "samples": []}
+    whole = {"schema": "pcdata.dataset/2", "samples": []}
     (folder / "dataset.json").write_text(edit(json.dumps(whole)))
     return Manifest.read(folder)
 

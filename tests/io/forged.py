@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import shutil
 import struct
 import zlib
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +20,9 @@ from pcdata import PointCloud
 from pcdata.errors import CacheError, PcdataError
 from pcdata.io.arrays.stored_arrays import stored_arrays
 from pcdata.io.store.cloud_record import record_from_cloud
-from pcdata.io.store.manifest import Manifest, Sample
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.sample_index import FOLDER, Sample
+from pcdata.io.store.shards import TABLE, seal_shard, shard_folder
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose
 from tests.io.memory import memory_limit
@@ -31,6 +37,30 @@ def cloud(count: int = 64) -> PointCloud:
     )
 
 
+def first_shard(folder: Path) -> Path:
+    return shard_folder(folder, 0)
+
+
+def write_manifest(folder: Path, form: str, samples: Sequence[Sample], **more) -> None:
+    """Seal the one shard and write the manifest, both anew."""
+    pipeline = more.pop("pipeline", Compose([]))
+    shutil.rmtree(folder / FOLDER, ignore_errors=True)
+    for path in (folder / FILE_NAME, first_shard(folder) / TABLE):
+        path.unlink(missing_ok=True)
+    seal_shard(first_shard(folder))
+    compression = more.pop("compression", "none")
+    Manifest(form, compression, pipeline.stored_fingerprint(), pipeline.sections(), samples, **more).write(folder)
+
+
+def edit_samples(folder: Path, edit: Callable[[int, dict[str, Any]], dict[str, Any]]) -> None:
+    """Change what the index says of samples, with hashes that fit, so that what else is checked is reached."""
+    manifest = Manifest.read(folder)
+    samples = [Sample(**edit(number, vars(sample).copy())) for number, sample in enumerate(manifest.samples)]
+    shutil.rmtree(folder / FOLDER)
+    (folder / FILE_NAME).unlink()
+    replace(manifest, samples=samples).write(folder)
+
+
 def stored(folder: Path, form: str, compression: str = "none") -> Path:
     store = STORES[form](folder, compression)
     store.write("a", record_from_cloud(cloud()))
@@ -40,10 +70,8 @@ def stored(folder: Path, form: str, compression: str = "none") -> Path:
 
 def dataset(folder: Path, form: str) -> Path:
     record = record_from_cloud(cloud())
-    path = stored(folder, form)
-    pipeline = Compose([])
-    samples = [Sample("a", "a", 64, record.digest())]
-    Manifest(form, "none", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(folder)
+    path = stored(first_shard(folder), form)
+    write_manifest(folder, form, [Sample("a", "a", 64, record.digest())])
     return path
 
 

@@ -22,7 +22,7 @@ from pcdata.io.store.cloud_record import (
     record_from_signals,
     signals_from_record,
 )
-from pcdata.io.store.manifest import SIGNALS_KEY
+from pcdata.io.store.shards import SIGNALS_KEY
 from pcdata.io.store.stores import STORES
 from pcdata.structures.pose_layouts import LAYOUTS
 from pcdata.structures.signal_kinds import SIGNAL_KINDS, parse_kind, signal_kinds_table

@@ -29,6 +29,7 @@ class Hdf5Store(Store):
     format = "hdf5"
     compressions = ("none", "lzf", "gzip")
     suffix = ".h5"
+    holds_file = True
 
     def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
         super().__init__(folder, compression)
@@ -95,6 +96,7 @@ class Hdf5Store(Store):
 
         if self._file is None or self._disk is None or self._opened_by != os.getpid():
             self.close()
+            self.folder.mkdir(parents=True, exist_ok=True)
             disk = FaultKeepingFile(self.path)
             self._file = h5py.File(disk, "w" if disk.is_new else "r+")
             self._disk, self._opened_by = disk, os.getpid()

@@ -7,50 +7,41 @@ import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from pcdata.errors import CacheError, PcdataWarning, locate
 from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import retired_of
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
+from pcdata.io.store.sample_index import Sample, SampleIndex
+from pcdata.io.store.shards import read_tables
 from pcdata.io.store.stores import STORES, Compression
 from pcdata.structures import Episode
 from pcdata.structures.episodes import episodes_from_json
 
-SCHEMA = "pcdata.dataset/1"
+SCHEMA = "pcdata.dataset/2"
 FILE_NAME = DATASET
-SIGNALS_KEY = "~signals"  # of the record of the signals of all samples; no sample has a key that begins so
 
 _CHECKSUM = "checksum"
-_MAX_BYTES = 256 * 2**20  # about a million samples
+_MAX_BYTES = 256 * 2**20  # a million episodes
 _DEFINED = ("transforms", "layouts", "combinators")  # what a file of one's own may define
-_MAX_KEY = 200  # file names end at 255 bytes
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One stored sample: its id, the key it is stored under, its size and the digest of its record."""
-
-    id: str
-    key: str
-    num_points: int
-    digest: str
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The contents of ``dataset.json``."""
+    """The contents of ``dataset.json``, and the index of the samples beside it."""
 
     format: str
     compression: Compression
     fingerprint: str  # of the deterministic steps that made the stored clouds
     pipeline: Mapping[str, Any]  # section -> list of {transform: fields}
-    samples: Sequence[Sample]
+    samples: SampleIndex | Sequence[Sample]  # an index afterwards
     versions: Mapping[str, str] = field(default_factory=dict)
+    keep_raw: bool = False  # whether the captures lie beside the clouds
+    shard_size: int | None = None  # what was asked for; None = what fits the number of captures
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     model: Mapping[str, Any] = field(default_factory=dict)  # name and choices of the model that it was built for
     source: Mapping[str, Any] = field(default_factory=dict)  # the section source that it was built with; {} = unknown
@@ -62,9 +53,28 @@ class Manifest:
     streams: Sequence[Mapping[str, Any]] = ()  # of the recordings: how each was joined, and what that left
     schema: str = SCHEMA
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "samples", SampleIndex.of(self.samples))
+
+    @property
+    def index(self) -> SampleIndex:
+        """The samples, as their index."""
+        assert isinstance(self.samples, SampleIndex)
+        return self.samples
+
     def write(self, folder: Path) -> None:
-        """Write the file, with a checksum of its own contents, and force it to disk."""
-        content = asdict(self)
+        """Write the index and the file, with a checksum of its own contents, and force them to disk.
+
+        The shards are there already, each closed by :func:`~pcdata.io.store.shards.seal_shard`.
+
+        Raises:
+            CacheError: a shard is missing, or not closed.
+            OSError: the disk is full.
+        """
+        content = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "samples"}
+        content["episodes"] = [asdict(episode) for episode in self.episodes]
+        content["num_samples"] = len(self.index)
+        content["index"] = self.index.write(folder, read_tables(folder))
         with open(folder / FILE_NAME, "x", encoding="utf-8") as file:
             json.dump({**content, _CHECKSUM: checksum_of(content)}, file, indent=1, allow_nan=False)
             file.write("\n")
@@ -86,6 +96,15 @@ class Manifest:
             raise
 
     @classmethod
+    def is_one(cls, folder: Path) -> bool:
+        """Say whether a folder's ``dataset.json`` is what a build wrote, whatever became of its index."""
+        try:
+            content = parse_info(read_bytes("dataset", folder / FILE_NAME, max_bytes=_MAX_BYTES, error=CacheError))
+        except CacheError:
+            return False
+        return content.pop(_CHECKSUM, None) == checksum_of(content) and content.get("schema") == SCHEMA
+
+    @classmethod
     def _read(cls, folder: str | Path, path: Path) -> Manifest:
         if not path.is_file():
             if not os.path.lexists(folder) and (retired := retired_of(Path(os.path.realpath(folder)))):
@@ -100,23 +119,22 @@ class Manifest:
             if content.get("schema") != SCHEMA:
                 raise CacheError(f"schema must be {SCHEMA!r}, got {content.get('schema')!r:.100}; rebuild the dataset")
             found = content.pop(_CHECKSUM, None)
-            listed: dict[str, Any] = {"samples": [Sample(**sample) for sample in content["samples"]]}
-            if isinstance(content.get("imports"), list):
-                listed["imports"] = tuple(content["imports"])
-            if isinstance(content.get("streams"), list):
-                listed["streams"] = tuple(content["streams"])
-            if "episodes" in content:
-                count = len(listed["samples"])
-                listed["episodes"] = tuple(
-                    episodes_from_json("the dataset", content["episodes"], count, error=CacheError)
-                )
-            manifest = cls(**{**content, **listed})
-            _check(manifest)
             if found is not None and found != checksum_of(content):
                 raise CacheError(
                     "was changed after it was written: its checksum does not fit its contents; copy it again from "
                     "where the dataset was built, or rebuild the dataset"
                 )
+            samples = SampleIndex.read(Path(folder), content.pop("index"), content.pop("num_samples"))
+            listed: dict[str, Any] = {"samples": samples}
+            for name in ("imports", "streams"):
+                if isinstance(content.get(name), list):
+                    listed[name] = tuple(content.pop(name))
+            if "episodes" in content:
+                listed["episodes"] = tuple(
+                    episodes_from_json("the dataset", content.pop("episodes"), len(samples), error=CacheError)
+                )
+            manifest = cls(**content, **listed)
+            _check(manifest)
         except CacheError as error:
             raise CacheError(f"{path}: {error}") from error
         except (TypeError, ValueError, KeyError, OverflowError, RecursionError, MemoryError) as error:
@@ -157,6 +175,10 @@ def _check(manifest: Manifest) -> None:
     ):
         if not isinstance(getattr(manifest, name), kind):
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
+    if type(manifest.keep_raw) is not bool:
+        raise CacheError(f"keep_raw must be true or false, got {manifest.keep_raw!r:.100}")
+    if manifest.shard_size is not None and (type(manifest.shard_size) is not int or manifest.shard_size < 1):
+        raise CacheError(f"shard_size must be a whole number from 1, or null, got {manifest.shard_size!r:.100}")
     if manifest.model and not (isinstance(manifest.model.get("name"), str) and _is_choices(manifest.model)):
         raise CacheError(f"model must have a name and choices, got {manifest.model!r:.100}")
     if not isinstance(manifest.imports, tuple) or not all(map(_is_import, manifest.imports)):
@@ -165,18 +187,6 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"signals must have a digest or a fault, got {manifest.signals!r:.100}")
     if not isinstance(manifest.streams, tuple) or not all(isinstance(one, dict) for one in manifest.streams):
         raise CacheError(f"streams must list objects, got {manifest.streams!r:.100}")
-    if not manifest.samples:
-        raise CacheError("it lists no samples; rebuild the dataset")
-    for sample in manifest.samples:
-        texts = (sample.id, sample.key, sample.digest)
-        if not all(isinstance(text, str) for text in texts) or type(sample.num_points) is not int:
-            raise CacheError(f"a sample needs an id, a key, num_points and a digest, got {sample!r:.200}")
-    if len({sample.key for sample in manifest.samples}) != len(manifest.samples):
-        raise CacheError("two samples share a key")
-    for sample in manifest.samples:
-        # Keys become file names: one that could climb out of the folder is refused.
-        if sample.key != key_of(sample.id):
-            raise CacheError(f"sample {sample.id!r} must have the key {key_of(sample.id)!r}, got {sample.key!r}")
 
 
 def _is_import(entry: Any) -> bool:
@@ -191,23 +201,3 @@ def _is_import(entry: Any) -> bool:
 
 def _is_choices(model: Mapping[str, Any]) -> bool:
     return set(model) == {"name", "choices"} and isinstance(model["choices"], dict)
-
-
-def key_of(sample_id: str) -> str:
-    """Return a file-name safe and unique key for a sample id.
-
-    Letters, digits, dot, dash and underscore stay; other bytes become %XX; a leading dot too. A key too long for a file
-    name ends in ``~`` and a hash instead.
-
-    Raises:
-        CacheError: the id is empty, or no text in one line.
-    """
-    if not isinstance(sample_id, str) or sample_id.splitlines() != [sample_id]:
-        raise CacheError(f"a sample id must be a text in one line that is not empty, got {sample_id!r:.100}")
-    # surrogatepass: file names that are not UTF-8 reach Python as lone surrogates.
-    key = quote(sample_id, safe="", errors="surrogatepass").replace("~", "%7E")
-    key = "%2E" + key[1:] if key.startswith(".") else key
-    if len(key) > _MAX_KEY:
-        digest = hashlib.sha256(key.encode()).hexdigest()[:32]
-        key = f"{key[: _MAX_KEY - 33]}~{digest}"
-    return key

@@ -23,7 +23,7 @@ import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,8 +205,8 @@ class PackedFile:
         if len(self._places) != sum(len(own.keys) for own in groups):
             raise CacheError("two records have one key")
 
-    def place_of(self, key: str) -> tuple[int, int]:
-        """Return the group of a record and its number there.
+    def place_of(self, key: str) -> Place:
+        """Return where a record lies.
 
         Raises:
             CacheError: there is no such record.
@@ -214,51 +214,58 @@ class PackedFile:
         place = self._places.get(key)
         if place is None:
             raise CacheError(f"the record {key!r:.300} is missing")
-        return place
+        return Place(self._groups[place[0]], place[1])
 
-    def facts(self, place: tuple[int, int]) -> dict[str, Any]:
-        """Return what a record has in common with the others of its group."""
-        return self._groups[place[0]].facts
 
-    def record(self, place: tuple[int, int]) -> dict[str, NDArray[Any]]:
-        """Return the arrays of one record, read-only, as they lie in the file."""
-        group, row = place
+class Place(NamedTuple):
+    """Where a record lies in the mapped file: its group and its number there."""
+
+    group: _Group
+    row: int
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the record has in common with the others of its group."""
+        return self.group.facts
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of the record, read-only, as they lie in the file."""
         arrays = {}
-        for name, column in self._groups[group].columns.items():
-            values = column.values[column.rows(row, row + 1)]
+        for name, column in self.group.columns.items():
+            values = column.values[column.rows(self.row, self.row + 1)]
             arrays[name] = values.reshape(()) if column.is_scalar else values
         return arrays
 
-    def joined(
-        self, places: Sequence[tuple[int, int]], leave_out: Collection[str]
-    ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[np.int64]]] | None:
-        """Return each array of some records with its rows one after another, and how many rows are of each record.
 
-        None where their facts differ, or their arrays in name, dtype or shape of a row, but for those that are left
-        out.
-        """
-        runs = _runs(places)
-        groups = [self._groups[number] for number, _, _ in runs]
-        names = [name for name in groups[0].columns if name not in leave_out]
-        if not all(groups[0].joins(other, names, leave_out) for other in groups):
-            return None
-        arrays, counts = {}, {}
-        for name in names:
-            cuts = [(own.columns[name], begin, stop) for own, (_, begin, stop) in zip(groups, runs)]
-            arrays[name] = np.concatenate([one.values[one.rows(begin, stop)] for one, begin, stop in cuts])
-            each = {one.each for one, _, _ in cuts}
-            if len(each) == 1 and None not in each:
-                counts[name] = np.full(len(places), each.pop(), dtype=np.int64)
-            else:
-                counts[name] = np.concatenate([one.counts(begin, stop) for one, begin, stop in cuts])
-        return arrays, counts
+def join_rows(
+    places: Sequence[Place], leave_out: Collection[str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[np.int64]]] | None:
+    """Return each array of some records with its rows one after another, and how many rows are of each record.
+
+    None where their facts differ, or their arrays in name, dtype or shape of a row, but for those that are left out.
+    """
+    runs = _runs(places)
+    first = runs[0][0]
+    names = [name for name in first.columns if name not in leave_out]
+    if not all(first.joins(other, names, leave_out) for other, _, _ in runs):
+        return None
+    arrays, counts = {}, {}
+    for name in names:
+        cuts = [(own.columns[name], begin, stop) for own, begin, stop in runs]
+        arrays[name] = np.concatenate([one.values[one.rows(begin, stop)] for one, begin, stop in cuts])
+        each = {one.each for one, _, _ in cuts}
+        if len(each) == 1 and None not in each:
+            counts[name] = np.full(len(places), each.pop(), dtype=np.int64)
+        else:
+            counts[name] = np.concatenate([one.counts(begin, stop) for one, begin, stop in cuts])
+    return arrays, counts
 
 
-def _runs(places: Sequence[tuple[int, int]]) -> list[tuple[int, int, int]]:
+def _runs(places: Sequence[Place]) -> list[tuple[_Group, int, int]]:
     """Return group, first and stop of records that lie one after another."""
-    runs: list[tuple[int, int, int]] = []
+    runs: list[tuple[_Group, int, int]] = []
     for group, row in places:
-        if runs and runs[-1][0] == group and runs[-1][2] == row:
+        if runs and runs[-1][0] is group and runs[-1][2] == row:
             runs[-1] = (group, runs[-1][1], row + 1)
         else:
             runs.append((group, row, row + 1))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcdata.errors import CacheError
 from pcdata.io.store.cloud_record import DERIVED, Record
 from pcdata.io.store.joined_record import joined_record, merged_info, own_info, split_info
-from pcdata.io.store.packed_file import PackedFile, PackedWriter, open_packed
+from pcdata.io.store.packed_file import PackedFile, PackedWriter, Place, join_rows, open_packed
 from pcdata.io.store.store import INFO, Compression, Store, damage_named, register_store, writing
 
 _HISTORY = f"{INFO}.history"  # apart from the other facts: it is long, and seldom read
@@ -31,6 +31,7 @@ class _PackedStore(Store):
     format = "packed"
     compressions = ("none",)
     suffix = ".packed"
+    holds_file = True
 
     def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
         super().__init__(folder, compression)
@@ -62,28 +63,32 @@ class _PackedStore(Store):
         """Read one record; its arrays are the caller's own."""
         with damage_named(self.path):
             file = self._mapped()
-            record = _as_it_lies(file, file.place_of(key))
+            record = _as_it_lies(file.place_of(key))
             return Record({name: array.copy() for name, array in record.arrays.items()}, record.info)
 
     def digest(self, key: str) -> str:
         """Return the digest of one record, computed where it lies."""
         with damage_named(self.path):
             file = self._mapped()
-            return _as_it_lies(file, file.place_of(key)).digest()
+            return _as_it_lies(file.place_of(key)).digest()
 
-    def read_joined(self, keys: Sequence[str]) -> Record | None:
-        """Read records as one, every array copied once."""
-        with damage_named(self.path):
-            file = self._mapped()
-            places = [file.place_of(key) for key in keys]
-            joined = file.joined(places, DERIVED)
+    @classmethod
+    def read_joined(cls, records: Sequence[tuple[Store, str]]) -> Record | None:
+        """Read records, of one file or several, as one; every array is copied once."""
+        places = []
+        for store, key in records:
+            assert isinstance(store, _PackedStore)
+            with damage_named(store.path):
+                places.append(store._mapped().place_of(key))
+        with damage_named(records[0][0].path_of("")):
+            joined = join_rows(places, DERIVED)
             if joined is None:
                 return None
             arrays, rows = joined
             own, history = (_texts(arrays.pop(name), rows.pop(name)) for name in (INFO, _HISTORY))
             # The strict parser looked at each when its digest was compared.
             owns = json.loads(b"[" + b",".join(own) + b"]")
-            return joined_record(arrays, rows, file.facts(places[0]), owns, history)
+            return joined_record(arrays, rows, places[0].facts, owns, history)
 
     def identity(self) -> tuple[int, ...]:
         """Return what tells the mapped file from another of its name."""
@@ -102,13 +107,13 @@ class _PackedStore(Store):
         return {**self.__dict__, "_writer": None, "_opened_file": None}
 
 
-def _as_it_lies(file: PackedFile, place: tuple[int, int]) -> Record:
+def _as_it_lies(place: Place) -> Record:
     """Return a record whose arrays are those of the mapped file."""
-    arrays = file.record(place)
+    arrays = place.arrays()
     own, history = (arrays.pop(name, None) for name in (INFO, _HISTORY))
     if own is None or history is None or own.dtype != np.uint8 or history.dtype != np.uint8:
         raise CacheError(f"has a record without the texts {INFO!r} and {_HISTORY!r}")
-    return Record(arrays, merged_info(file.facts(place), own_info(own.tobytes(), history.tobytes())))
+    return Record(arrays, merged_info(place.facts, own_info(own.tobytes(), history.tobytes())))
 
 
 def _texts(letters: NDArray[Any], counts: NDArray[np.int64]) -> list[bytes]:

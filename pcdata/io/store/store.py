@@ -25,11 +25,15 @@ INFO = "pcdata"  # the name that the JSON text is stored under
 
 
 class Store:
-    """Records by key inside one dataset folder; subclass it and :func:`register_store` for a format of your own."""
+    """Records by key inside one folder, a shard of a dataset.
+
+    Subclass it and :func:`register_store` for a format of your own.
+    """
 
     format: ClassVar[str]  # its name in ``output: {format: ...}``
     compressions: ClassVar[tuple[Compression, ...]]  # that it knows, "none" among them
     suffix: ClassVar[str]  # of its files
+    holds_file: ClassVar[bool] = False  # whether one that was read keeps a file open until it is closed
 
     def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
         self.folder = Path(folder)
@@ -63,8 +67,11 @@ class Store:
         """
         return self.read(key).digest()
 
-    def read_joined(self, keys: Sequence[str]) -> Record | None:
-        """Read some records as one, that of their clouds in a row; None where this store, or these records, cannot.
+    @classmethod
+    def read_joined(cls, records: Sequence[tuple[Store, str]]) -> Record | None:
+        """Read some records as one, that of their clouds in a row; None where such stores, or these records, cannot.
+
+        Each is told by its store, one of this class, and its key.
 
         The digests of the records were compared before: see :meth:`identity`.
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pcdata.errors import CaptureError
 from pcdata.files.sample_names import check_names, in_order
 from pcdata.io.sources.listing import is_litter
-from pcdata.io.store.manifest import key_of
+from pcdata.io.store.sample_keys import key_of
 
 _FORBIDDEN = {*'/\\<>:"|?*'}  # in names of files, of one system or another
 _LONGEST = 200  # bytes of a name, of the 255 that a file name may have

@@ -12,10 +12,10 @@ from pcdata import CachedCloudDataset, read_volume
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports.episodes import read_episodes
 from pcdata.io.store.cloud_record import Record, record_from_cloud
-from pcdata.io.store.manifest import FILE_NAME, Manifest, Sample
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.sample_index import Sample
 from pcdata.io.store.stores import STORES
-from pcdata.transforms import Compose
-from tests.io.forged import cloud, dataset, foreign_refused, stored
+from tests.io.forged import cloud, dataset, first_shard, foreign_refused, stored, write_manifest
 
 FORMATS = list(STORES)
 
@@ -52,20 +52,17 @@ def test_other_files_that_are_fifos_are_refused_at_once(tmp_path):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("part", ["file", "folder"])
+@pytest.mark.parametrize("part", ["file", "folder", "shard", "shards", "table"])
 def test_a_dataset_whose_files_are_links_to_elsewhere_is_refused(tmp_path, form, part):
     folder, other = tmp_path / "dataset", tmp_path / "elsewhere"
     folder.mkdir()
     path = dataset(folder, form)
-    if part == "file":
-        shutil.move(path, other)
-        path.symlink_to(other)
-    elif path.parent == folder:
-        pytest.skip("its file lies in the dataset's own folder, which the user names")
-    else:
-        shutil.move(path.parent, other)
-        path.parent.symlink_to(other)
-    with pytest.raises(CacheError, match="link out of the dataset's folder"):
+    shard = first_shard(folder)
+    parts = {"folder": path.parent, "shard": shard, "shards": shard.parent, "table": shard / "files.tsv"}
+    moved = parts.get(part, path)
+    shutil.move(moved, other)
+    moved.symlink_to(other)
+    with pytest.raises(CacheError, match=r"link out of the dataset's folder|leads out of"):
         CachedCloudDataset(folder)[0]
 
 
@@ -77,13 +74,10 @@ def test_a_dataset_whose_files_are_links_to_elsewhere_is_refused(tmp_path, form,
 def test_a_field_under_another_name_is_no_extra_that_nothing_rotates(tmp_path, form, old_name):
     record = record_from_cloud(cloud())
     arrays = {("extra." + name if name == old_name else name): array for name, array in record.arrays.items()}
-    pipeline = Compose([])
-    Manifest(
-        form, "none", pipeline.stored_fingerprint(), pipeline.sections(), [Sample("a", "a", 64, record.digest())]
-    ).write(tmp_path)
-    store = STORES[form](tmp_path)
+    store = STORES[form](first_shard(tmp_path))
     store.write("a", Record(arrays, record.info))
     store.close()
+    write_manifest(tmp_path, form, [Sample("a", "a", 64, record.digest())])
     with pytest.raises(CacheError, match="differs from what was written"):
         CachedCloudDataset(tmp_path)[0]
 
@@ -97,13 +91,11 @@ def test_facts_that_json_cannot_hold_or_that_swell_are_typed_errors(tmp_path, fo
         def info_text(self) -> str:
             return text
 
-    dataset(tmp_path, form)
     record = record_from_cloud(cloud())
-    path = STORES[form](tmp_path).path_of("a")
-    path.unlink()
-    store = STORES[form](tmp_path)
+    store = STORES[form](first_shard(tmp_path))
     store.write("a", Forged(record.arrays, {**record.info}))
     store.close()
+    write_manifest(tmp_path, form, [Sample("a", "a", 64, record.digest())])
     with pytest.raises(CacheError):
         CachedCloudDataset(tmp_path)[0]
 
@@ -111,10 +103,8 @@ def test_facts_that_json_cannot_hold_or_that_swell_are_typed_errors(tmp_path, fo
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_number_of_points_that_differs_from_the_manifest_is_told(tmp_path, form):
     record = record_from_cloud(cloud())
-    stored(tmp_path, form)
-    pipeline = Compose([])
-    samples = [Sample("a", "a", 65, record.digest())]
-    Manifest(form, "none", pipeline.stored_fingerprint(), pipeline.sections(), samples).write(tmp_path)
+    stored(first_shard(tmp_path), form)
+    write_manifest(tmp_path, form, [Sample("a", "a", 65, record.digest())])
     with pytest.raises(CacheError, match="has 64 points, but"):
         CachedCloudDataset(tmp_path)[0]
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,17 +13,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pcdata.errors import CacheError, PcdataWarning
-from pcdata.io.store.manifest import FILE_NAME, SCHEMA, Manifest, Sample, checksum_of, key_of
+from pcdata.io.store.manifest import FILE_NAME, SCHEMA, Manifest, checksum_of
+from pcdata.io.store.sample_index import Sample
+from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.shards import seal_shard, shard_folder
 
 GOOD = {
     "format": "npz",
     "compression": "none",
     "fingerprint": "f" * 64,
     "pipeline": {"depth": [], "cloud": [], "augment": []},
-    "samples": [{"id": "a", "key": "a", "num_points": 3, "digest": "d"}],
     "versions": {"pcdata": "0.1.0"},
     "schema": SCHEMA,
 }
+SAMPLE = Sample("a", "a", 3, "d" * 64)
+
+
+@pytest.fixture(autouse=True)
+def _index(tmp_path):
+    """Let the example of these tests have an index."""
+    seal_shard(shard_folder(tmp_path, 0))
+    Manifest(**GOOD, samples=[SAMPLE]).write(tmp_path)
+    content = json.loads((tmp_path / FILE_NAME).read_text())
+    GOOD.update({name: content[name] for name in ("index", "num_samples")})
+    yield
+    for name in ("index", "num_samples"):
+        del GOOD[name]
 
 
 def _refused(folder: Path, content: object) -> str:
@@ -35,25 +52,30 @@ def _refused(folder: Path, content: object) -> str:
 
 def test_what_is_written_is_read(tmp_path):
     ids = ["a/b", "ü", "..", "x" * 300, "a b"]
-    samples = [Sample(name, key_of(name), number, "d" * 64) for number, name in enumerate(ids)]
+    samples = [Sample(name, key_of(name), number, "d" * 64, number // 2) for number, name in enumerate(ids)]
     manifest = Manifest("hdf5", "lzf", "f" * 64, {"depth": [], "cloud": []}, samples, {"torch": "2"})
-    manifest.write(tmp_path)
-    assert Manifest.read(tmp_path) == manifest
-    assert Manifest.read(str(tmp_path)) == manifest
+    folder = tmp_path / "new"
+    for shard in range(3):
+        seal_shard(shard_folder(folder, shard))
+    manifest.write(folder)
+    for read in (Manifest.read(folder), Manifest.read(str(folder)), pickle.loads(pickle.dumps(Manifest.read(folder)))):
+        assert read == manifest
+        assert read.samples == samples
+        assert read.index.ids == ids
+        assert [read.index.ids.place_of(name) for name in (*ids, "", "c", 5)] == [0, 1, 2, 3, 4, None, None, None]
+        assert [read.index.of_shard(shard) for shard in range(3)] == [range(2), range(2, 4), range(4, 5)]
 
 
 def test_the_example_of_these_tests_is_valid(tmp_path):
     (tmp_path / FILE_NAME).write_text(json.dumps({**GOOD, "checksum": checksum_of(GOOD)}))
-    assert Manifest.read(tmp_path).samples == [Sample("a", "a", 3, "d")]
+    assert Manifest.read(tmp_path).samples == [SAMPLE]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"samples": [{**GOOD["samples"][0], "num_points": 4}]},
-        {"samples": [{**GOOD["samples"][0], "digest": "e"}]},
-        {"samples": [{"id": "b", "key": "b", "num_points": 3, "digest": "d"}]},
-        {"samples": [*GOOD["samples"], {"id": "b", "key": "b", "num_points": 3, "digest": "d"}]},
+        {"num_samples": 2},
+        {"index": {}},
         {"fingerprint": "0" * 64},
         {"pipeline": {"depth": [], "cloud": [], "augment": [{"RandomYaw": {}}]}},
         {"versions": {"pcdata": "0.1.1"}},
@@ -116,16 +138,12 @@ def test_a_name_that_is_not_utf8_has_a_key():
 
 
 @pytest.mark.parametrize("key", ["../x", "..", "/etc/passwd", "a/b", "A", "", "a\0", "a.npz/../../x"])
-def test_a_key_that_is_not_that_of_its_id_is_refused(tmp_path, key):
-    assert "key" in _refused(tmp_path, {**GOOD, "samples": [{**GOOD["samples"][0], "key": key}]})
-
-
-def test_an_id_that_climbs_out_cannot_bring_its_own_key(tmp_path):
-    assert "key" in _refused(tmp_path, {**GOOD, "samples": [{**GOOD["samples"][0], "id": "../x", "key": "../x"}]})
-
-
-def test_two_samples_of_one_key_are_refused(tmp_path):
-    assert "share a key" in _refused(tmp_path, {**GOOD, "samples": GOOD["samples"] * 2})
+def test_a_key_that_is_not_that_of_its_id_is_refused(key):
+    with pytest.raises(CacheError, match="must have the key 'a'"):
+        Manifest(
+            **{name: GOOD[name] for name in ("format", "compression", "fingerprint", "pipeline")},
+            samples=[replace(SAMPLE, key=key)],
+        )
 
 
 @pytest.mark.parametrize(
@@ -143,18 +161,14 @@ def test_two_samples_of_one_key_are_refused(tmp_path):
         ({"pipeline": []}, "pipeline"),
         ({"pipeline": None}, "pipeline"),
         ({"versions": "1.0"}, "versions"),
-        ({"samples": []}, "no samples"),
-        ({"samples": None}, ""),
-        ({"samples": 5}, ""),
-        ({"samples": ["a"]}, ""),
-        ({"samples": {"a": 1}}, ""),
-        ({"samples": [{"id": "a"}]}, ""),
-        ({"samples": [{**GOOD["samples"][0], "more": 1}]}, "more"),
-        ({"samples": [{**GOOD["samples"][0], "id": 5, "key": "5"}]}, "id"),
-        ({"samples": [{**GOOD["samples"][0], "id": "", "key": ""}]}, "id"),
-        ({"samples": [{**GOOD["samples"][0], "num_points": "3"}]}, "num_points"),
-        ({"samples": [{**GOOD["samples"][0], "num_points": True}]}, "num_points"),
-        ({"samples": [{**GOOD["samples"][0], "digest": None}]}, "digest"),
+        ({"num_samples": 2}, "num_samples"),
+        ({"num_samples": True}, "num_samples"),
+        ({"num_samples": 10**30}, "num_samples"),
+        ({"index": None}, "index must tell"),
+        ({"index": {"../../ids.npy": {"bytes": 1, "sha256": ""}}}, "index must tell"),
+        ({"samples": []}, "samples"),
+        ({"keep_raw": 1}, "keep_raw"),
+        ({"shard_size": 0}, "shard_size"),
         ({"surprise": 1}, "surprise"),
     ],
     ids=str,
@@ -163,7 +177,7 @@ def test_wrong_contents_are_refused(tmp_path, change, word):
     assert word in _refused(tmp_path, {**GOOD, **change})
 
 
-@pytest.mark.parametrize("name", [name for name in GOOD if name != "versions"])
+@pytest.mark.parametrize("name", ["index", "num_samples", *(name for name in GOOD if name != "versions")])
 def test_a_missing_entry_is_refused(tmp_path, name):
     _refused(tmp_path, {key: value for key, value in GOOD.items() if key != name})
 
@@ -182,6 +196,7 @@ def test_a_cut_file_is_refused_wherever_it_is_cut(tmp_path):
 
 
 def test_a_folder_without_one_says_how_to_make_one(tmp_path):
+    (tmp_path / FILE_NAME).unlink()
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(CacheError, match="pcdata build"):
             Manifest.read(folder)

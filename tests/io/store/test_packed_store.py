@@ -32,6 +32,10 @@ def write(folder: Path, clouds: list[PointCloud]) -> Path:
     return store.path
 
 
+def joined(store, keys):
+    return store.read_joined([(store, key) for key in keys])
+
+
 def plain(count: int, seed: int = 0) -> PointCloud:
     draw = torch.Generator().manual_seed(seed)
     return PointCloud(points=torch.rand(count, 3, generator=draw), frame_id="base", meta=[{"sample_id": str(seed)}])
@@ -77,7 +81,7 @@ def test_records_read_as_one_are_the_batch_of_their_clouds(tmp_path, monkeypatch
     monkeypatch.setattr(packed_file, "_GROUP", group)
     clouds = [full_cloud(0), full_cloud(1), full_cloud(2)[0], full_cloud(3)[1:]]
     write(tmp_path, clouds)
-    record = STORES["packed"](tmp_path).read_joined([f"k{number}" for number in which])
+    record = joined(STORES["packed"](tmp_path), [f"k{number}" for number in which])
     assert_same_cloud(cloud_from_record(record), PointCloud.cat([clouds[number] for number in which]))
 
 
@@ -86,9 +90,9 @@ def test_records_that_cannot_share_a_batch_are_not_read_as_one(tmp_path):
     with_labels = PointCloud(points=torch.zeros(2, 3), frame_id="base", labels=torch.zeros(2, dtype=torch.int64))
     write(tmp_path, [plain(4), other_frame, with_labels, plain(3, 1)])
     store = STORES["packed"](tmp_path)
-    assert store.read_joined(["k0", "k3"]) is not None
-    assert store.read_joined(["k0", "k1"]) is None
-    assert store.read_joined(["k2", "k0"]) is None
+    assert joined(store, ["k0", "k3"]) is not None
+    assert joined(store, ["k0", "k1"]) is None
+    assert joined(store, ["k2", "k0"]) is None
 
 
 @pytest.mark.parametrize(
@@ -101,14 +105,14 @@ def test_records_whose_pointers_fit_their_neighbors_rows_alone_are_not_read_as_o
     with closing(STORES["packed"](tmp_path)) as store:
         store.write("k0", Record({**record.arrays, "ptr": np.array(ptr)}, record.info))
         store.write("k1", record)
-    assert store.read_joined(["k0", "k1"]) is None
+    assert joined(store, ["k0", "k1"]) is None
 
 
 def test_what_is_read_is_the_readers_own(tmp_path):
     write(tmp_path, [plain(4), plain(4, 1)])
     store = STORES["packed"](tmp_path)
     for _ in range(2):
-        for read in (store.read("k0"), store.read_joined(["k0", "k1"]), store.read_joined(["k0"])):
+        for read in (store.read("k0"), joined(store, ["k0", "k1"]), joined(store, ["k0"])):
             cloud = cloud_from_record(read)
             assert torch.equal(cloud.points[:4], plain(4).points)
             cloud.points.add_(1.0)

@@ -1,0 +1,281 @@
+"""The shards of a dataset: each a folder with a store of its own and a table of its files, read as one.
+
+``shards/00012`` holds what a store of that folder wrote, and ``files.tsv``: of every file of the shard, one a line, its
+SHA-256, its bytes and its name, those at the top first. The dataset's index has the SHA-256 of each table, so that
+every byte of a dataset is known by ``dataset.json``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from pcdata.errors import CacheError, locate, write_fault
+from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input, read_bytes
+from pcdata.io.store.cloud_record import Record
+from pcdata.io.store.sample_index import SampleIndex
+from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.stores import STORES, Store
+
+FOLDER, TABLE = "shards", "files.tsv"
+SIGNALS_FOLDER = "signals"  # beside the shards: a store with one record, of the signals of all samples
+SIGNALS_KEY = "~signals"  # of that record; no sample has a key that begins so
+
+_NAME = re.compile(r"[0-9]{5,}")
+_LINE = re.compile(r"([0-9a-f]{64})\t([0-9]{1,18})\t([^\t\n\r\\:]+)")
+_MOST_BYTES = 1 << 32  # of a table
+_BLOCK = 1 << 22  # bytes that are hashed at once
+_MOST_OPEN = 128  # stores that hold a file open
+_FEWEST, _MOST_SHARDS = 32, 1000
+
+
+class StoredFile(NamedTuple):
+    """What a shard's table says of a file."""
+
+    sha256: str
+    size: int
+
+
+def shard_size_of(num_samples: int, asked: int | None = None) -> int:
+    """Return how many samples of a plan each shard has: what was asked for, or such that there are 1,000 shards."""
+    return asked or max(_FEWEST, -(-num_samples // _MOST_SHARDS))
+
+
+def shard_folder(folder: Path, shard: int) -> Path:
+    """Return the folder of one shard of a dataset."""
+    return folder / FOLDER / f"{shard:05d}"
+
+
+def seal_shard(folder: Path) -> str:
+    """Write the table of the files of a shard whose store is closed, and force it to disk; return its SHA-256.
+
+    Raises:
+        CacheError: it has one already, holds what is no file, or it cannot be written.
+    """
+    lines = []
+    try:
+        for name in _names_below(folder):
+            size, sha256 = hash_of(folder / name)
+            line = f"{sha256}\t{size}\t{name}"
+            if _LINE.fullmatch(line) is None:
+                raise CacheError(f"{folder / name}: has a name that no table can hold; store it under another")
+            lines.append(line + "\n")
+        content = "".join(lines).encode("utf-8", "surrogateescape")
+        folder.mkdir(parents=True, exist_ok=True)  # of a shard without a sample
+        with open(folder / TABLE, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise CacheError(f"{folder / TABLE}: cannot be written: {write_fault(error)}") from error
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_tables(folder: Path) -> list[bytes]:
+    """Return the SHA-256 of the table of every shard in a dataset's folder, in their order.
+
+    Raises:
+        CacheError: there is none, one is missing, or one was not sealed.
+    """
+    with suppress(FileNotFoundError):
+        numbers = sorted(int(name) for name in os.listdir(folder / FOLDER) if _NAME.fullmatch(name))
+        if numbers and numbers == [*range(len(numbers))]:
+            return [hashlib.sha256(_table_bytes(folder, shard)).digest() for shard in numbers]
+    raise CacheError(f"{folder / FOLDER}: must hold the folders 00000, 00001, ... of the dataset's shards")
+
+
+def read_table(folder: Path, shard: int, sha256: bytes) -> dict[str, StoredFile]:
+    """Return the files of one shard by name, as they were written.
+
+    Raises:
+        CacheError: the table is missing, or another than the index says.
+    """
+    content, path = _table_bytes(folder, shard), shard_folder(folder, shard) / TABLE
+    if hashlib.sha256(content).digest() != sha256:
+        raise _located(path, "is not what was written; copy the shard again, or rebuild the dataset")
+    files = {}
+    for line in content.decode("utf-8", "surrogateescape").split("\n")[:-1]:
+        found = _LINE.fullmatch(line)
+        if found is None or found[3] in files or _climbs(found[3]):
+            raise _located(path, f"has a line that tells of no file of the shard: {line!r:.200}")
+        files[found[3]] = StoredFile(found[1], int(found[2]))
+    return files
+
+
+def hash_of(path: Path) -> tuple[int, str]:
+    """Return the size and the SHA-256 of a file.
+
+    Raises:
+        CacheError: it is no regular file, or cannot be read.
+    """
+    total, size = hashlib.sha256(), 0
+    if path.stat().st_size == 0:  # which no input may be
+        return 0, total.hexdigest()
+    with open_input("dataset", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError) as file:
+        while block := file.read(_BLOCK):
+            total.update(block)
+            size += len(block)
+    return size, total.hexdigest()
+
+
+class Shards:
+    """The records of a dataset by the number of their sample, wherever they lie.
+
+    A shard is opened when a process first reads one of its records: then its table, its folder and the size of what
+    lies at its top are held to what was written.
+    """
+
+    def __init__(self, folder: Path, form: str, index: SampleIndex) -> None:
+        self.folder = folder
+        self._form = form
+        self._index = index
+        self._stores: dict[int, Store] = {}
+
+    def path_of(self, number: int) -> Path:
+        """Return the file that holds the record of a sample."""
+        shard = int(self._index.shards[number])
+        return STORES[self._form](shard_folder(self.folder, shard)).path_of(key_of(self._index.ids[number]))
+
+    def read(self, number: int) -> Record:
+        """Read the record of a sample.
+
+        Raises:
+            CacheError: missing, damaged or hostile; says which file.
+        """
+        return self.store(int(self._index.shards[number])).read(key_of(self._index.ids[number]))
+
+    def digest(self, number: int) -> str:
+        """Return the digest of a record as it is stored.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        return self.store(int(self._index.shards[number])).digest(key_of(self._index.ids[number]))
+
+    def read_joined(self, numbers: Sequence[int]) -> Record | None:
+        """Read the records of some samples as one, in this order; None where the store, or these records, cannot.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        shards = self._index.shards[numbers].tolist()
+        records = [(self.store(shard), key_of(self._index.ids[number])) for shard, number in zip(shards, numbers)]
+        return STORES[self._form].read_joined(records)
+
+    def identities(self, numbers: Sequence[int]) -> dict[int, tuple[int, ...]] | None:
+        """Return what tells the files of the shards of some samples from others of their names, by shard.
+
+        None where files are opened again for every record: see :meth:`pcdata.io.Store.identity`.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        found = {}
+        for shard in {*self._index.shards[numbers].tolist()}:
+            identity = self.store(shard).identity()
+            if identity is None:
+                return None
+            found[shard] = identity
+        return found
+
+    def store(self, shard: int) -> Store:
+        """Return the store of one shard.
+
+        Raises:
+            CacheError: the shard is missing, lies elsewhere, or a file of it has another size than was written.
+        """
+        store = self._stores.get(shard)
+        if store is None:
+            store = STORES[self._form](shard_folder(self.folder, shard))
+            if store.holds_file and len(self._stores) >= _MOST_OPEN:
+                self._stores.pop(next(iter(self._stores))).close()
+            self._check_sizes(shard)
+            self._stores[shard] = store
+        return store
+
+    def signals(self) -> Record:
+        """Read the record of the signals of all samples.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+        store = self.signals_store()
+        try:
+            return store.read(SIGNALS_KEY)
+        finally:
+            store.close()
+
+    def signals_store(self) -> Store:
+        """Return the store that holds the signals of all samples."""
+        folder = self.folder / SIGNALS_FOLDER
+        _check_place(self.folder, folder)
+        return STORES[self._form](folder)
+
+    def close(self) -> None:
+        """Close what this process has open."""
+        stores, self._stores = self._stores, {}
+        for store in stores.values():
+            store.close()
+
+    def _check_sizes(self, shard: int) -> None:
+        folder = shard_folder(self.folder, shard)
+        for name, told in read_table(self.folder, shard, self._index.tables[shard].tobytes()).items():
+            if "/" in name:  # those at the top come first
+                break
+            with suppress(OSError):  # told when it is opened
+                found = os.stat(folder / name)
+                if stat.S_ISREG(found.st_mode) and found.st_size != told.size:
+                    raise _located(
+                        folder / name,
+                        f"has {found.st_size} bytes, but {told.size} were written: cut short, or changed; copy it "
+                        "again, or rebuild the dataset",
+                    )
+
+
+def _table_bytes(folder: Path, shard: int) -> bytes:
+    path = shard_folder(folder, shard) / TABLE
+    _check_place(folder, path.parent)
+    if not os.path.lexists(path):
+        raise _located(path, "the file is missing; rebuild the dataset, or copy it again")
+    if path.is_file() and path.stat().st_size == 0:  # of a shard without a sample
+        return b""
+    return read_bytes("dataset", path, max_bytes=_MOST_BYTES, inside=[folder], error=CacheError)
+
+
+def _check_place(dataset: Path, folder: Path) -> None:
+    try:
+        check_inside("dataset", folder, [dataset], CacheError)
+    except CacheError as error:
+        raise _located(folder, "is a link out of the dataset's folder; put the folder itself there") from error
+
+
+def _names_below(folder: Path) -> Iterator[str]:
+    """Give the names of all files below a folder, those at its top first, in one order on every machine."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    found = []
+    for place, folders, files in os.walk(folder, onerror=refuse) if folder.is_dir() else ():
+        for name in [*files, *folders]:
+            path = os.path.join(place, name)
+            if os.path.islink(path):
+                raise CacheError(f"{path}: is a link, which no shard holds")
+        found += [Path(place, name).relative_to(folder).as_posix() for name in files]
+    yield from sorted(found, key=lambda name: ("/" in name, name))
+
+
+def _climbs(name: str) -> bool:
+    return name.startswith("/") or any(part in ("", ".", "..") for part in name.split("/"))
+
+
+def _located(path: Path, what: str) -> CacheError:
+    error = CacheError(f"{path}: {what}")
+    locate(error, path=path)
+    return error
