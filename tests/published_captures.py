@@ -116,12 +116,13 @@ COLOR_FROM_DEPTH = np.array([[1, 0, 0, 0.0257], [0, 1, 0, 0], [0, 0, 1, 0], [0, 
 
 def apc(root: Path, *, without: str = "") -> Path:
     blocks = {
-        "Color camera intrinsic matrix": MATRIX,
+        "Color camera intrinsic matrix": 2 * np.array(MATRIX) - np.diag([0, 0, 1]),
         "Depth camera intrinsic matrix": MATRIX,
         "Depth-to-color camera extrinsic matrix": COLOR_FROM_DEPTH,
     }
     for number in (0, 1):
         image(root / f"frame-{number:06d}.depth.png", rotated(depth_mm(number) * 10))
+        image(root / "raw" / f"frame-{number:06d}.depth.png", rotated(depth_mm(number + 5) * 10))
         title = f"Camera-to-world extrinsic matrix (camera pose) for frame-{number:06d}"
         blocks[title] = turned(number)
     image(root / "frame-000000.color.png", color(0))

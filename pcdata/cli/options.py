@@ -68,7 +68,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {
             "action": "store_const",
             "const": True,
-            "help": "depth as the color camera sees it: realsense_bag, azure_kinect, ros, scannet, apc",
+            "help": "depth as the color camera sees it: realsense_bag, azure_kinect, ros, scannet; apc stores it so",
         },
     ),
     "color_from_depth": (

@@ -1,7 +1,8 @@
 """Amazon picking sets of MIT and Princeton: ``frame-XXXXXX.depth.png``, ``.color.png`` and ``cam.info.txt``.
 
 Source: Zeng et al., "Multi-view Self-supervised Deep Learning for 6D Pose Estimation in the Amazon Picking Challenge",
-ICRA 2017; apc-vision-toolbox: bits of depth rotated by three, 1/10000 m, poses world from **color** camera.
+ICRA 2017; apc-vision-toolbox: bits of depth rotated by three, 1/10000 m, depth registered to color by librealsense, the
+depth camera's own images in ``raw/``, poses world from **color** camera.
 """
 
 from __future__ import annotations
@@ -20,29 +21,35 @@ from pcdata.files.sample_names import name_some
 from pcdata.io.calibration.foreign_cameras import matrix_of, numbers_of, pinhole_of_matrix
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, files_by_id
-from pcdata.io.sources.listing import LinkTargets, is_file, link_targets
+from pcdata.io.sources.listing import LinkTargets, is_file, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_switch
 from pcdata.io.sources.registry import register_layout
 
 _IMAGES = {"depth": r"(?P<id>frame-\d+)\.depth\.png", "color": r"(?P<id>frame-\d+)\.color\.png"}
-_INFO = "cam.info.txt"
+_INFO, _RAW = "cam.info.txt", "raw"
 _UNIT = 0.0001
 _BLOCK = re.compile(r"#[ \t]*([^\n]*)\n([^#]*)")
 _COLOR, _DEPTH = "Color camera intrinsic matrix", "Depth camera intrinsic matrix"
 _MOTION, _POSE = "Depth-to-color camera extrinsic matrix", re.compile(r".*camera pose.* for (?P<id>frame-\d+)")
-MISSING_MOTION = (
+_GIVE = "add that matrix to it, or give it as color_from_depth (--color-from-depth '16 numbers')"
+_MISSING = (
     f"{_INFO} has no '{_MOTION}': the poses are of the color camera and are used for the depth camera as they stand, "
-    "so points are off by the distance between the two (some millimetres to centimetres); add that matrix to it, or "
-    "give it as color_from_depth (--color-from-depth)"
+    f"so points are off by the distance between the two (some millimetres to centimetres); {_GIVE}"
+)
+_NOT_NEEDED = (
+    f"{_INFO} has no '{_MOTION}': the images registered to color need none, those of the depth camera "
+    f"(registered=False) would be off by the distance between the two; {_GIVE}"
 )
 
 
 @register_layout
 class _ApcSource(ListedSource):
-    """Depth as the depth camera saw it; with ``registered`` as the color camera did, of the frames that have an image.
+    """Depth registered to color as the recorder stored it, or with ``registered=False`` that of the depth camera.
 
-    The poses in the file are of the color camera; those of the depth camera follow by the depth-to-color matrix. Where
-    the file lacks it, ``provenance["missing"]`` says so, and so does ``pcdata validate``.
+    ``frame-XXXXXX.depth.png`` has the pixels of the color camera: the recorder moved every reading by the matrix from
+    depth to color and painted it where the color camera sees it, which leaves gaps between the pixels. So the
+    intrinsics are those of color, the poses hold as they stand, and the color image lies on the depth. What the depth
+    camera saw is in ``raw/``; its poses follow by the matrix. Where the file lacks that, ``pcdata validate`` says so.
     """
 
     kind = "apc"
@@ -52,7 +59,7 @@ class _ApcSource(ListedSource):
         self,
         path: Path,
         *,
-        registered: bool = False,
+        registered: bool = True,
         color_from_depth: Sequence[float] | None = None,
         frame_id: str = "world",
         links_to: LinkTargets = (),
@@ -61,14 +68,14 @@ class _ApcSource(ListedSource):
 
         Args:
             path: the folder of one scan.
+            registered: the depth images are those registered to color; False: those of the depth camera, in ``raw/``,
+                or beside the calibration where there is no such folder.
             color_from_depth: the depth-to-color matrix, 16 numbers row by row, where the file lacks it.
-            registered: register depth to the color images; without it they are left out.
             frame_id: the frame that the poses lead to.
             links_to: folders outside that links in the capture may lead to.
 
         Raises:
-            CaptureError: a part of the layout is missing, a frame has no pose where others have, ``registered``
-                without the depth-to-color matrix, or two of these.
+            CaptureError: a part of the layout is missing, a frame has no pose where others have, or two of these.
             PoseError: the matrix is not rigid.
         """
         path = checked_folder(self.kind, path, self.needs, _INFO)
@@ -79,45 +86,42 @@ class _ApcSource(ListedSource):
         found = {role: files_by_id(path, fits) for role, fits in _IMAGES.items()}
         if stray := {*found["color"]} - {*found["depth"]}:
             raise CaptureError(f"{where}: there is color but no depth for {name_some(stray)}; move it out")
+        raw = path / _RAW
+        depth = found["depth"] if registered or not is_folder(raw) else files_by_id(raw, _IMAGES["depth"])
         poses = {match["id"]: rows for title, rows in blocks.items() if (match := _POSE.fullmatch(title))}
-        if lacking := {*found["depth"]} - {*poses} if poses else set():
+        if lacking := {*depth} - {*poses} if poses else set():
             raise CaptureError(f"{info}: has no pose for {name_some(lacking)}; add it, or move the frame out")
         if color_from_depth is not None and _MOTION in blocks:
             raise CaptureError(f"{info}: has '{_MOTION}', and color_from_depth says it too; drop one")
         stated = blocks.get(_MOTION, color_from_depth)
         motion = None if stated is None else matrix_of(f"{info}: {_MOTION}", _listed(where, stated))
-        if registered and (motion is None or _COLOR not in blocks or not found["color"]):
-            raise CaptureError(
-                f"{where}: registered needs color images, and '{_COLOR}' and '{_MOTION}' in {_INFO}; leave it out"
-            )
-        depth_camera = _camera(info, blocks, _DEPTH)
-        color_camera = _camera(info, blocks, _COLOR) if registered else None
         facts: dict[str, Any] = {"metres_per_unit": _UNIT, "depth_encoding": "rotated"}
         if motion is None and poses:
-            facts["missing"] = [MISSING_MOTION]
+            facts |= {"not_needed": [_NOT_NEEDED]} if registered else {"missing": [_MISSING]}
+        if registered:
+            facts["registered_to"] = "color"
+        camera = _camera(info, blocks, _COLOR if registered else _DEPTH)
+        colors = found["color"] if registered else {}
         views = {
             name: StoredView(
-                files={"depth": depth},
+                files={"depth": file, **({"color": colors[name]} if name in colors else {})},
                 read=partial(read_depth, metres_per_unit=_UNIT, depth_encoding="rotated"),
-                camera=depth_camera,
-                pose=partial(_pose, f"{info}: {name}", poses[name], motion) if poses else None,
-                color=(found["color"][name], color_camera, motion) if color_camera and motion is not None else None,
+                camera=camera,
+                pose=partial(_pose, f"{info}: {name}", poses[name], None if registered else motion) if poses else None,
                 facts=facts,
             )
-            for name, depth in found["depth"].items()
-            if not registered or name in found["color"]
+            for name, file in depth.items()
         }
-        skipped = {name: "it has no color image to register depth to" for name in found["depth"] if name not in views}
         told = []
-        if found["color"] and not registered:
-            told = [f"{len(found['color'])} color images of another camera; registered=True (--registered) reads them"]
+        if registered and (plain := len({*depth} - {*colors})) and colors:
+            told = [f"color of {plain} of {len(depth)} frames: they have no color image"]
+        if not registered and found["color"]:
+            told = [f"{len(found['color'])} color images of another camera; they lie on the depth that is registered"]
         super().__init__(
             path,
             views,
             frame_id=frame_id,
-            registered=registered,
-            read=[info, *found["depth"].values(), *found["color"].values()],
-            skipped=skipped,
+            read=[info, *depth.values(), *found["depth"].values(), *found["color"].values()],
             unread=told,
             links_to=links_to,
         )

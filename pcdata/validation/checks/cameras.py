@@ -69,9 +69,10 @@ def intrinsics(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Findin
         "stated": (
             "parts of the calibration that its layout has a place for, and that are not there",
             "none",
-            "any",
+            "any that these points need",
             "a reader that cannot do without one refuses the capture; where points would only be off, as by the "
-            'distance between a depth and a color camera, it names the part in `provenance["missing"]`',
+            'distance between a depth and a color camera, it names the part in `provenance["missing"]`; what only '
+            'other images of the capture need, in `provenance["not_needed"]`, which warns',
         )
     },
 )
@@ -80,12 +81,13 @@ def stated(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Finding]) 
     return [
         Finding(
             name="stated",
-            verdict=Verdict.FAIL,
+            verdict=verdict,
             found=str(missing).partition(";")[0],
             value=None,
             advice=str(missing).rpartition("; ")[2],
         )
-        for missing in frame.provenance.get("missing", ())
+        for key, verdict in (("missing", Verdict.FAIL), ("not_needed", Verdict.WARN))
+        for missing in frame.provenance.get(key, ())
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -265,36 +266,52 @@ def test_m2t2_metadata_tell_where_the_hand_is_from_json_or_a_pickle(tmp_path: Pa
 # -- poses and registration --------------------------------------------------------------------------------------------
 
 
-def test_apc_poses_are_of_the_color_camera_and_lead_to_the_depth_camera(tmp_path: Path) -> None:
-    source = open_source(made.apc(tmp_path))
-    frame = source.load("frame-000001")
-    assert torch.equal(frame.depth[0], metres(1))
-    assert pose(frame) == pytest.approx(turned(1) @ COLOR_FROM_DEPTH)
-    registered = open_source(tmp_path, registered=True)
-    assert registered.ids == ["frame-000000"]
-    assert registered.skipped == {"frame-000001": "it has no color image to register depth to"}
-    assert np.abs(pose(registered.load("frame-000000")) - turned(0)).max() < 1e-12
+def test_apc_depth_is_registered_to_the_color_camera_that_the_poses_are_of(tmp_path: Path) -> None:
+    frame = open_source(made.apc(tmp_path)).load("frame-000000")
+    assert torch.equal(frame.depth[0], metres(0))
+    assert np.array_equal(pose(frame), turned(0))
+    assert float(frame.camera.intrinsics[0, 0, 0]) == 2 * INTRINSICS[0]
+    assert frame.colors is not None
+    assert frame.provenance["registered_to"] == "color"
 
 
-def test_a_missing_depth_to_color_matrix_is_named_and_not_made_up(tmp_path: Path) -> None:
-    source = open_source(made.apc(tmp_path, without="Depth-to-color camera extrinsic matrix"))
+def test_apc_poses_lead_to_the_depth_camera_for_the_images_that_it_saw(tmp_path: Path) -> None:
+    source = open_source(made.apc(tmp_path), registered=False)
+    frame = source.load("frame-000000")
+    assert torch.equal(frame.depth[0], metres(5))
+    assert pose(frame) == pytest.approx(turned(0) @ COLOR_FROM_DEPTH)
+    assert float(frame.camera.intrinsics[0, 0, 0]) == INTRINSICS[0]
+    assert frame.colors is None
+    shutil.rmtree(tmp_path / "raw")
+    beside = open_source(tmp_path, registered=False).load("frame-000000")
+    assert torch.equal(beside.depth[0], metres(0))
+    assert pose(beside) == pytest.approx(turned(0) @ COLOR_FROM_DEPTH)
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_a_missing_depth_to_color_matrix_is_named_and_not_made_up(tmp_path: Path, registered: bool) -> None:
+    source = open_source(made.apc(tmp_path, without="Depth-to-color camera extrinsic matrix"), registered=registered)
     frame = source.load("frame-000001")
     assert np.array_equal(pose(frame), turned(1))
-    (named,) = frame.provenance["missing"]
+    (named,) = frame.provenance["not_needed" if registered else "missing"]
     assert "cam.info.txt has no 'Depth-to-color camera extrinsic matrix'" in named
     found = [one for report in validate_source(source) for one in report.findings if one.name == "stated"]
-    assert all(one.verdict is Verdict.FAIL and "Depth-to-color" in one.found for one in found)
+    verdict = Verdict.WARN if registered else Verdict.FAIL
+    assert all(one.verdict is verdict and "Depth-to-color" in one.found for one in found)
     assert found
-    with pytest.raises(CaptureError, match="registered needs"):
-        open_source(tmp_path, registered=True)
     assert "--color-from-depth" in found[0].advice
-    given = open_source(tmp_path, color_from_depth=COLOR_FROM_DEPTH.ravel().tolist()).load("frame-000001")
-    assert pose(given) == pytest.approx(turned(1) @ COLOR_FROM_DEPTH)
-    assert "missing" not in given.provenance
+    given = open_source(tmp_path, registered=registered, color_from_depth=COLOR_FROM_DEPTH.ravel().tolist())
+    frame = given.load("frame-000001")
+    assert pose(frame) == pytest.approx(turned(1) if registered else turned(1) @ COLOR_FROM_DEPTH)
+    assert not {"missing", "not_needed"} & {*frame.provenance}
+
+
+def test_an_apc_matrix_that_is_wrong_is_refused(tmp_path: Path) -> None:
+    root = made.apc(tmp_path, without="Depth-to-color camera extrinsic matrix")
     with pytest.raises(ConfigError, match="16 numbers"):
-        open_source(tmp_path, color_from_depth="no")
+        open_source(root, color_from_depth="no")
     with pytest.raises(PoseError, match="not rigid"):
-        open_source(tmp_path, color_from_depth=[2.0 * value for value in COLOR_FROM_DEPTH.ravel()])
+        open_source(root, color_from_depth=[2.0 * value for value in COLOR_FROM_DEPTH.ravel()])
     with pytest.raises(CaptureError, match="drop one"):
         open_source(made.apc(tmp_path / "whole"), color_from_depth=COLOR_FROM_DEPTH.ravel().tolist())
 
