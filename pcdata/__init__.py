@@ -108,6 +108,7 @@ _HOMES = {
         "fit_normalizers",
         "register_collate",
         "set_epoch",
+        "split_dataset",
         "COLLATES",
     ],
     "pcdata.models": ["ModelBatch", "ModelContract", "check", "preset", "to_frame", "to_source"],

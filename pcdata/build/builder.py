@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 import pcdata
+from pcdata.build.carried import carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
@@ -152,6 +153,8 @@ def build_dataset(
                 encoding="utf-8",
             )
             manifest.write(partial)
+            if note := carry_splits(folder, partial):
+                report.notes.append(note)
         except OSError as error:
             raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
     return report

@@ -80,6 +80,7 @@ class Loader(BaseModel):
     num_workers: Annotated[int, Ge(0)] = 2
     collate: Collate = "packed"  # of windows: "windows"
     seed: int = 0
+    split: str | None = None  # which samples, as "pcdata split" draws them; None = all
     windows: Windows | None = None  # of clouds and actions, where the source has episodes; None = single clouds
 
     @model_validator(mode="before")

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.sample_index import FILES as INDEX_FILES
@@ -16,7 +17,7 @@ from pcdata.io.store.shards import FOLDER as SHARDS
 from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, TABLE, shard_folder
 from pcdata.io.store.stores import STORES
 
-_TOP = {FILE_NAME, "pipeline.yaml", "load.py"}
+_TOP = {FILE_NAME, "pipeline.yaml", "load.py", SPLITS}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 _IN_VIEW = re.compile(  # what write_capture writes below raw/KEY of a shard
     r"|view[0-9]+(/intrinsics\.json|/depth(/0\.(png|npy))?|/(labels|masks|color|confidence)(/0\.png)?|/poses(/0\.txt)?)?"

@@ -19,7 +19,7 @@ from pcdata import CachedCloudDataset, {names}
 
 
 def main() -> None:
-{imports}    dataset = CachedCloudDataset(Path(__file__).parent, seed={seed})
+{imports}    dataset = CachedCloudDataset(Path(__file__).parent, seed={seed}{split})
 {preset}    loader = DataLoader(
         {samples},
         batch_size={batch_size},
@@ -55,6 +55,7 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         imports: names of the files that define steps of the dataset: the script asks for their paths.
     """
     settings = loader.model_dump(exclude={"collate", "windows"})
+    settings["split"] = "" if loader.split is None else f", split={loader.split!r}"
     settings |= {"usage": "", "argparse": "", "imports": "", "samples": "dataset"}
     if imports:
         files = ", ".join(imports)

@@ -45,6 +45,7 @@ def add_to(commands: Any) -> None:
     export.add_argument(
         "--as-stored", action="store_true", help="leave out the random end: the clouds as the build stored them"
     )
+    export.add_argument("--split", metavar="NAME", help="only one split of a built dataset, such as train")
     export.add_argument(
         "--skip-bad",
         action="store_true",
@@ -90,6 +91,8 @@ def _export(arguments: argparse.Namespace) -> None:
     if not is_built(source):
         if arguments.as_stored:
             raise ConfigError(f"export: --as-stored is for a built dataset, and {source} is none; leave it out")
+        if arguments.split is not None:
+            raise ConfigError(f"export: --split is for a built dataset, and {source} is none; leave it out")
         source = open_captures(source, arguments, limit=arguments.limit)
         source = source if preset is None else CloudDataset(source, preset.pipeline)
     elif preset is not None:
@@ -102,7 +105,9 @@ def _export(arguments: argparse.Namespace) -> None:
             raise ConfigError(
                 f"export: --as-stored draws nothing, so --{', --'.join(drawn)} say nothing; leave one out"
             )
-        source = CachedCloudDataset(source, augment=None)
+        source = CachedCloudDataset(source, augment=None, split=arguments.split)
+    elif arguments.split is not None:
+        source = CachedCloudDataset(source, split=arguments.split)
     with ProgressBar("export") as progress:
         report = export_dataset(
             source,

@@ -43,6 +43,8 @@ CHECKS = (
     "pose_direction_over_time",
 )
 FORMATS = ("hdf5", "npz", "packed", "pt")
+SPLIT_RULES = ("sample", "episode", "folder", "id:REGEX", "column:NAME", "signal:NAME", "meta:NAME")
+PUBLISHED_SPLITS = ("graspnet",)
 WEIGHTINGS = ("constant", "inverse_square", "angle")
 CARVINGS = ("never", "near", "everywhere")
 MODELS = (

@@ -16,6 +16,8 @@ from pcdata.datasets.epoch_setting import set_epoch
 from pcdata.datasets.normalizers import LinearNormalizer, fit_normalizers
 from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.datasets.samples import SampleDataset
+from pcdata.datasets.split_dataset import split_dataset
+from pcdata.datasets.splits import Splits
 from pcdata.datasets.window_batch import WindowBatch
 from pcdata.datasets.windows import EpisodeWindows
 
@@ -28,6 +30,7 @@ __all__ = [
     "LinearNormalizer",
     "RepeatedEpochWarning",
     "SampleDataset",
+    "Splits",
     "WindowBatch",
     "collate_fixed",
     "collate_packed",
@@ -36,4 +39,5 @@ __all__ = [
     "fit_normalizers",
     "register_collate",
     "set_epoch",
+    "split_dataset",
 ]

@@ -12,6 +12,8 @@ from torch import Generator, Tensor
 
 from pcdata.datasets.passes import shared
 from pcdata.datasets.samples import SampleDataset, runs_on_batches
+from pcdata.datasets.splits import FILE_NAME as SPLITS
+from pcdata.datasets.splits import Splits
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning, ShapeError, locate
 from pcdata.imports import imported_files
 from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
@@ -20,6 +22,7 @@ from pcdata.io.store.sample_index import SampleIndex
 from pcdata.io.store.shards import SIGNALS_KEY, Shards, shard_folder
 from pcdata.rng import child_seed, seeded
 from pcdata.structures import Episode, PointCloud, Signal
+from pcdata.structures.episodes import kept_episodes
 from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Compose, Transform
 
@@ -42,9 +45,12 @@ class CachedCloudDataset(SampleDataset):
             transform.
         seed: of all random draws, together with the epoch and the sample id.
         repeats: how often every sample is in the dataset, each time with other random draws.
+        split: the samples of one split alone, such as "train"; see :func:`pcdata.split_dataset`. None = all.
+        splits: the file that says which those are; None = ``splits.json`` of the dataset.
 
     Raises:
-        CacheError: damaged, hostile or incomplete files, or another pipeline's cache.
+        CacheError: damaged, hostile or incomplete files, another pipeline's cache, or no splits of these samples.
+        ConfigError: there is no such split.
     """
 
     def __init__(
@@ -55,6 +61,8 @@ class CachedCloudDataset(SampleDataset):
         augment: Transform | Literal["stored"] | None = "stored",
         seed: int = 0,
         repeats: int = 1,
+        split: str | None = None,
+        splits: str | Path | None = None,
     ) -> None:
         if isinstance(augment, str) and augment != "stored":
             raise ConfigError(f"augment must be 'stored', None or a transform, got {augment!r}")
@@ -77,7 +85,16 @@ class CachedCloudDataset(SampleDataset):
             )
         self.pipeline = wanted
         transform = wanted.split()[1] if isinstance(augment, str) else augment
-        super().__init__(self.manifest.index.ids, transform, seed, repeats)
+        ids: Sequence[str] = self.manifest.index.ids
+        self.split = split
+        self.splits = self.folder / SPLITS if splits is None else Path(splits)
+        self._rows: Sequence[int] = range(len(ids))  # of the samples in the index
+        if split is not None:
+            self._rows = Splits.read(self.splits, ids).rows(split, ids)
+            ids = [ids[row] for row in self._rows]
+        elif splits is not None:
+            raise ConfigError(f"splits {str(splits)!r} say nothing without split, such as split='train'")
+        super().__init__(ids, transform, seed, repeats)
         self._shards = Shards(self.folder, self.manifest.format, self.manifest.index)
         self._touched = _FirstTouch(self.manifest.index)
 
@@ -121,7 +138,8 @@ class CachedCloudDataset(SampleDataset):
     @property
     def episodes(self) -> list[Episode]:
         """The episodes over ``ids``, as the build kept them."""
-        return list(self.manifest.episodes)
+        own = self.manifest.episodes
+        return list(own) if self.split is None else kept_episodes(own, self._rows)
 
     def signal_table(self) -> Mapping[str, Signal]:
         """Return the signals of all samples by name, (S, ...) in the order of ``ids``, as recorded; no cloud is loaded.
@@ -139,49 +157,55 @@ class CachedCloudDataset(SampleDataset):
         if record.digest() != told["digest"]:
             raise CacheError(f"{path}: the signals differ from what was written; rebuild the dataset")
         try:
-            return signals_from_record(record, len(self.ids))
+            table = signals_from_record(record, len(self.manifest.index))
         except CacheError as error:
             raise CacheError(f"{path}: {error}; rebuild the dataset") from error
+        if self.split is None:
+            return table
+        rows = torch.tensor(self._rows, dtype=torch.int64, device="cpu")
+        return {name: signal.rows(rows) for name, signal in table.items()}
 
     def _load(self, index: int) -> PointCloud:
+        row = self._rows[index]
         record = None
-        if self._compared([index]):
-            record = self._shards.read_joined([index]) or self._shards.read(index)
+        if self._compared([row]):
+            record = self._shards.read_joined([row]) or self._shards.read(row)
         else:
-            record = self._shards.read(index)
-            self._check_digest(index, record.digest())
+            record = self._shards.read(row)
+            self._check_digest(row, record.digest())
         try:
             cloud = cloud_from_record(record)
         except CacheError as error:
-            raise self._fault(index, f": {error}") from error
-        wanted = int(self.manifest.index.num_points[index])
+            raise self._fault(row, f": {error}") from error
+        wanted = int(self.manifest.index.num_points[row])
         if cloud.num_points != wanted:
-            raise self._fault(index, f" has {cloud.num_points} points, but the index says {wanted}")
+            raise self._fault(row, f" has {cloud.num_points} points, but the index says {wanted}")
         return cloud
 
-    def _compared(self, numbers: Sequence[int]) -> bool:
+    def _compared(self, rows: Sequence[int]) -> bool:
         """Compare the digests of samples that nobody has read yet; False where every read must compare its own."""
-        files = self._shards.identities(numbers)
+        files = self._shards.identities(rows)
         if files is None:
             return False
-        for fresh in self._touched.fresh(numbers, files):
+        for fresh in self._touched.fresh(rows, files):
             self._check_digest(fresh, self._shards.digest(fresh))
             self._touched.note(fresh)
         return True
 
-    def _check_digest(self, index: int, digest: str) -> None:
-        if digest != self.manifest.index.digest(index):
-            raise self._fault(index, " differs from what was written")
+    def _check_digest(self, row: int, digest: str) -> None:
+        if digest != self.manifest.index.digest(row):
+            raise self._fault(row, " differs from what was written")
 
-    def _fault(self, index: int, what: str) -> CacheError:
-        path = self._shards.path_of(index)
-        error = CacheError(f"{path}: sample {self.ids[index]!r}{what}; rebuild the dataset")
+    def _fault(self, row: int, what: str) -> CacheError:
+        path = self._shards.path_of(row)
+        error = CacheError(f"{path}: sample {self.manifest.index.ids[row]!r}{what}; rebuild the dataset")
         locate(error, path=path)
         return error
 
     def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
         """Return the clouds of some samples as one batch; None where that of one by one would be another."""
-        record = self._shards.read_joined(numbers) if self._compared(numbers) else None
+        rows = [self._rows[number] for number in numbers]
+        record = self._shards.read_joined(rows) if self._compared(rows) else None
         if record is None:
             single = [self._load(number) for number in numbers]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
@@ -190,7 +214,7 @@ class CachedCloudDataset(SampleDataset):
         else:
             clouds = cloud_from_record(record)
         # One cloud each, since none has fewer.
-        wanted = self.manifest.index.num_points[numbers].tolist()
+        wanted = self.manifest.index.num_points[rows].tolist()
         return clouds if clouds.num_clouds == len(numbers) and clouds.counts.tolist() == wanted else None
 
     def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
@@ -208,7 +232,7 @@ class CachedCloudDataset(SampleDataset):
     def _parts(self, numbers: Sequence[int], each: int = 1) -> Iterator[slice]:
         """Cut samples, ``each`` of which belong together, into parts that the memory of a processor can hold."""
         begin = points = 0
-        counts = self.manifest.index.num_points[numbers].tolist()
+        counts = self.manifest.index.num_points[[self._rows[number] for number in numbers]].tolist()
         if sum(counts) <= _MOST_POINTS:
             yield slice(0, len(numbers))
             return
@@ -221,7 +245,8 @@ class CachedCloudDataset(SampleDataset):
         yield slice(begin, len(numbers))
 
     def __repr__(self) -> str:
-        return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples, {self.manifest.format})"
+        split = "" if self.split is None else f" of {self.split}"
+        return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples{split}, {self.manifest.format})"
 
 
 class _FirstTouch:

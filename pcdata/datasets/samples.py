@@ -11,9 +11,9 @@ from torch.utils.data import Dataset, get_worker_info
 
 from pcdata.contracts.dispatch import warn_if_slow
 from pcdata.contracts.numbers import whole_number
-from pcdata.datasets.episode_split import split_episodes
 from pcdata.datasets.errors_in_workers import for_the_parent
 from pcdata.datasets.passes import PassWatch, shared
+from pcdata.datasets.split_drawing import split_episodes
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.io.store.sample_index import SampleIds

@@ -1,8 +1,7 @@
-"""Facts of samples that no cloud holds: their class and their split, from a CSV file or a mapping."""
+"""Facts of samples that no cloud holds: their class and their split, from a file or a mapping."""
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +10,11 @@ from typing import Any
 
 from pcdata.errors import ConfigError, near_matches
 from pcdata.exports.copies import original_of
-from pcdata.files.opening import read_bytes
+from pcdata.files.sample_table import read_sample_table
 
 Given = Path | Mapping[str, Any]
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-_MAX_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,9 @@ class Row:
 def read_table(where: str, given: Given | None, ids: Sequence[str], *, needs: Sequence[str]) -> dict[str, Row]:
     """Return the row of every sample id.
 
-    A file has a header ``sample,class,split`` (in any order; which columns must be there, the target says); a mapping
-    goes from sample id to ``{"class": ..., "split": ...}``. A copy of a sample has the row of that sample, unless
-    it has its own. Rows of other samples do not matter.
+    A CSV file has a header ``sample,class,split`` (in any order; which columns must be there, the target says); a JSON
+    file or a mapping goes from sample id to ``{"class": ..., "split": ...}``. A copy of a sample has the row of that
+    sample, unless it has its own. Rows of other samples do not matter.
 
     Raises:
         ConfigError: nothing was given, a sample or a column is missing, or a name cannot become a file name.
@@ -41,9 +39,9 @@ def read_table(where: str, given: Given | None, ids: Sequence[str], *, needs: Se
     if given is None:
         raise ConfigError(
             f"{where}: needs the option table, a CSV file with the header {columns} and a row for each of the "
-            f"{len(ids)} samples (in Python also a mapping from sample id)"
+            f"{len(ids)} samples (or a JSON file, in Python a mapping, from sample id)"
         )
-    rows = dict(given) if isinstance(given, Mapping) else _read_csv(where, given)
+    rows = dict(given) if isinstance(given, Mapping) else read_sample_table(where, given)
     known: dict[str, Row] = {}
     for sample_id in ids:
         original = original_of(sample_id, rows)
@@ -64,24 +62,19 @@ def read_table(where: str, given: Given | None, ids: Sequence[str], *, needs: Se
     return known
 
 
-def _read_csv(where: str, path: Path) -> dict[str, Mapping[str, Any]]:
-    try:
-        text = read_bytes(where, path, max_bytes=_MAX_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{where}: {path}: must be UTF-8 text: {error}") from error
-    reader = csv.DictReader(text.splitlines(), strict=True)
-    if "sample" not in (reader.fieldnames or ()):
-        raise ConfigError(
-            f"{where}: {path}: the first line must name the columns, sample among them, got {reader.fieldnames}"
-        )
-    rows: dict[str, Mapping[str, Any]] = {}
-    try:
-        for row in reader:
-            if row["sample"] in rows:
-                raise ConfigError(f"{where}: {path}:{reader.line_num}: sample {row['sample']!r} comes twice")
-            rows[row["sample"]] = row
-    except csv.Error as error:
-        raise ConfigError(f"{where}: {path}:{reader.line_num}: {error}") from error
+def with_splits(where: str, given: Given | None, part_of: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
+    """Return a table with the splits of a dataset, where the table itself names none.
+
+    Args:
+        where: the target.
+        given: the table; None = there is none.
+        part_of: split of every sample, or of every episode where the rows are of those.
+    """
+    rows = dict(given) if isinstance(given, Mapping) else {} if given is None else read_sample_table(where, given)
+    for name, split in part_of.items():
+        row = rows.get(name, {})
+        if isinstance(row, Mapping) and not row.get("split") and (name in rows or given is None):
+            rows[name] = {**row, "split": split}
     return rows
 
 
@@ -107,7 +100,8 @@ def in_splits(where: str, rows: Mapping[str, Row], allowed: Sequence[str]) -> di
         split = row.split or allowed[0]
         if split not in splits:
             raise ConfigError(
-                f"{where}: sample {sample_id!r} is in split {split!r}, but the loader has {', '.join(allowed)}"
+                f"{where}: sample {sample_id!r} is in split {split!r}, but the loader has {', '.join(allowed)}; "
+                "name the splits so (pcdata split --fresh --parts), or give the column split"
             )
         splits[split].append(sample_id)
     return splits

@@ -13,6 +13,7 @@ import torch
 
 from pcdata.datasets import CachedCloudDataset
 from pcdata.datasets.samples import SampleDataset
+from pcdata.datasets.splits import Splits
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.exports.copies import copy_name
 from pcdata.exports.kept_captures import captures_of, steps_not_run
@@ -234,6 +235,22 @@ def stated_by_model(source: Any, kind: type[Target]) -> dict[str, Any]:
         given = CachedCloudDataset(absolute(source))
     model: dict[str, Any] = dict(given.manifest.model) if isinstance(given, CachedCloudDataset) else {}
     return options_for_model(model.get("name"), model.get("choices", {}), kind)
+
+
+def splits_of(source: Any) -> dict[str, str]:
+    """Return the split of every sample and every episode of a built dataset, where it has splits; else nothing.
+
+    Raises:
+        CacheError: they are damaged, or not of these samples.
+    """
+    built = isinstance(source, str | os.PathLike) and is_built(source)
+    given = CachedCloudDataset(absolute(source)) if built else source
+    if not isinstance(given, CachedCloudDataset) or not (given.splits.is_file() or given.split):
+        return {}
+    ids = [sample.id for sample in given.manifest.samples]
+    part_of = Splits.read(given.splits, ids).part_of()
+    of_episodes = {one.id: part_of[ids[one.first]] for one in given.manifest.episodes}
+    return {**of_episodes, **{sample_id: part_of[sample_id] for sample_id in ids}}
 
 
 def options_for_model(name: str | None, choices: Mapping[str, Any], kind: type[Target]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from pcdata.errors import (
 )
 from pcdata.exports.export_folders import empty_part, move_into_place, naming_faults_of, refuse_links
 from pcdata.exports.export_record import FILE_NAME, ExportRecord, check_only_export, files_of
-from pcdata.exports.export_source import DrawnClouds, identity_of, open_for, stated_by_model
+from pcdata.exports.export_source import DrawnClouds, identity_of, open_for, splits_of, stated_by_model
 from pcdata.exports.target import Item, Samples, Target
 from pcdata.exports.targets import target_named
 from pcdata.files.inputs import recording
@@ -100,6 +100,8 @@ def export_dataset(
     if stated := stated_by_model(source, type(chosen)):
         chosen = target_named(target, {**stated, **options})
     opened, notes = open_for(chosen, source, seed=seed, epoch=epoch, copies=copies)
+    if type(chosen).with_splits is not Target.with_splits and (part_of := splits_of(source)):
+        chosen = chosen.with_splits(part_of)
     ids = list(opened.ids)
     folder = Path(os.path.realpath(Path(out).expanduser()))
     report = _ExportReport(folder, chosen.name)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
-from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table, with_splits
 from pcdata.exports.model_contracts import require_cloud
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_count, one_cloud
@@ -53,6 +53,10 @@ class ModelNet(Target):
     def example(cls, ids: Sequence[str]) -> dict[str, Any]:
         """All of one class."""
         return {"table": {sample_id: {"class": "mug"} for sample_id in ids}}
+
+    def with_splits(self, part_of: Mapping[str, str]) -> Target:
+        """Take the splits into the table, which says the classes."""
+        return self if self.table is None else replace(self, table=with_splits(self.name, self.table, part_of))
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One file per sample."""

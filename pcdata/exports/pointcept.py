@@ -6,7 +6,7 @@ Source: Pointcept/Pointcept, ``pointcept/datasets/defaults.py`` (DefaultDataset)
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError, CaptureError
-from pcdata.exports.class_table import Given, read_table
+from pcdata.exports.class_table import Given, read_table, with_splits
 from pcdata.exports.model_contracts import require_cloud
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, one_cloud
@@ -50,6 +50,10 @@ class Pointcept(Target):
     segment: str | None = None
     instance: str | None = None
     frame: str | None = None
+
+    def with_splits(self, part_of: Mapping[str, str]) -> Target:
+        """Take the splits into the table."""
+        return replace(self, table=with_splits(self.name, self.table, part_of))
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One folder per sample."""

@@ -6,7 +6,7 @@ Source: charlesq34/pointnet, ``provider.py`` (getDataFiles, loadDataFile), ``tra
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from pcdata.errors import ConfigError
-from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table
+from pcdata.exports.class_table import Given, Row, classes_of, in_splits, read_table, with_splits
 from pcdata.exports.model_contracts import require_cloud
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_same_count, one_cloud
@@ -69,6 +69,10 @@ class PointNet(Target):
                 f"{self.name}: labels are 8-bit, so {_MAX_CLASSES} classes at most, got {len(classes_of(rows))}"
             )
         return rows
+
+    def with_splits(self, part_of: Mapping[str, str]) -> Target:
+        """Take the splits into the table, which says the classes."""
+        return self if self.table is None else replace(self, table=with_splits(self.name, self.table, part_of))
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One item: the lists name all files."""

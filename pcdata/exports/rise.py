@@ -10,7 +10,7 @@ import io
 import json
 import pickle
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
-from pcdata.exports.class_table import Given, in_splits, read_table
+from pcdata.exports.class_table import Given, in_splits, read_table, with_splits
 from pcdata.exports.episode_signals import signal_row
 from pcdata.exports.exported_images import Fields, image_fields, stored_colors, stored_depth
 from pcdata.exports.model_contracts import require_depth
@@ -90,6 +90,10 @@ class _Rise(Target):
     def units_per_metre(self) -> int:
         """Return how the loader reads the depth of this camera."""
         return _units_per_metre(self.camera)
+
+    def with_splits(self, part_of: Mapping[str, str]) -> Target:
+        """Take the splits into the table."""
+        return replace(self, table=with_splits(self.name, self.table, part_of))
 
     def items(self, ids: Sequence[str]) -> list[Item]:
         """One item per episode, of which the ids alone tell nothing."""

@@ -131,6 +131,13 @@ class Target(ABC):
         """
         return iter(())
 
+    def with_splits(self, part_of: Mapping[str, str]) -> Target:
+        """Return the target with the splits of a dataset, by sample or episode, where its options name none.
+
+        Here nothing is split.
+        """
+        return self
+
     def options(self) -> dict[str, Any]:
         """Return the options as JSON can hold them; of a mapping, the names in it."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}

@@ -34,3 +34,9 @@ def lock_open(descriptor: int) -> bool | None:
     except OSError as error:
         return False if isinstance(error, BlockingIOError) else None
     return True
+
+
+def release(descriptor: int | None) -> None:
+    """Give up what :func:`try_lock` took; None = it took nothing."""
+    if descriptor is not None:
+        os.close(descriptor)

@@ -10,11 +10,12 @@ from statistics import median
 from typing import Any
 
 from pcdata.build import BuildReport
-from pcdata.datasets import CachedCloudDataset
+from pcdata.datasets import CachedCloudDataset, Splits
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.writers.writers import WRITERS
 from pcdata.report.capture_facts import capture_facts
 from pcdata.report.plain_table import text_table
+from pcdata.report.split_text import splits_in_words
 from pcdata.structures import PointCloud
 
 _SKIPPED_SHOWN = 20  # captures that were left out, in a summary
@@ -59,6 +60,7 @@ def dataset_text(folder: str | Path) -> str:
     facts: list[list[object]] = [
         ["samples", len(dataset)],
         *([["left out", len(manifest.skipped)]] if manifest.skipped else []),
+        *([["splits", splits_in_words(Splits.read(dataset.splits))]] if dataset.splits.is_file() else []),
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
         ["format", f"{manifest.format}, compression {manifest.compression}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],

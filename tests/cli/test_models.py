@@ -17,6 +17,8 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.calibration.refine import METHODS
 from pcdata.cli import known_names
 from pcdata.cli.main import main
+from pcdata.datasets.split_dataset import PUBLISHED
+from pcdata.datasets.split_groups import RULES
 from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import export_dataset
 from pcdata.exports.targets import TARGETS
@@ -246,6 +248,7 @@ def test_help_knows_the_names_of_every_registry():
     assert {name: tuple(f.name for f in fields(one)) for name, one in WRITERS.items()} == known_names.WRITERS
     assert tuple(sensor_profiles()) == known_names.SENSORS
     assert METHODS == known_names.REFINERS
+    assert (RULES, (*PUBLISHED,)) == (known_names.SPLIT_RULES, known_names.PUBLISHED_SPLITS)
     for one in CONTRACTS.values():
         assert contract(one.name, **{choice: example(one, choice) for choice in one.required_choices})
 
@@ -256,6 +259,7 @@ def test_help_knows_the_names_of_every_registry():
         (["build"], [*known_names.MODELS, *known_names.KINDS, *known_names.FORMATS, *known_names.CHOICES]),
         (["check"], [*known_names.MODELS, *known_names.CHOICES]),
         (["export"], [*known_names.TARGETS, *known_names.KINDS, "frames_per_scene", "label_offset"]),
+        (["split"], [*known_names.SPLIT_RULES, *known_names.PUBLISHED_SPLITS]),
         (["convert"], [*known_names.WRITERS, *known_names.KINDS, "quality"]),
         (["validate"], [*known_names.CHECKS, *known_names.SENSORS, *known_names.KINDS]),
         (["calib", "check"], known_names.SENSORS),

@@ -1,0 +1,79 @@
+"""The command that says what is for training and what is held out: split."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from pcdata.cli.known_names import PUBLISHED_SPLITS, SPLIT_RULES
+from pcdata.cli.options import add_import_option
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    split = commands.add_parser("split", help="say which samples of a dataset are for training and which are held out")
+    split.add_argument("dataset", metavar="DATASET", help="folder that 'pcdata build' wrote")
+    split.add_argument(
+        "--parts",
+        type=_parts,
+        metavar="NAME=HOW_MUCH,...",
+        help="shares, numbers of groups, or rest (default: train=0.8,val=0.1,test=0.1)",
+    )
+    split.add_argument(
+        "--by",
+        metavar="RULE",
+        help=f"what stays together: {', '.join(SPLIT_RULES)} (default: episode where there are any, else sample)",
+    )
+    split.add_argument(
+        "--named-by",
+        metavar="NAME",
+        help=f"draw nothing: the splits of a published data set ({', '.join(PUBLISHED_SPLITS)}), or a RULE that names "
+        "each sample's, such as column:split",
+    )
+    split.add_argument(
+        "--stratify",
+        action="append",
+        metavar="RULE",
+        help="an attribute that all splits get in like shares, such as column:object_set; repeatable",
+    )
+    split.add_argument("--table", metavar="FILE", help="CSV with the column sample, or JSON from id to values: columns")
+    split.add_argument("--seed", type=int, metavar="N", help="of the draw (default: 0)")
+    split.add_argument("--file", metavar="FILE", help="write the splits there (default: splits.json in DATASET)")
+    split.add_argument("--fresh", action="store_true", help="draw all anew (default: what has a split keeps it)")
+    add_import_option(split)
+    split.set_defaults(run=_split)
+
+
+def _parts(text: str) -> dict[str, float | int | None]:
+    parts: dict[str, float | int | None] = {}
+    for entry in text.split(","):
+        name, sign, value = entry.partition("=")
+        try:
+            number = None if value == "rest" else float(value) if "." in value else int(value)
+        except ValueError:
+            sign = ""
+        if not sign or not name or name in parts:
+            raise argparse.ArgumentTypeError(
+                f"must be NAME=SHARE,NAME=COUNT,NAME=rest with every name once, such as train=rest,val=0.1,test=20, "
+                f"got {entry!r}"
+            )
+        parts[name] = number
+    return parts
+
+
+def _split(arguments: argparse.Namespace) -> None:
+    from pcdata.datasets import split_dataset
+    from pcdata.report.split_text import splits_text
+
+    splits = split_dataset(
+        arguments.dataset,
+        arguments.parts,
+        by=arguments.by,
+        named_by=arguments.named_by,
+        stratify=arguments.stratify,
+        seed=arguments.seed,
+        table=arguments.table,
+        path=arguments.file,
+        fresh=arguments.fresh,
+    )
+    print(splits_text(splits))
