@@ -60,7 +60,6 @@ def dataset_text(folder: str | Path) -> str:
     facts: list[list[object]] = [
         ["samples", len(dataset)],
         *([["left out", len(manifest.skipped)]] if manifest.skipped else []),
-        *([["splits", splits_in_words(Splits.read(dataset.splits))]] if dataset.splits.is_file() else []),
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
         ["format", f"{manifest.format}, compression {manifest.compression}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
@@ -68,6 +67,8 @@ def dataset_text(folder: str | Path) -> str:
         ["fingerprint", manifest.fingerprint[:16]],
         ["made with", ", ".join(f"{name} {version}" for name, version in manifest.versions.items())],
     ]
+    if dataset.splits.is_file():
+        facts.insert(1, ["splits", splits_in_words(Splits.read(dataset.splits))])
     facts[-2:-2] = [[*row] for row in _signal_rows(cloud)]
     facts += [["built with", f"{one['file']}, sha256 {one['sha256'][:16]}"] for one in manifest.imports]
     stored, on_the_fly = dataset.pipeline.split()

@@ -83,7 +83,7 @@ def test_an_export_takes_one_split(dataset, tmp_path, capsys):
 
 
 def test_episodes_stay_whole(tmp_path, capsys):
-    source = TeleopSource(num_episodes=4, num_views=1, size=(12, 16))
+    source = TeleopSource(num_episodes=3, num_views=1, size=(6, 8))
     build_dataset(config_from_yaml("depth: [Deproject]"), source, tmp_path / "set")
     assert main(["split", str(tmp_path / "set"), "--by", "sample"]) == 2
     assert "would be in" in capsys.readouterr().err
