@@ -19,6 +19,7 @@ from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.loading_script import loading_script
 from pcdata.datasets.collate import COLLATES
+from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import (
     CacheError,
     CaptureError,
@@ -153,8 +154,8 @@ def build_dataset(
                 encoding="utf-8",
             )
             manifest.write(partial)
-            if note := carry_splits(folder, partial):
-                report.notes.append(note)
+            if (folder / SPLITS).is_file():
+                report.notes.extend(carry_splits(folder, partial))
         except OSError as error:
             raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
     return report

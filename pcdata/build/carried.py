@@ -11,28 +11,26 @@ from pcdata.errors import ConfigError
 from pcdata.io.store.manifest import Manifest
 
 
-def carry_splits(old: Path, new: Path) -> str | None:
+def carry_splits(old: Path, new: Path) -> list[str]:
     """Write the splits of an old dataset into the one that takes its place, with what is new added.
 
     Args:
-        old: the folder that is replaced; it may have no splits, or not be there.
+        old: the folder that is replaced, which has splits.
         new: the new dataset, complete but for this.
 
     Returns:
-        What to know: samples could not be added by the rules of the file; None = nothing.
+        What to know: that new samples could not be added by the rules of the file.
 
     Raises:
         CacheError: the splits are damaged, or cannot be written.
     """
-    if not (old / FILE_NAME).is_file():
-        return None
     manifest = Manifest.read(new)
     splits = Splits.read(old)
-    facts = SampleFacts(new, [sample.id for sample in manifest.samples], manifest.episodes, None)
-    note = None
+    facts = SampleFacts(new, manifest.index.ids, manifest.episodes, None)
+    notes = []
     try:
         splits = added(facts, splits, {})
     except ConfigError as error:
-        note = f"{FILE_NAME} is that of the dataset before; add what is new with 'pcdata split': {error}"
+        notes.append(f"{FILE_NAME} is that of the dataset before; add what is new with 'pcdata split': {error}")
     splits.write(new / FILE_NAME)
-    return note
+    return notes

@@ -72,7 +72,7 @@ def split_dataset(
     folder = Path(folder)
     file = folder / FILE_NAME if path is None else Path(path)
     manifest = Manifest.read(folder)
-    facts = SampleFacts(folder, [sample.id for sample in manifest.samples], manifest.episodes, table)
+    facts = SampleFacts(folder, manifest.index.ids, manifest.episodes, table)
     given = {
         "by": by,
         "parts": None if parts is None else _plain_parts(parts),

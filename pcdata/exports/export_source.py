@@ -247,7 +247,7 @@ def splits_of(source: Any) -> dict[str, str]:
     given = CachedCloudDataset(absolute(source)) if built else source
     if not isinstance(given, CachedCloudDataset) or not (given.splits.is_file() or given.split):
         return {}
-    ids = [sample.id for sample in given.manifest.samples]
+    ids = given.manifest.index.ids
     part_of = Splits.read(given.splits, ids).part_of()
     of_episodes = {one.id: part_of[ids[one.first]] for one in given.manifest.episodes}
     return {**of_episodes, **{sample_id: part_of[sample_id] for sample_id in ids}}
