@@ -2,5 +2,16 @@
 
 from pcdata.build.builder import BuildReport, BuiltSample, build_dataset
 from pcdata.build.config import BuildConfig, config_from_yaml, load_config
+from pcdata.build.verification import DatasetFault, DatasetVerdict, verify_dataset
 
-__all__ = ["BuildConfig", "BuildReport", "BuiltSample", "build_dataset", "config_from_yaml", "load_config"]
+__all__ = [
+    "BuildConfig",
+    "BuildReport",
+    "BuiltSample",
+    "DatasetFault",
+    "DatasetVerdict",
+    "build_dataset",
+    "config_from_yaml",
+    "load_config",
+    "verify_dataset",
+]

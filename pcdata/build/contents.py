@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError
@@ -35,7 +36,7 @@ def check_only_dataset(folder: Path) -> None:
     try:
         if not os.path.lexists(folder / FILE_NAME):
             raise CacheError(f"{folder} is not a pcdata dataset, so it is not overwritten; choose another folder")
-        foreign = _foreign(folder, _manifest_of(folder))
+        foreign = foreign_files(folder, _manifest_of(folder))
     except OSError as error:
         raise CacheError(f"{folder}: cannot be examined: {error}") from error
     if foreign:
@@ -51,14 +52,20 @@ def _manifest_of(folder: Path) -> Manifest | None:
     try:
         return Manifest.read(folder)
     except CacheError:
-        if Manifest.is_one(folder) and not _foreign(folder, None):
+        if Manifest.is_one(folder) and not foreign_files(folder, None):
             return None
         raise
 
 
-def _foreign(folder: Path, manifest: Manifest | None) -> list[str]:
-    """Return what no build wrote; of a removal that was killed late the index is not whole, and little else is left."""
-    known, raw = _known(folder, manifest)
+def foreign_files(
+    folder: Path, manifest: Manifest | None, tables: Mapping[int, Collection[str]] = MappingProxyType({})
+) -> list[str]:
+    """Return what no build wrote, below a dataset's folder.
+
+    Without a manifest, of which a removal that was killed late leaves an index that is not whole, that is whatever lies
+    beside it and the index. Of shards that have an entry in ``tables``, it is what is not named there.
+    """
+    known, raw = _known(folder, manifest, tables)
     folders = {parent.as_posix() for name in known for parent in Path(name).parents}
     folders |= {f"{shard}/raw" for shard in raw}
     foreign = []
@@ -81,7 +88,9 @@ def _foreign(folder: Path, manifest: Manifest | None) -> list[str]:
     return sorted(foreign)
 
 
-def _known(folder: Path, manifest: Manifest | None) -> tuple[set[str], dict[str, set[str]]]:
+def _known(
+    folder: Path, manifest: Manifest | None, tables: Mapping[int, Collection[str]]
+) -> tuple[set[str], dict[str, set[str]]]:
     """Return the files that a build writes, and of every shard the keys of the captures that may lie beside it."""
     known = _TOP | {f"{INDEX}/{name}" for name in INDEX_FILES}
     raw: dict[str, set[str]] = {}
@@ -89,6 +98,9 @@ def _known(folder: Path, manifest: Manifest | None) -> tuple[set[str], dict[str,
         return known, raw
     for number in range(manifest.index.num_shards):
         shard = shard_folder(folder, number)
+        if number in tables:
+            known |= {(shard / name).relative_to(folder).as_posix() for name in tables[number]}
+            continue
         store = STORES[manifest.format](shard)
         keys = {key_of(sample_id) for sample_id in manifest.index.ids[_as_slice(manifest.index.of_shard(number))]}
         raw[shard.relative_to(folder).as_posix()] = keys

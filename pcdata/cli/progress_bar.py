@@ -13,8 +13,9 @@ from pcdata.cli.printable import printable, terminal
 class ProgressBar:
     """A bar on a terminal, plain lines elsewhere; also the place where a lost Ctrl-C is heard."""
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, what: str, *, unit: str = "sample") -> None:
         self.what = what
+        self.unit = unit
         self.bar: Any = None
         self.started = time.perf_counter()
 
@@ -35,6 +36,6 @@ class ProgressBar:
         if self.bar is None:
             from tqdm import tqdm
 
-            self.bar = tqdm(total=total, desc=printable(self.what), unit="sample", file=terminal(sys.stderr))
+            self.bar = tqdm(total=total, desc=printable(self.what), unit=self.unit, file=terminal(sys.stderr))
         self.bar.set_postfix_str(printable(sample_id))
         self.bar.update(done - self.bar.n)

@@ -136,7 +136,9 @@ class Manifest:
             manifest = cls(**content, **listed)
             _check(manifest)
         except CacheError as error:
-            raise CacheError(f"{path}: {error}") from error
+            told = CacheError(f"{path}: {error}")
+            locate(told, path=getattr(error, "path", None))  # of the index, where it is at fault
+            raise told from error
         except (TypeError, ValueError, KeyError, OverflowError, RecursionError, MemoryError) as error:
             kind = type(error).__name__
             raise CacheError(f"{path}: cannot be read ({kind}: {error!s:.500}); rebuild the dataset") from error

@@ -20,7 +20,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CacheError
+from pcdata.errors import CacheError, locates_path
 from pcdata.files.npy import PREFIX, header_length, npy_bytes, parse_header
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.files.whole_folders import INDEX
@@ -402,7 +402,11 @@ def _of_arrays(arrays: Mapping[str, NDArray[Any]]) -> SampleIndex:
 
 def _mapped(folder: Path, name: str, told: Any) -> NDArray[Any]:
     """Return the array of one file, read-only and still on disk."""
-    path = folder / FOLDER / name
+    return _mapped_at(folder / FOLDER / name, folder, name, told)
+
+
+@locates_path
+def _mapped_at(path: Path, folder: Path, name: str, told: Any) -> NDArray[Any]:
     size, sha256 = (told.get("bytes"), told.get("sha256")) if isinstance(told, dict) else (None, None)
     if type(size) is not int or not isinstance(sha256, str):
         raise CacheError(f"index must give bytes and sha256 of {name}, got {told!r:.200}")

@@ -1,0 +1,31 @@
+"""What the verification of a dataset found, in words."""
+
+from __future__ import annotations
+
+from pcdata.build.verification import DatasetFault, DatasetVerdict
+from pcdata.report.plain_table import text_table
+
+_SHOWN = 5  # samples of a file
+
+
+def verification_text(verdict: DatasetVerdict) -> str:
+    """Tell every fault, the samples that it spoils, and what to do."""
+    looked = f"{verdict.folder}: {verdict.num_files:,} files of {verdict.num_bytes:,} bytes were hashed"
+    if not verdict.faults:
+        return f"{looked}; all are what was written"
+    rows = [[fault.kind, fault.path, fault.why, _samples(fault)] for fault in verdict.faults]
+    spoiled = len({sample for fault in verdict.faults for sample in fault.samples})
+    bad = any(fault.kind != "foreign" for fault in verdict.faults)
+    return "\n".join(
+        [
+            f"{looked}; {len(verdict.faults)} are not what was written, which spoils {spoiled} samples",
+            "",
+            text_table(["what", "file", "why", "samples"], rows),
+            *(["", "copy the damaged and missing files again, or build the dataset again"] if bad else []),
+        ]
+    )
+
+
+def _samples(fault: DatasetFault) -> str:
+    more = f", and {len(fault.samples) - _SHOWN} more" if len(fault.samples) > _SHOWN else ""
+    return ", ".join(fault.samples[:_SHOWN]) + more if fault.samples else "none"
