@@ -101,7 +101,7 @@ class SourceSettings:
         return {"only": (), **merged}
 
     def _check_agree(self, name: str, stated: Any, given: Any) -> None:
-        if stated == given or (self.by_name and name in ("calibration", "links_to")):
+        if stated == given or (self.by_name and name in ("calibration", "links_to", "posed.file")):
             return
         raise ConfigError(f"source: the configuration says {name} {stated!r}, the argument {given!r}; drop one")
 
@@ -137,6 +137,9 @@ def source_settings(document: Document, node: Any, folder: Path | None) -> Sourc
     for key in _FILES:
         if isinstance(values.get(key), str) and folder is not None:
             values[key] = os.path.join(folder, os.path.expanduser(values[key]))  # a Path drops a pattern's last slash
+    posed = values.get("posed")
+    if isinstance(posed, dict) and isinstance(posed.get("file"), str) and folder is not None:
+        posed["file"] = os.path.join(folder, os.path.expanduser(posed["file"]))
     skip = list(values.pop("skip", None) or ())
     skip_file = values.pop("skip_file", None)
     skip += read_skip_file(skip_file) if skip_file else []

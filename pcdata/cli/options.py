@@ -177,6 +177,15 @@ _COMBINED: dict[str, tuple[str, dict[str, Any]]] = {  # combinator: the field th
             "depth, near, far, rows, principal_point) are --option convention.FIELD=VALUE",
         },
     ),
+    "posed": (
+        "file",
+        {
+            "metavar": "FILE",
+            "help": "where the cameras stand, in place of what the captures say: a .json of extrinsics by episode and "
+            "serial, as DROID's are published, or a calibration file; its other fields (frame_id, episode, camera) are "
+            "--option posed.FIELD=VALUE",
+        },
+    ),
 }
 _NO_OPTIONS = {  # of opening captures, not of their layout
     "path": "the path itself",

@@ -8,7 +8,7 @@ cameras have OpenCV's axes.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +61,39 @@ def with_droid_extrinsics(
     kept_names = {*transforms, *calibration.cameras}
     kept = {name: told for name, told in calibration.evidence.items() if name in kept_names}
     return replace(calibration, transforms=transforms, evidence=kept)
+
+
+def read_droid_extrinsics(
+    where: str, path: str | os.PathLike[str], episodes: Sequence[str], *, is_stated: bool
+) -> dict[str | None, dict[str, Tensor]]:
+    """Return the poses, (4, 4) float64, of the cameras of some episodes: by episode, then by serial.
+
+    By None stand those that are of every episode: of a file of one, or of the one that was stated.
+
+    Raises:
+        CaptureError: the file is none, or has none of the episodes.
+        PoseError: a matrix is not rigid.
+    """
+    stored = json_object(where, read_text(where, path, max_bytes=_MAX_BYTES), error=CaptureError)
+    if is_stated:
+        return {None: _poses(where, _of_episode(where, stored, episodes[0]))}
+    if not stored or not all(isinstance(one, Mapping) for one in stored.values()):
+        return {None: _poses(where, stored)}
+    found: dict[str | None, dict[str, Tensor]] = {
+        name: _poses(f"{where}: {name}", stored[name]) for name in episodes if name in stored
+    }
+    if not found:
+        own = f"none of the captures' ({', '.join(episodes[:3])})" if episodes else "and the captures are of no episode"
+        raise CaptureError(
+            f"{where}: has {len(stored)} episodes, {own}; say whose poses: episode={next(iter(stored))!r:.200} "
+            f"(--option posed.episode={next(iter(stored))})"
+        )
+    return found
+
+
+def _poses(where: str, said: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return what is a pose of all that is said; names, scores and the like stand beside them."""
+    return {name: _pose(f"{where}: {name}", value) for name, value in said.items() if isinstance(value, list)}
 
 
 def _of_episode(where: str, said: Mapping[str, Any], episode: str | None) -> Mapping[str, Any]:

@@ -25,6 +25,7 @@ from pcdata.io.sources import (  # noqa: F401
     averaged,
     temporal,
     convention,
+    posed,
 )
 
 # isort: on

@@ -158,6 +158,8 @@ def _told(
     if "links_to" in told:
         told["links_to"] = [folder.name for folder in link_targets(told["links_to"])]
     told |= {name: checked_fields(_WHERE, name, value) for name, value in around.items()}
+    if isinstance(file := told.get("posed", {}).get("file"), (str, os.PathLike)):
+        told["posed"] |= {"file": Path(file).name}
     return {name: _plain(value) for name, value in told.items() if value is not None}
 
 
