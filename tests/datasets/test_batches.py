@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import shutil
 from pathlib import Path
@@ -48,7 +49,7 @@ def stores(tmp_path_factory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("batches")
     source = TeleopSource(num_episodes=2, num_views=1, size=(8, 10))
     for form in FORMATS:
-        build_dataset(config_from_yaml(f"{PIPELINE}output: {{format: {form}}}\n"), source, root / form)
+        build_dataset(config_from_yaml(f"{PIPELINE}output: {{format: {form}, shard_size: 5}}\n"), source, root / form)
     return {form: root / form for form in FORMATS}
 
 
@@ -238,3 +239,12 @@ def test_a_sample_is_compared_once_for_a_file_and_again_for_another_file_of_its_
     dataset[1]  # still mapped
     with pytest.raises(CacheError, match="differs from what was written"):
         pickle.loads(pickle.dumps(dataset))[1]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="only Linux tells which files are open")
+def test_shards_that_were_read_keep_no_file_open(stores):
+    dataset = CachedCloudDataset(stores["packed"])
+    assert dataset.manifest.index.num_shards > 3
+    before = len(os.listdir("/proc/self/fd"))
+    dataset.__getitems__(range(len(dataset)))
+    assert len(os.listdir("/proc/self/fd")) == before

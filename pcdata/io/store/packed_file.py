@@ -17,7 +17,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import mmap
 import os
 import struct
 from collections.abc import Collection, Mapping, Sequence
@@ -29,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
+from pcdata.files.mapping import map_file
 from pcdata.files.strict_json import json_object
 
 SCHEMA = "pcdata.packed/1"
@@ -289,11 +289,10 @@ def open_packed(file: BinaryIO) -> PackedFile:
         raise CacheError("it does not end as a packed file does: cut short, not closed, or something was appended")
     if not (len(_MAGIC) <= begin <= stop - length and length <= _LONGEST_INDEX):
         raise CacheError(f"its index of {length} bytes behind byte {begin} cannot be in a file of {size} bytes")
-    content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    with memoryview(content) as view, view[begin:stop] as tail:
-        if len(content) != size or hashlib.sha256(tail).digest() != digest:
-            raise CacheError("its tables and index are not what was written")
-    index = json_object("its index", content[stop - length : stop], error=CacheError)
+    content = map_file(file)
+    if len(content) != size or hashlib.sha256(content[begin:stop]).digest() != digest:
+        raise CacheError("its tables and index are not what was written")
+    index = json_object("its index", bytes(content[stop - length : stop]), error=CacheError)
     if index.get("schema") != SCHEMA:
         raise CacheError(f"schema must be {SCHEMA!r}, got {index.get('schema')!r:.100}")
     groups = index.get("groups")
@@ -307,7 +306,7 @@ def open_packed(file: BinaryIO) -> PackedFile:
 class _Reader:
     """Take from a mapped file what its index claims, each byte once and in order, so that no claim exceeds the file."""
 
-    def __init__(self, content: mmap.mmap, begin: int, end: int, stop: int) -> None:
+    def __init__(self, content: memoryview, begin: int, end: int, stop: int) -> None:
         self._content = content
         self._block, self._end = begin, end  # where the next block may begin, and where blocks end
         self._table, self._stop = end, stop  # the same of tables
@@ -375,7 +374,7 @@ class _Reader:
         if not self._table <= begin <= self._stop - length:
             raise CacheError(f"a table claims {length} bytes at {begin}, where they cannot lie")
         self._table = begin + length
-        return self._content[begin : begin + length]
+        return bytes(self._content[begin : begin + length])
 
 
 def _entry(told: Any, name: str) -> Any:

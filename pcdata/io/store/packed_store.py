@@ -31,7 +31,6 @@ class _PackedStore(Store):
     format = "packed"
     compressions = ("none",)
     suffix = ".packed"
-    holds_file = True
 
     def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
         super().__init__(folder, compression)

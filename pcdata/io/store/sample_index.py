@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import mmap
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError, locates_path
+from pcdata.files.mapping import map_file
 from pcdata.files.npy import PREFIX, header_length, npy_bytes, parse_header
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.files.whole_folders import INDEX
@@ -419,11 +419,11 @@ def _mapped_at(path: Path, folder: Path, name: str, told: Any) -> NDArray[Any]:
             raise CacheError(
                 f"{where} has {found} bytes, but {size} were written; copy it again, or rebuild the dataset"
             )
-        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        content = map_file(file)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise CacheError(f"{where} is not what was written; copy it again, or rebuild the dataset")
     try:
-        header = parse_header(content[: header_length(content[:PREFIX])], size)
+        header = parse_header(bytes(content[: header_length(bytes(content[:PREFIX]))]), size)
     except CacheError as error:
         raise CacheError(f"{where}: {error}") from error
     dtype, row = FILES[name]
