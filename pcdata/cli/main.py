@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -51,6 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"pcdata: {error}", file=sys.stderr)
         for note in getattr(error, "__notes__", ()):
             print(f"  {note}", file=sys.stderr)
+        _tell_what_is_needed(words, str(error))
         return 2 if isinstance(error, ConfigError) else 1
     except BrokenPipeError:  # "pcdata inspect ... | head" has read enough
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the flush at exit
@@ -61,6 +63,14 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"pcdata: {error if str(error) else 'not enough memory'}", file=sys.stderr)
         return 1
     return verdict or 0
+
+
+def _tell_what_is_needed(words: Sequence[str], message: str) -> None:
+    """Give the command once more with the options that captures are said to need; inspect does so by itself."""
+    from pcdata.report.unopened_text import needed_options
+
+    if "inspect" not in words[:2] and (needed := needed_options(message)):
+        print(f"  next: pcdata {shlex.join(words)} {needed}", file=sys.stderr)
 
 
 def _import(paths: Sequence[str]) -> None:

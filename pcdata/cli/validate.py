@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
 from pcdata.cli.known_names import CHECKS, SENSORS
-from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.options import add_capture_options, open_captures, positive, said_again
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -40,6 +41,7 @@ def add_to(commands: Any) -> None:
 def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.errors import CaptureError, PoseError, UnitError
     from pcdata.files.opening import replacing
+    from pcdata.report.unopened_text import needed_options
     from pcdata.report.validation_text import validation_text
     from pcdata.validation import WHOLE, CaptureLimits, SampleReport, Summary, check_of_error, validate_source
     from pcdata.verdicts import Verdict
@@ -50,6 +52,7 @@ def _validate(arguments: argparse.Namespace) -> int:
     summary = Summary()
     total = 0
     unread: list[str] = []
+    needed = ""  # options without which captures cannot be read
     try:
         source = open_captures(arguments.path, arguments, limit=arguments.limit)
         reports, total, unread = validate_source(source, limits=limits), len(source), source.unread()
@@ -62,6 +65,8 @@ def _validate(arguments: argparse.Namespace) -> int:
         writer = None if temporary is None else _Writer(temporary, arguments.path, asdict(limits))
         for done, report in enumerate(reports, 1):
             summary.add(report)
+            failed = (one.found for one in report.findings if one.verdict is Verdict.FAIL)
+            needed = needed or next(filter(None, map(needed_options, failed)), "")
             if writer is not None:
                 writer.add(report.to_json())
             if not report.whole:
@@ -71,6 +76,8 @@ def _validate(arguments: argparse.Namespace) -> int:
     print(validation_text(summary))
     for line in unread:
         print(f"not read: {line}")
+    if needed:
+        print(f"next: pcdata validate {shlex.join(said_again(arguments))} {needed}")
     return int(summary.verdict is Verdict.FAIL)
 
 

@@ -16,6 +16,7 @@ from pcdata.errors import PcdataError
 from pcdata.io.images.reading import DEPTH_SUFFIXES, read_raw_depth
 from pcdata.io.sources.detect import detect_layout
 from pcdata.io.sources.layouts import LAYOUTS
+from pcdata.io.sources.listed import ONE_IMAGE
 from pcdata.io.sources.listing import absolute, entries, is_folder
 from pcdata.report.capture_facts import SCHEMA
 from pcdata.report.inspection_text import size_in_words
@@ -55,7 +56,11 @@ def unopened_facts(path: str, kind: str | None, error: PcdataError) -> dict[str,
         "refused": f"{type(error).__name__}: {error}",
         "options": _FLAG.findall(str(error)),
     }
-    return {**facts, "depth": depth} if (depth := _first_depth(files)) else facts
+    if depth := _first_depth(files):
+        facts["depth"] = depth
+        if ONE_IMAGE in str(error):
+            facts |= {"path": path, "single": str(Path(path) / str(depth["file"]))}
+    return facts
 
 
 def unopened_text(facts: Mapping[str, Any], words: Sequence[str]) -> str:
@@ -67,14 +72,21 @@ def unopened_text(facts: Mapping[str, Any], words: Sequence[str]) -> str:
         rows.append(["depth", f"{depth['file']}: {depth['width']}x{depth['height']} {depth['dtype']}, {depth['told']}"])
     why = textwrap.wrap(facts["refused"].splitlines()[0], _WIDTH, break_long_words=False, break_on_hyphens=False)
     rows += [["not opened" * (not number), line] for number, line in enumerate(why)]
-    # An image needs both of these; of other options that a message names, one helps.
-    needed = [option for option in facts["options"] if option.startswith(("--intrinsics", "--metres-per-unit"))]
-    commands = [" ".join(needed)] if needed else facts["options"]
-    rows += [
-        ["next" * (not number), f"pcdata inspect {shlex.join(words)} {options}"]
-        for number, options in enumerate(commands)
-    ]
+    needed = needed_options(facts["refused"])
+    commands = [f"{shlex.join(words)} {options}" for options in ([needed] if needed else facts["options"])]
+    if facts.get("single"):  # what helps one image of the folder does not help the others
+        commands = [shlex.join([facts["single"] if word == facts["path"] else word for word in words])]
+    rows += [["next" * (not number), f"pcdata inspect {command}"] for number, command in enumerate(commands)]
     return text_table(["capture", facts["name"]], rows)
+
+
+def needed_options(message: str) -> str:
+    """Return the options that an error says are needed, all of them, as they are typed; "" = it names none.
+
+    An image needs intrinsics and a unit; of other options that messages name, one helps.
+    """
+    found = _FLAG.findall(message)
+    return " ".join(option for option in found if option.startswith(("--intrinsics", "--metres-per-unit")))
 
 
 def _files(place: Path) -> list[Path]:

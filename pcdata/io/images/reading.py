@@ -125,9 +125,9 @@ def _raw_depth(where: str, mode: str, pixels: NDArray[Any], header: tuple[int, i
         return pixels
     if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit gray PNG as 32-bit integers
         return pixels.astype(np.uint16)
-    words = {"L": "8-bit gray", "P": "palette", "1": "1-bit", "RGB": "color", "RGBA": "color with alpha"}
+    words = {"L": "an 8-bit gray", "P": "a palette", "1": "a 1-bit", "RGB": "a color", "RGBA": "a color with alpha"}
     raise CaptureError(
-        f"{where}: a depth image must be 16-bit gray, but this is a {words.get(mode, mode)} image; is it a picture of "
+        f"{where}: a depth image must be 16-bit gray, but this is {words.get(mode, mode)} image; is it a picture of "
         "the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
     )
 

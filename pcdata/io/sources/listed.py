@@ -29,6 +29,7 @@ from pcdata.io.sources.source import Source
 from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
 Size = tuple[int, int]  # (height, width)
+ONE_IMAGE = "Give the path of one image instead of the folder"  # the advice where images are of several units
 _NAMED = 0.001  # probability above which a unit is worth a mention
 
 
@@ -221,8 +222,7 @@ def stated_unit(where: str, unit: float | None, depth: Path, others: Sequence[Pa
         if theirs and min(theirs.get(best, 0.0), own.get(likely, 0.0)) < _NAMED:
             raise UnitError(
                 f"{where}: no file states the unit of depth, and by their numbers the images are not of the same: "
-                f"{depth.name} may be {best}, {other.name} {likely}. Give the path of one image instead of the folder, "
-                "and its unit with it"
+                f"{depth.name} may be {best}, {other.name} {likely}. {ONE_IMAGE}, and its unit with it"
             )
     order = "" if best.encoding == "plain" else f" --depth-encoding {best.encoding}"
     raise UnitError(

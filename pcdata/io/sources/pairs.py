@@ -65,6 +65,8 @@ class _PairsSource(ListedSource):
     unit. Intrinsics and a pose come from a file beside them that other programs write, see
     :func:`pcdata.io.calibration.foreign_cameras.read_foreign_camera`, or from the options. Floats are metres where
     nothing else is said.
+
+    Where the layout is asked for by its name and no name of a file has a word, the images are depth.
     """
 
     kind = "pairs"
@@ -111,6 +113,10 @@ class _PairsSource(ListedSource):
         folder = path if is_folder(path) else path.parent
         allowed = [folder, *link_targets(links_to)]
         found = _by_role(folder)
+        if folder != path and _told(path.name)[0] is None:
+            found["depth"] = _untold([path])
+        elif not found["depth"]:
+            found["depth"] = _untold(visible_files(folder, _can_be_depth))
         if folder != path:
             found["depth"] = {name: file for name, file in found["depth"].items() if file == path}
             others = {role: files for role, files in found.items() if role != "depth"}
@@ -193,6 +199,24 @@ def _told(name: str) -> tuple[str | None, str]:
     if len(set(roles)) > 1:
         return None, ""
     return roles[0], "-".join(word for word in words if word.lower() not in (*_WORDS, *_NO_NAMES))
+
+
+def _can_be_depth(name: str) -> bool:
+    """Say whether a file may be depth though no word tells: whoever asks for this layout by its name says so."""
+    words = {word.lower() for word in _SEPARATORS.split(Path(name).stem)}
+    return Path(name).suffix.lower() in DEPTH_SUFFIXES and words.isdisjoint([*_WORDS, *_PICTURES])
+
+
+def _untold(files: Sequence[Path]) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for file in files:
+        name = "-".join(word for word in _SEPARATORS.split(file.stem) if word)
+        if name in found:
+            raise CaptureError(
+                f"{file.parent}: {found[name].name} and {file.name} are both depth of {name!r}; move one"
+            )
+        found[name] = file
+    return found
 
 
 def _by_role(folder: Path) -> dict[str, dict[str, Path]]:

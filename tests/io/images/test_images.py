@@ -117,7 +117,7 @@ def test_a_frame_without_any_reading_is_refused(tmp_path: Path, raw: np.ndarray)
 )
 def test_pictures_of_depth_are_refused_as_depth(tmp_path: Path, mode: str, word: str) -> None:
     Image.new(mode, (4, 4)).save(tmp_path / "d.png")
-    with pytest.raises(CaptureError, match=f"must be 16-bit gray, but this is a .*{word}"):
+    with pytest.raises(CaptureError, match=f"must be 16-bit gray, but this is an? .*{word}"):
         read_depth(tmp_path / "d.png", metres_per_unit=0.001)
 
 
