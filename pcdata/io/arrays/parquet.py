@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -19,7 +20,9 @@ from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 _MAX_ROWS = 1 << 31
 _MAX_GROUP_BYTES = 1 << 32  # of one column in one row group, unpacked: an episode of megapixel images
 _MAX_GROUP_VALUES = 1 << 30  # of one column in one row group: a run length may claim any number in a few bytes
-_BATCH = 1 << 25  # bytes of rows that are in memory at once
+_BATCH = 1 << 22  # bytes of rows that are decoded at once
+_KEPT = 1 << 26  # bytes of rows that stay in memory: those that were asked for last
+_BUFFER = 1 << 20  # bytes of a column that are read at once: without it pyarrow reads its whole row group
 _NUMBERS = "biuf"
 
 
@@ -39,18 +42,22 @@ class ParquetColumns:
             self._stream = open_input(where, path, max_bytes=MAX_STREAMED_BYTES, inside=inside)
             try:
                 parquet = importlib.import_module("pyarrow.parquet")
-                self._file = parquet.ParquetFile(self._stream)
+                self._file = parquet.ParquetFile(self._stream, buffer_size=_BUFFER)
                 self._starts = self._checked_groups()
                 self.names: list[str] = list(self._file.schema_arrow.names)
             except BaseException:
                 self._stream.close()
                 raise
         self.num_rows = int(self._starts[-1])
-        self._batches: dict[tuple[str, ...], _Batches] = {}
+        self._onward: dict[tuple[str, ...], _Onward] = {}
+        self._kept: OrderedDict[tuple[tuple[str, ...], int], Any] = OrderedDict()
+        self._kept_bytes = 0
 
     def close(self) -> None:
         """Close the file."""
-        self._batches.clear()
+        self._onward.clear()
+        self._kept.clear()
+        self._kept_bytes = 0
         self._stream.close()
 
     def table(self, names: Iterable[str]) -> dict[str, list[Any]]:
@@ -77,7 +84,8 @@ class ParquetColumns:
     def row(self, number: int, names: Iterable[str]) -> dict[str, Any]:
         """Return columns of one row: numbers and lists of them as a flat array, all else as Python values.
 
-        Rows of one row group are read onward from the last one; for others the group is begun again.
+        Rows near those that were asked for last are in memory; else a row group is read onward from where reading is,
+        or from its first row.
 
         Raises:
             CaptureError: a column is not there, or a value is missing; or there is no such row.
@@ -85,16 +93,30 @@ class ParquetColumns:
         names = self._checked_names(names)
         if not 0 <= number < self.num_rows:
             raise CaptureError(f"{self._where}: {self._path}: there is no row {number} among {self.num_rows}")
-        group = int(np.searchsorted(self._starts, number, side="right")) - 1
-        key = tuple(names)
         with self._named():
-            batches = self._batches.get(key)
-            if batches is None or not batches.reaches(group, number):
-                batches = self._batches[key] = self._batches_of(group, names)
-            batch, place = batches.at(number)
-            return {name: _value(name, batch.column(name).slice(place, 1)) for name in names}
+            start, batch = self._batch(tuple(names), number)
+            return {name: _value(name, batch.column(name).slice(number - start, 1)) for name in names}
 
-    def _batches_of(self, group: int, names: list[str]) -> _Batches:
+    def _batch(self, names: tuple[str, ...], number: int) -> tuple[int, Any]:
+        """Return the first row of the batch that a row is in, and the batch."""
+        for (columns, start), batch in reversed(self._kept.items()):
+            if columns == names and start <= number < start + batch.num_rows:
+                self._kept.move_to_end((columns, start))
+                return start, batch
+        group = int(np.searchsorted(self._starts, number, side="right")) - 1
+        onward = self._onward.get(names)
+        if onward is None or onward.group != group or number < onward.next_row:
+            onward = self._onward[names] = _Onward(
+                group, int(self._starts[group]), self._batches_of(group, list(names))
+            )
+        start, batch = onward.to(number)
+        self._kept[names, start] = batch
+        self._kept_bytes += batch.nbytes
+        while self._kept_bytes > _KEPT and len(self._kept) > 1:
+            self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
+        return start, batch
+
+    def _batches_of(self, group: int, names: list[str]) -> Iterator[Any]:
         rows = int(self._starts[group + 1] - self._starts[group])
         about = self._file.metadata.row_group(group)
         wanted = set(names)
@@ -104,8 +126,10 @@ class ParquetColumns:
             if column.path_in_schema in wanted or any(column.path_in_schema.startswith(f"{name}.") for name in wanted)
         )
         most = max(1, min(rows, _BATCH * rows // max(size, 1)))
-        found = self._file.iter_batches(batch_size=most, row_groups=[group], columns=names, use_threads=False)
-        return _Batches(group, int(self._starts[group]), found)
+        found: Iterator[Any] = self._file.iter_batches(
+            batch_size=most, row_groups=[group], columns=names, use_threads=False
+        )
+        return found
 
     def _checked_groups(self) -> NDArray[np.int64]:
         """Return the first row of every row group, and the end."""
@@ -144,24 +168,21 @@ class ParquetColumns:
         return read_by_library(self._where, self._path, "Parquet file")
 
 
-class _Batches:
-    """Rows of one row group, onward from its first."""
+class _Onward:
+    """Where reading is in a row group."""
 
     def __init__(self, group: int, start: int, batches: Iterator[Any]) -> None:
-        self._group, self._start, self._batches = group, start, batches
-        self._batch: Any = None
+        self.group, self.next_row, self._batches = group, start, batches
 
-    def reaches(self, group: int, number: int) -> bool:
-        return group == self._group and number >= self._start
-
-    def at(self, number: int) -> tuple[Any, int]:
-        """Return the batch that a row is in, and its place there."""
-        while self._batch is None or number >= self._start + self._batch.num_rows:
-            self._start += 0 if self._batch is None else self._batch.num_rows
-            self._batch = next(self._batches, None)
-            if self._batch is None:
+    def to(self, number: int) -> tuple[int, Any]:
+        """Return the first row of the batch that a later row is in, and the batch."""
+        while True:
+            batch, start = next(self._batches, None), self.next_row
+            if batch is None:
                 raise CaptureError(f"has no row {number}, which its index says it has; it is damaged")
-        return self._batch, number - self._start
+            self.next_row += batch.num_rows
+            if number < self.next_row:
+                return start, batch
 
 
 def _value(name: str, column: Any) -> Any:

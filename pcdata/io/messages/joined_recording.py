@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import CaptureError, PcdataError, add_note
-from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
+from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_numbers
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.io.messages.camera_streams import (
     RECORDED,
@@ -188,9 +188,7 @@ class JoinedRecording(JoinedTopics):
 
 def _in_metres(where: str, numbers: NDArray[Any], unit: float, invalid: Sequence[int]) -> NDArray[np.float32]:
     if numbers.dtype == np.uint16:
-        table = metres_of_value(unit)
-        table[[0, *invalid]] = 0.0
-        depth = table[numbers]
+        depth = metres_of_numbers(numbers, unit, invalid)
     else:
         depth = clean_float_depth(where, numbers, unit, invalid)
     check_plausible(where, depth, DepthUnit(unit), numbers)

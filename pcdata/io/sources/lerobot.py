@@ -6,6 +6,7 @@ names under which depth and cameras were seen.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,8 @@ class _LeRobotSource(Source):
         said = read_json(where, path, FACTS, self._inside)
         self._facts = None if said is None else facts_of_json(where, said, self._index.features)
         self._episode_by_number = {one.number: one for one in self._index.episodes}
+        firsts = itertools.accumulate((one.length for one in self._index.episodes), initial=0)
+        self._first_of = dict(zip(self._episode_by_number, firsts))
         self._pictures = Pictures(where, path, self._inside)
         self._rows = Handles(4)
         frame = check_name(where, "frame_id", frame_id)
@@ -276,14 +279,25 @@ class _LeRobotSource(Source):
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files that a sample is in, with others: that of its rows, and those of its pictures."""
+        return {role: self.path / file for role, file in self._files(sample_id).items()}
+
+    def provenance(self, sample_id: str) -> dict[str, Any]:
+        """Return the layout, the folder and the files of a sample."""
+        return {"source": self.kind, "root": self.name, "files": self._files(sample_id)}
+
+    def _files(self, sample_id: str) -> dict[str, str]:
+        """Return files by role, from the folder."""
         episode, _ = self._place(sample_id)
-        found = {"rows": self.path / episode.file}
+        found = {"rows": episode.file}
         for stream, _, _ in self._views:
             for role, key in (("depth", stream.key), ("color", stream.color)):
                 file = None if key is None else self._pictures.file_of(stream, key, episode)
                 if file is not None:
-                    found[f"{stream.camera}_{role}"] = self.path / file
+                    found[f"{stream.camera}_{role}"] = file
         return found
+
+    def check_links(self, sample_id: str) -> None:
+        """Leave it to whatever opens a file, which holds it to the same; files stay open from sample to sample."""
 
     def depth_files(self, sample_id: str) -> list[Path]:
         """Return none: many samples are in one file."""
@@ -392,11 +406,13 @@ class _LeRobotSource(Source):
             for name, signal in signals.items():
                 cloud = cloud.with_signal(name, signal.values, signal.kind, signal.frame)
             return cloud
-        index = sum(one.length for one in self._index.episodes if one.number < episode.number) + step
-        frames = [self._frame(sample_id, index, view, episode, step, row, facts) for view in self._views]
-        names = [stream.camera for stream, _, _ in self._views]
-        frame = join_views(frames, {**_shared([one.provenance for one in frames]), "cameras": names})
-        return replace(frame, recorded_signals=signals)
+        index = self._first_of[episode.number] + step
+        facts["cameras"] = [stream.camera for stream, _, _ in self._views]
+        first = self._frame(sample_id, index, self._views[0], episode, step, row, facts, signals)
+        if len(self._views) == 1:
+            return first
+        others = [self._frame(sample_id, index, view, episode, step, row, facts, {}) for view in self._views[1:]]
+        return join_views([first, *others], _shared([one.provenance for one in (first, *others)]))
 
     def _frame(
         self,
@@ -407,6 +423,7 @@ class _LeRobotSource(Source):
         step: int,
         row: Mapping[str, Any],
         facts: Mapping[str, Any],
+        signals: Mapping[str, Signal],
     ) -> DepthFrame:
         stream, lens, pose = view
         where = f"{self}: camera {stream.camera!r}"
@@ -440,6 +457,7 @@ class _LeRobotSource(Source):
             sample_id=sample_id,
             capture_index=index,
             provenance={**facts, **about},
+            recorded_signals=signals,
         )
 
     def _signals_of(self, episode: RecordedEpisode, step: int, row: Mapping[str, Any]) -> dict[str, Signal]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcdata.errors import CaptureError, PcdataError, UnitError, add_note
 from pcdata.files.handles import Handles
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input, read_bytes
-from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
+from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_numbers
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.io.images.reading import check_pixels, decode_color, decode_raw_depth
 from pcdata.io.images.video import VideoFile
@@ -59,9 +59,7 @@ class Pictures:
             bound = error if stream.facts.get("codec_is_lossless") else None  # what a codec took has none
             return depth, {**stream.facts, "depth_encoding": "quantized", "depth_error_mm": bound}
         if stored.dtype == np.uint16:
-            table = metres_of_value(unit)
-            table[[0, *invalid]] = 0.0
-            depth = table[stored]
+            depth = metres_of_numbers(stored, unit, invalid)
         else:
             depth = clean_float_depth(where, stored, unit, invalid)
         check_plausible(where, depth, DepthUnit(unit), stored)

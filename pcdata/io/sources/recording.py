@@ -20,7 +20,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.files.sample_names import name_some
-from pcdata.functional.depth.stored_depth import check_plausible, metres_of_value
+from pcdata.functional.depth.stored_depth import check_plausible, metres_of_numbers
 from pcdata.functional.depth.unit_fit import DepthUnit
 from pcdata.io.sources.listing import LinkTargets, absolute, check_links, entries, is_folder, link_targets
 from pcdata.io.sources.option_checks import check_seconds, check_switch
@@ -157,7 +157,7 @@ class RecordingSource(Source):
         number = int(sample_id)
         partner = self._partners.get(number)
         taken = self._take(number, partner)
-        depth = metres_of_value(self.metres_per_unit)[taken.units]
+        depth = metres_of_numbers(taken.units, self.metres_per_unit, ())
         check_plausible(str(self), depth, DepthUnit(self.metres_per_unit), taken.units)
         time = self._recorded.depth_times[number]
         frame = DepthFrame(
