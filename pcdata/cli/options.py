@@ -76,7 +76,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {  # option of a layout's class:
         {
             "type": lambda text: [float(number) for number in text.replace(",", " ").split()],
             "metavar": "'M00 M01 ... M33'",
-            "help": "depth-to-color matrix, 16 numbers row by row, where no file has it: apc",
+            "help": "depth-to-color matrix, 16 numbers row by row, where no file has it: apc, ros",
         },
     ),
     "labels_from": (

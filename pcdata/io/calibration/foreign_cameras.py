@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, IntrinsicsError, PcdataError
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError
 from pcdata.files.opening import read_bytes, read_text
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding
@@ -146,6 +146,18 @@ def matrix_of(where: str, values: Sequence[Any], *, scale: float = 1.0) -> Tenso
     matrix[:3, 3] *= scale
     rigid.check_rigid(where, matrix)
     return matrix
+
+
+def check_motion(where: str, option: str, numbers: Any) -> Tensor:  # (4, 4) float64
+    """Return a rigid motion from its 16 numbers, row by row.
+
+    Raises:
+        ConfigError: they are no list.
+        PoseError: they are not 16, or not rigid.
+    """
+    if not isinstance(numbers, (list, tuple)):
+        raise ConfigError(f"{where}: {option} must be 16 numbers, row by row, got {numbers!r:.100}")
+    return matrix_of(f"{where}: {option}", numbers)
 
 
 def _autolab_intrinsics(where: str, text: str) -> ForeignCamera:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from torch import Tensor
+
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note, near_matches
 from pcdata.io.messages.cameras import camera_of
@@ -100,6 +102,7 @@ class Choice:
     color: Sequence[str] | None = None  # () = none is wanted
     camera_info: Mapping[str, str] | None = None
     registered: bool = False
+    color_from_depth: Tensor | None = None  # (4, 4) float64, where tf does not tell it
     metres_per_unit: float | None = None
     intrinsics: tuple[float, float, float, float] | None = None
     clock: Clock = "header"

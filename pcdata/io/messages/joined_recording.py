@@ -144,7 +144,9 @@ class JoinedRecording(JoinedTopics):
             frame = replace(frame, world_from_camera=pose[None], frame_id=self.frame_id)
         if colors is None or camera.color_camera is None or camera.color is None:
             return frame
-        color_from_depth = self.pose(camera.color.frame, camera.images.frame, time)
+        color_from_depth = self._color_from_depth
+        if color_from_depth is None:
+            color_from_depth = self.pose(camera.color.frame, camera.images.frame, time)
         return register_to_color(frame, torch.from_numpy(colors)[None], camera.color_camera, color_from_depth)
 
     def _others(self, read: Read, camera: CameraStream, number: int) -> dict[str, Any]:

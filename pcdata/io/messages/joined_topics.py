@@ -67,7 +67,7 @@ class JoinedTopics:
         """
         self._where = self.where = where
         self.file = log.files[0].path
-        self._joining = joining
+        self._joining, self._color_from_depth = joining, choice.color_from_depth
         self.said = _statement(where, log, choice)
         images = image_topics(log)
         self.cameras = chosen_cameras(where, log, images, self.said, choice)
@@ -75,6 +75,7 @@ class JoinedTopics:
         max_gap = joining.max_gap * 1e9
         self.signals, left = chosen_signals(where, log, self.said, joining.signals, max_gap)
         self._check_sizes()
+        self._contradictions: list[str] = []
         self._tree = self._read_times(log, choice.clock)
         self.times = self.cameras[0].images.topic.times  # (N,) int64 nanoseconds
         self._check_clocks(log, choice.clock)
@@ -89,7 +90,7 @@ class JoinedTopics:
                 f"{next(iter(self.skipped.values()))}; {self._way_out()}"
             )
         used = self._used()
-        self.unread = [*log.damage, *left, *self._unread(log, images, used), *self._counted()]
+        self.unread = [*log.damage, *self._contradictions, *left, *self._unread(log, images, used), *self._counted()]
         self._log = log.only(sorted(used))
 
     # -- what belongs together -----------------------------------------------------------------------------------------
@@ -199,7 +200,7 @@ class JoinedTopics:
         for camera in self.cameras:
             if self.frame_id is not None and self._stated_pose(camera) is None:
                 ways.append((self.frame_id, camera.images.frame))
-            if camera.color_camera is not None and camera.color is not None:
+            if camera.color_camera is not None and camera.color is not None and self._color_from_depth is None:
                 ways.append((camera.color.frame, camera.images.frame))
         ways += [(self.frame_id or "", frame) for frame in self._joining.poses.values()]
         ways += [
@@ -240,8 +241,19 @@ class JoinedTopics:
         self.cameras = [one.on(clocked) for one in self.cameras]
         self.signals = [replace(one, topic=clocked[one.topic]) for one in self.signals]
         try:
-            return builder.tree().only(ways) if ways else None
+            if not ways:
+                return None
+            tree = builder.tree().only(ways)
+            self._contradictions = builder.contradictions(tree.edges)
+            return tree
         except CaptureError as error:
+            colors = [one.color.frame for one in self.cameras if one.color is not None and one.color_camera is not None]
+            if any(way[0] in colors for way in ways) and not any(way[0] == self.frame_id for way in ways):
+                add_note(
+                    error,
+                    "depth is registered to the color camera by the depth-to-color matrix, which tf lacks: give it as "
+                    "color_from_depth (--color-from-depth '16 numbers')",
+                )
             for one in self.signals:
                 if one.frame not in (None, self.frame_id, "camera"):
                     add_note(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,11 @@ class FrameTree:
     def frames(self) -> list[str]:
         """The names of all frames, sorted."""
         return sorted({*self._parents, *self._parents.values()})
+
+    @property
+    def edges(self) -> set[Edge]:
+        """The pairs of parent and child."""
+        return {*self._moving, *self._static}
 
     def _check_circles(self) -> None:
         ends: set[str] = set()  # frames from which the way to a root is known
@@ -173,6 +178,7 @@ class TreeBuilder:
         self._topics = 0
         self._moving: dict[Edge, _Rows] = {}
         self._static: dict[Edge, tuple[tuple[int, int], list[float]]] = {}
+        self._restated: dict[Edge, int] = {}  # static transforms that another message of the pair contradicts
 
     def taker(self, *, static: bool, times: NDArray[np.int64] | None = None) -> Callable[[int, Any], None]:
         """Return what takes the messages of a topic, each with its number in it.
@@ -194,10 +200,28 @@ class TreeBuilder:
                     self._moving.setdefault(edge, _Rows()).add(
                         order, stamp(one) if times is None else int(times[number]), numbers
                     )
-                elif edge not in self._static or order >= self._static[edge][0]:
+                    continue
+                if edge in self._static and not _same_pose(self._static[edge][1], numbers):
+                    self._restated[edge] = self._restated.get(edge, 0) + 1
+                if edge not in self._static or order >= self._static[edge][0]:
                     self._static[edge] = (order, numbers)
 
         return take
+
+    def contradictions(self, edges: Collection[Edge]) -> list[str]:
+        """Say which transforms of some pairs of frames contradict others of the same pair, and which of them count."""
+        told = [
+            f"tf gives {child!r} in {parent!r} {count + 1} different static poses; the last counts"
+            for (parent, child), count in self._restated.items()
+            if (parent, child) in edges
+        ]
+        for (parent, child), rows in self._moving.items():
+            if (parent, child) in edges and (parent, child) not in self._static and (count := rows.contradicted()):
+                told.append(
+                    f"tf gives {child!r} in {parent!r} two different poses at one time, {count} times; the first "
+                    "counts: record one of those who publish it"
+                )
+        return told
 
     def tree(self) -> FrameTree:
         """Return the tree.
@@ -228,6 +252,14 @@ class _Rows:
         self._times.append(time)
         self._numbers.extend(numbers)
 
+    def contradicted(self) -> int:
+        """Return at how many times there are poses that differ."""
+        times, table = np.array(self._times, np.int64), np.array(self._numbers, np.float64).reshape(-1, 7)
+        order = np.argsort(times, kind="stable")
+        times, table = times[order], table[order]
+        again = np.flatnonzero(times[1:] == times[:-1])
+        return len({int(times[one]) for one in again if not _same_pose(table[one], table[one + 1])})
+
     def first_of_each_time(self) -> tuple[list[int], NDArray[np.float64]]:
         """Return the times in order, and the (N, 7) numbers of the first pose of each."""
         topic, number = np.array(self._order, np.int64).reshape(-1, 2).T
@@ -235,6 +267,13 @@ class _Rows:
         times, first = np.unique(np.array(self._times, np.int64)[by_message], return_index=True)
         table = np.array(self._numbers, np.float64).reshape(-1, 7)
         return times.tolist(), table[by_message[first]]
+
+
+def _same_pose(one: Any, other: Any) -> bool:
+    """Whether two poses (x y z and a quaternion, which may have the other sign) differ by rounding alone."""
+    a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    turn = min(np.abs(a[3:] - b[3:]).max(), np.abs(a[3:] + b[3:]).max())
+    return bool(np.abs(a[:3] - b[:3]).max() <= 1e-6 and turn <= 1e-6)
 
 
 def plain_frame(name: str) -> str:

@@ -15,10 +15,10 @@ from typing import Any
 
 from torch import Tensor
 
-from pcdata.errors import CaptureError, ConfigError
+from pcdata.errors import CaptureError
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
-from pcdata.io.calibration.foreign_cameras import matrix_of, numbers_of, pinhole_of_matrix
+from pcdata.io.calibration.foreign_cameras import check_motion, matrix_of, numbers_of, pinhole_of_matrix
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, files_by_id
 from pcdata.io.sources.listing import LinkTargets, is_file, is_folder, link_targets
@@ -59,7 +59,7 @@ class _ApcSource(ListedSource):
         self,
         path: Path,
         *,
-        registered: bool = True,
+        registered: bool | None = None,
         color_from_depth: Sequence[float] | None = None,
         frame_id: str = "world",
         links_to: LinkTargets = (),
@@ -68,8 +68,9 @@ class _ApcSource(ListedSource):
 
         Args:
             path: the folder of one scan.
-            registered: the depth images are those registered to color; False: those of the depth camera, in ``raw/``,
-                or beside the calibration where there is no such folder.
+            registered: None: the depth images that are registered to color, and color where all of them have it;
+                True: those that have a color image, with it; False: those of the depth camera, in ``raw/``, or beside
+                the calibration where there is no such folder.
             color_from_depth: the depth-to-color matrix, 16 numbers row by row, where the file lacks it.
             frame_id: the frame that the poses lead to.
             links_to: folders outside that links in the capture may lead to.
@@ -80,47 +81,56 @@ class _ApcSource(ListedSource):
         """
         path = checked_folder(self.kind, path, self.needs, _INFO)
         where = f"{self.kind} source {path}"
-        check_switch(where, "registered", registered)
+        own = registered is not None and not check_switch(where, "registered", registered)  # the depth camera's own
         info = path / _INFO
         blocks = _blocks(info, [path, *link_targets(links_to)])
         found = {role: files_by_id(path, fits) for role, fits in _IMAGES.items()}
         if stray := {*found["color"]} - {*found["depth"]}:
             raise CaptureError(f"{where}: there is color but no depth for {name_some(stray)}; move it out")
         raw = path / _RAW
-        depth = found["depth"] if registered or not is_folder(raw) else files_by_id(raw, _IMAGES["depth"])
+        depth = found["depth"] if not own or not is_folder(raw) else files_by_id(raw, _IMAGES["depth"])
         poses = {match["id"]: rows for title, rows in blocks.items() if (match := _POSE.fullmatch(title))}
         if lacking := {*depth} - {*poses} if poses else set():
             raise CaptureError(f"{info}: has no pose for {name_some(lacking)}; add it, or move the frame out")
         if color_from_depth is not None and _MOTION in blocks:
             raise CaptureError(f"{info}: has '{_MOTION}', and color_from_depth says it too; drop one")
-        stated = blocks.get(_MOTION, color_from_depth)
-        motion = None if stated is None else matrix_of(f"{info}: {_MOTION}", _listed(where, stated))
+        motion = matrix_of(f"{info}: {_MOTION}", blocks[_MOTION]) if _MOTION in blocks else None
+        if color_from_depth is not None:
+            motion = check_motion(where, "color_from_depth", color_from_depth)
         facts: dict[str, Any] = {"metres_per_unit": _UNIT, "depth_encoding": "rotated"}
         if motion is None and poses:
-            facts |= {"not_needed": [_NOT_NEEDED]} if registered else {"missing": [_MISSING]}
-        if registered:
+            facts |= {"missing": [_MISSING]} if own else {"not_needed": [_NOT_NEEDED]}
+        if not own:
             facts["registered_to"] = "color"
-        camera = _camera(info, blocks, _COLOR if registered else _DEPTH)
-        colors = found["color"] if registered else {}
+        camera = _camera(info, blocks, _DEPTH if own else _COLOR)
+        plain = {*depth} - {*found["color"]}
+        if registered and not found["color"]:
+            raise CaptureError(f"{where}: registered needs color images, and there is none; leave it out")
+        colors = found["color"] if registered or (not plain and not own) else {}
         views = {
             name: StoredView(
                 files={"depth": file, **({"color": colors[name]} if name in colors else {})},
                 read=partial(read_depth, metres_per_unit=_UNIT, depth_encoding="rotated"),
                 camera=camera,
-                pose=partial(_pose, f"{info}: {name}", poses[name], None if registered else motion) if poses else None,
+                pose=partial(_pose, f"{info}: {name}", poses[name], motion if own else None) if poses else None,
                 facts=facts,
             )
             for name, file in depth.items()
+            if not registered or name in colors
         }
         told = []
-        if registered and (plain := len({*depth} - {*colors})) and colors:
-            told = [f"color of {plain} of {len(depth)} frames: they have no color image"]
-        if not registered and found["color"]:
+        if found["color"] and own:
             told = [f"{len(found['color'])} color images of another camera; they lie on the depth that is registered"]
+        elif found["color"] and plain and not registered:
+            told = [
+                f"{len(found['color'])} color images, since {len(plain)} frames have none; registered=True "
+                "(--registered) reads the frames that have one"
+            ]
         super().__init__(
             path,
             views,
             frame_id=frame_id,
+            skipped={name: "it has no color image" for name in depth if name not in views},
             read=[info, *depth.values(), *found["depth"].values(), *found["color"].values()],
             unread=told,
             links_to=links_to,
@@ -158,12 +168,6 @@ def _camera(file: Path, blocks: dict[str, list[float]], title: str) -> Any:
     if len(numbers) != 9:
         raise CaptureError(f"{file}: needs '{title}' with nine numbers, found {len(numbers)}")
     return pinhole_of_matrix(f"{file}: {title}", [numbers[:3], numbers[3:6], numbers[6:]])
-
-
-def _listed(where: str, numbers: Any) -> Sequence[float]:
-    if not isinstance(numbers, (list, tuple)):
-        raise ConfigError(f"{where}: color_from_depth must be 16 numbers, row by row, got {numbers!r:.100}")
-    return numbers
 
 
 def _pose(where: str, numbers: list[float], motion: Tensor | None) -> Tensor:  # (4, 4) float64, world from depth camera

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, PcdataError
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, in_order, name_some
+from pcdata.io.calibration.foreign_cameras import check_motion
 from pcdata.io.messages.camera_streams import Choice, image_topics, told
 from pcdata.io.messages.clock import CLOCKS, Clock
 from pcdata.io.messages.cloud_recording import CloudRecording, cloud_topics
@@ -60,6 +61,7 @@ class _RosSource(Source):
         camera_info: Mapping[str, str] | None = None,
         cloud: str | None = None,
         registered: bool = False,
+        color_from_depth: Sequence[float] | None = None,
         metres_per_unit: float | None = None,
         invalid_values: Collection[int] = (),
         intrinsics: tuple[float, float, float, float] | None = None,
@@ -81,6 +83,7 @@ class _RosSource(Source):
             cloud: the topic of clouds (PointCloud2) to be read instead of depth images; None = the only one, where
                 there is no depth.
             registered: register depth to color images of another camera.
+            color_from_depth: the depth-to-color matrix, 16 numbers row by row, where tf does not tell it.
             metres_per_unit: length of one stored unit; None = that of the encoding: 16UC1 millimetres, 32FC1 metres.
             invalid_values: stored whole numbers besides 0 that mean "no reading".
             intrinsics: (fx, fy, cx, cy) in pixels, where no message describes the one camera.
@@ -108,6 +111,9 @@ class _RosSource(Source):
             color=_topics(where, "color", color),
             camera_info=_mapping(where, "camera_info", camera_info),
             registered=check_switch(where, "registered", registered),
+            color_from_depth=None
+            if color_from_depth is None
+            else check_motion(where, "color_from_depth", color_from_depth),
             metres_per_unit=None if metres_per_unit is None else check_metres_per_unit(where, metres_per_unit),
             intrinsics=None if intrinsics is None else check_pinhole(where, intrinsics),
             clock=_clock(where, clock),

@@ -267,7 +267,12 @@ def test_m2t2_metadata_tell_where_the_hand_is_from_json_or_a_pickle(tmp_path: Pa
 
 
 def test_apc_depth_is_registered_to_the_color_camera_that_the_poses_are_of(tmp_path: Path) -> None:
-    frame = open_source(made.apc(tmp_path)).load("frame-000000")
+    source = open_source(made.apc(tmp_path))
+    assert source.load("frame-000000").colors is None
+    assert any("1 color images, since 1 frames have none" in line for line in source.unread())
+    source = open_source(tmp_path, registered=True)
+    assert source.skipped == {"frame-000001": "it has no color image"}
+    frame = source.load("frame-000000")
     assert torch.equal(frame.depth[0], metres(0))
     assert np.array_equal(pose(frame), turned(0))
     assert float(frame.camera.intrinsics[0, 0, 0]) == 2 * INTRINSICS[0]
@@ -288,21 +293,21 @@ def test_apc_poses_lead_to_the_depth_camera_for_the_images_that_it_saw(tmp_path:
     assert pose(beside) == pytest.approx(turned(0) @ COLOR_FROM_DEPTH)
 
 
-@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize("registered", [None, False])
 def test_a_missing_depth_to_color_matrix_is_named_and_not_made_up(tmp_path: Path, registered: bool) -> None:
     source = open_source(made.apc(tmp_path, without="Depth-to-color camera extrinsic matrix"), registered=registered)
     frame = source.load("frame-000001")
     assert np.array_equal(pose(frame), turned(1))
-    (named,) = frame.provenance["not_needed" if registered else "missing"]
+    (named,) = frame.provenance["not_needed" if registered is None else "missing"]
     assert "cam.info.txt has no 'Depth-to-color camera extrinsic matrix'" in named
     found = [one for report in validate_source(source) for one in report.findings if one.name == "stated"]
-    verdict = Verdict.WARN if registered else Verdict.FAIL
+    verdict = Verdict.WARN if registered is None else Verdict.FAIL
     assert all(one.verdict is verdict and "Depth-to-color" in one.found for one in found)
     assert found
     assert "--color-from-depth" in found[0].advice
     given = open_source(tmp_path, registered=registered, color_from_depth=COLOR_FROM_DEPTH.ravel().tolist())
     frame = given.load("frame-000001")
-    assert pose(frame) == pytest.approx(turned(1) if registered else turned(1) @ COLOR_FROM_DEPTH)
+    assert pose(frame) == pytest.approx(turned(1) if registered is None else turned(1) @ COLOR_FROM_DEPTH)
     assert not {"missing", "not_needed"} & {*frame.provenance}
 
 

@@ -190,7 +190,9 @@ def test_graspnets_matlab_file_says_what_the_frame_has(test_data: Path) -> None:
 
 
 def test_the_shelf_is_registered_to_the_posed_camera_and_the_other_stands_beside_it(test_data: Path) -> None:
-    seen = open_source(test_data / "apc_multiview_shelf").load("frame-000002")
+    source = open_source(test_data / "apc_multiview_shelf", registered=True)
+    assert source.ids == [f"frame-{number:06d}" for number in (0, 2, 4, 7, 10)]
+    seen = source.load("frame-000002")
     source = open_source(test_data / "apc_multiview_shelf", registered=False)
     own = source.load("frame-000002")
     between = np.linalg.inv(seen.world_from_camera[0].numpy()) @ own.world_from_camera[0].numpy()

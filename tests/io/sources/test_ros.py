@@ -350,9 +350,30 @@ def test_color_of_another_camera_is_told_and_registered_on_request(tmp_path: Pat
     assert frame.size == (24, 32)
     moved = torch.tensor(frame.provenance["registered"]["color_from_depth"])[0, :3, 3]
     assert torch.allclose(moved, torch.tensor([-0.05, 0, 0]).to(moved), atol=1e-12)
+    bare = mcap(tmp_path / "bare", [*without(COLOR, "/cam/color/camera_info"), *other, info])
+    with pytest.raises(CaptureError, match=r"(?s)'color_optical'.*--color-from-depth '16 numbers'"):
+        open_source(bare, registered=True)
+    matrix = [1, 0, 0, -0.05, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    given = open_source(bare, registered=True, color_from_depth=matrix).load("000001")
+    assert torch.equal(given.depth, frame.depth)
+    with pytest.raises(ConfigError, match="16 numbers"):
+        open_source(bare, registered=True, color_from_depth="no")
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------
+
+
+def test_transforms_that_contradict_each_other_are_told(tmp_path: Path) -> None:
+    again = ("/tf_static", EPOCH, ROS2.transform(0, "hand", "camera_optical", (0.7, 0, 0)))
+    path = mcap(tmp_path, [*without(), again])
+    told = open_source(path, frame_id="base").unread()
+    assert any("'camera_optical' in 'hand' 2 different static poses; the last counts" in line for line in told), told
+    stamp = next(entry[1] for entry in without() if entry[0] == "/tf")
+    moving = [("/tf", stamp + 1, ROS2.transform(stamp, "base", "hand", (x, 0, 0.5))) for x in (0.3, 0.9)]
+    told = open_source(mcap(tmp_path / "two", [*without(), *moving]), frame_id="base").unread()
+    assert any("'hand' in 'base' two different poses at one time, 1 times; the first counts" in line for line in told)
+    told = open_source(mcap(tmp_path / "one", [*without()]), frame_id="base").unread()
+    assert not any("different" in line for line in told)
 
 
 def test_frames_that_are_not_connected_are_named_tree_by_tree(tmp_path: Path) -> None:
