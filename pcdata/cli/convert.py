@@ -27,6 +27,9 @@ def add_to(commands: Any) -> None:
         help="option of the layout that is written; repeatable: "
         + "; ".join(f"{name}: {', '.join(options)}" for name, options in WRITERS.items() if options),
     )
+    convert.add_argument(
+        "--dry-run", action="store_true", help="write nothing: tell what would be written and lost, by a few captures"
+    )
     add_capture_options(convert)
     convert.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     convert.set_defaults(run=_convert)
@@ -44,5 +47,5 @@ def _convert(arguments: argparse.Namespace) -> None:
     writer_named("convert", arguments.to, options)  # a wrong name must not wait for a folder to be listed
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
     with ProgressBar("convert") as progress:
-        report = convert(source, arguments.to, arguments.out, progress=progress, **options)
+        report = convert(source, arguments.to, arguments.out, progress=progress, dry_run=arguments.dry_run, **options)
     print(conversion_text(report))

@@ -137,7 +137,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }  # with their options
 WRITERS: dict[str, tuple[str, ...]] = {
     "folder": (),
-    "mcap": ("color", "quality", "compression"),
+    "mcap": ("color", "quality", "compression", "fps"),
     "lerobot": ("depth", "metres_per_unit", "color", "fps", "state", "action", "points", "registered_to", "robot_type"),
 }  # with their options
 SENSORS = (

@@ -15,6 +15,13 @@ def conversion_text(report: WrittenReport) -> str:
     episodes = f" in {report.episodes} episode{'s' * (report.episodes != 1)}" if report.episodes else ""
     captures = f"{report.samples} capture{'s' * (report.samples != 1)}{episodes}, {size_in_words(report.size)}"
     lines = [f"written  {report.folder}  ({report.kind}: {captures})"]
+    if report.looked_at is not None:
+        captures = captures.replace(", ", ", about ", 1)
+        lines = [
+            f"dry run  nothing is written; {report.folder} would hold ({report.kind}: {captures}), by "
+            f"{report.looked_at} captures that were looked at"
+        ]
+    lines.append(f"streams  {', '.join(report.streams)}")
     lines += [f"lost     {name}: {loss}" for name, loss in report.lost.items()]
     if not report.lost:
         lines.append("lost     nothing: all that was read comes back as it was")
@@ -24,5 +31,8 @@ def conversion_text(report: WrittenReport) -> str:
     lines += [f"note     {note}" for note in report.notes]
     if report.left_out:
         lines.append(skipped_text(report.left_out))
-    lines.append(f"next     pcdata inspect {shlex.quote(str(report.folder))}")
+    if report.looked_at is None:
+        lines.append(f"next     pcdata inspect {shlex.quote(str(report.folder))}")
+    else:
+        lines.append("next     the same command without --dry-run")
     return "\n".join(lines)

@@ -11,7 +11,7 @@ import torch
 
 from pcdata import open_source
 from pcdata.cli.main import main
-from pcdata.errors import CaptureError
+from pcdata.errors import CaptureError, ConfigError
 from pcdata.io import convert, write_ply
 from pcdata.structures import PointCloud, Signal
 from pcdata.synthetic import TeleopSource
@@ -37,6 +37,31 @@ def test_it_tells_what_was_written_and_the_command_to_go_on(capture, tmp_path, c
     assert f"next     pcdata inspect '{tmp_path / 'out put'}'" in said
     assert "convert 5/5 004" in progress
     assert tree(tmp_path / "out put") == tree(capture)
+
+
+def test_a_dry_run_tells_what_would_be_written_and_writes_nothing(capture, tmp_path, capsys):
+    before = sorted(tmp_path.iterdir())
+    words = ["convert", str(capture), "--to", "folder", "--out", str(tmp_path / "out")]
+    assert main([*words, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "dry run  nothing is written; " in said
+    assert "folder: 5 captures in 2 episodes, about " in said
+    assert "streams  depth, color, labels, mask, confidence, lens, pose, signal joints" in said
+    assert "lost     nothing" in said
+    assert sorted(tmp_path.iterdir()) == before
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "file").touch()
+    assert main([*words, "--dry-run"]) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_captures_of_clouds_among_depth_images_are_named_with_how_to_leave_them_out(tmp_path):
+    made = made_captures(6)
+    made.frames["004"] = PointCloud(points=torch.rand(9, 3), frame_id="camera")
+    with pytest.raises(ConfigError, match=r"no depth image but a PointCloud.*--skip ID") as caught:
+        convert(made, "folder", tmp_path / "out")
+    assert caught.value.sample_id == "004"
+    assert not (tmp_path / "out").exists()
 
 
 def test_captures_are_chosen_and_combined_as_everywhere(capture, tmp_path, capsys):

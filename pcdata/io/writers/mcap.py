@@ -32,7 +32,6 @@ SCHEMA = 1  # of the JSON in /pcdata
 START = "start_ns"  # the attribute of an episode: when its first step was, nanoseconds since 1970
 _IMAGES = ("colors", "labels", "mask", "confidence")
 _NO_CLOCK = 10**9  # nanoseconds: where nobody knows when; 0 would mean "no time" to ROS
-_STEP = 10**8  # nanoseconds between captures whose times nobody knows
 _MILLIMETRES = 0.001
 
 
@@ -45,6 +44,7 @@ class _McapWriter(Writer):
         color: "raw" and "png" lose nothing; "jpeg" is small.
         quality: of JPEG, 1 .. 95.
         compression: of the file: "zstd" or "none".
+        fps: captures in a second, where no times are known of them; 10 otherwise.
     """
 
     kind: ClassVar[str] = "mcap"
@@ -54,8 +54,12 @@ class _McapWriter(Writer):
     color: Literal["raw", "png", "jpeg"] = "raw"
     quality: int = 90
     compression: Literal["zstd", "none"] = "zstd"
+    fps: float = 10.0
 
     def __post_init__(self) -> None:
+        fps: Any = self.fps
+        if isinstance(fps, bool) or not (isinstance(fps, (int, float)) and 0 < fps <= 1000):
+            raise ConfigError(f"mcap: fps must be captures in a second, up to 1000, got {fps!r:.60}")
         for name, values in (("color", ("raw", "png", "jpeg")), ("compression", ("zstd", "none"))):
             if getattr(self, name) not in values:
                 raise ConfigError(f"mcap: {name} must be one of {', '.join(values)}, got {getattr(self, name)!r:.80}")
@@ -69,7 +73,7 @@ class _McapWriter(Writer):
         for name, (ids, episode) in zip(file_names([name for name, _, _ in parts]), ((b, c) for _, b, c in parts)):
             with _opened(folder, name, self.compression) as bag:
                 recording = _Recording(self, bag, messages, captures, ids, episode)
-                for (_, frame), stamp in zip(captures.read(ids), _stamps(captures, ids, episode)):
+                for (_, frame), stamp in zip(captures.read(ids), _stamps(captures, ids, episode, self.fps)):
                     recording.add(frame, stamp)
 
 
@@ -88,13 +92,16 @@ def _parts(captures: Captures) -> list[tuple[str, list[str], Episode | None]]:
     return parts
 
 
-def _stamps(captures: Captures, ids: Sequence[str], episode: Episode | None) -> list[int]:
+def _stamps(captures: Captures, ids: Sequence[str], episode: Episode | None, fps: float) -> list[int]:
     """Return the nanoseconds of each capture, each later than the one before."""
     times = episode.times if episode is not None else ()
     start = episode.attributes.get(START) if episode is not None else None
     if not times and len(ids) > 1:
-        captures.note(f"no times are known of some captures: they are {_STEP / 1e9:g} s apart in the recording")
-    times = times or [place * _STEP / 1e9 for place in range(len(ids))]
+        captures.note(
+            f"no times are known of some captures: they are {1 / fps:g} s apart in the recording (--set fps=N, "
+            "captures in a second, says another)"
+        )
+    times = times or [place / fps for place in range(len(ids))]
     start = start if isinstance(start, int) and 0 < start < 1 << 62 else _NO_CLOCK
     stamps: list[int] = []
     for time in times:

@@ -66,6 +66,8 @@ class WrittenReport:
         left_out: id of a capture that was left out -> why.
         not_read: what lies in the captures but is not read, so not written either.
         notes: what else to know.
+        streams: what the captures hold: depth, color, ..., and signals by their names.
+        looked_at: of a dry run, how many captures it is judged by; the size is theirs, times as many as there are.
     """
 
     folder: Path
@@ -77,6 +79,8 @@ class WrittenReport:
     left_out: dict[str, str] = field(default_factory=dict)
     not_read: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    streams: list[str] = field(default_factory=list)
+    looked_at: int | None = None
 
 
 class Captures:
@@ -121,6 +125,9 @@ class Captures:
             self.latest = sample_id
             yield sample_id, frame
             self._report.samples += 1
+            for stream in _streams(frame):
+                if stream not in self._report.streams:
+                    self._report.streams.append(stream)
             for name, has in self._left_behind.items():
                 if has(frame):
                     self.lose(name, f"{self._report.kind} has no place for it", captures=1)
@@ -168,11 +175,17 @@ class Writer(ABC):
         """
 
 
+def _streams(frame: DepthFrame) -> list[str]:
+    held = [name for name, has in KEPT.items() if has(frame) and name != "signals"]
+    return ["depth", *held, *(f"signal {name}" for name in frame.recorded_signals)]
+
+
 def _depth_frame(data: Any) -> DepthFrame:
     if not isinstance(data, DepthFrame):
         raise ConfigError(
             f"convert: a capture is no depth image but a {type(data).__name__}, and depth images with their cameras "
-            "are what is written; 'pcdata build' stores clouds, 'pcdata export' writes them for others"
+            "are what is written: leave such captures out (--skip ID, or --only a pattern of the others); 'pcdata "
+            "build' stores clouds, 'pcdata export' writes them for others"
         )
     frame = data.cpu()
     for view in range(frame.num_views):
