@@ -8,7 +8,6 @@ Source: LeRobot 0.6, ``datasets/dataset_writer.py``, ``dataset_metadata.py``, ``
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import statistics
@@ -16,19 +15,20 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth.stored_depth import metres_of_value
-from pcdata.io.sources.lerobot_facts import FACTS, IMAGES, CameraFacts, DatasetFacts, EpisodeFacts
+from pcdata.errors import ConfigError
+from pcdata.io.sources.lerobot_facts import FACTS, DatasetFacts, EpisodeFacts
 from pcdata.io.sources.lerobot_files import DATA_PATH, INFO, VIDEO_PATH
+from pcdata.io.writers.lerobot_camera_files import CameraWriter, ColorStorage, DepthStorage
 from pcdata.io.writers.lerobot_columns import (
     camera_names,
+    check_alike,
+    check_same_signals,
     derived_columns,
     derived_value,
     index_features,
@@ -39,7 +39,7 @@ from pcdata.io.writers.lerobot_columns import (
     signal_value,
 )
 from pcdata.io.writers.lerobot_points import point_columns, point_features
-from pcdata.io.writers.lerobot_stats import AllStats, ColorStats, Stats, stats_of
+from pcdata.io.writers.lerobot_stats import AllStats, Stats, stats_of
 from pcdata.io.writers.lerobot_tables import FILE_MEGABYTES, RowsWriter, write_episodes_table, write_tasks_table
 from pcdata.io.writers.lerobot_videos import FILE_MEGABYTES as VIDEO_MEGABYTES
 from pcdata.io.writers.lerobot_videos import FILES_IN_CHUNK, VideoWriter
@@ -47,16 +47,10 @@ from pcdata.io.writers.registry import register_writer
 from pcdata.io.writers.writer import KEPT, Captures, Writer
 from pcdata.structures import CAMERA_FRAME, DepthFrame, Episode, Signal
 
-DepthStorage = Literal["auto", "ffv1", "image", "array"]
-ColorStorage = Literal["video", "image", "none"]
-
-_UNITS = (0.001, 0.0001, 0.00025, 0.0002, 0.000125)  # of sensors: tried where captures do not state theirs
-_HIGHEST = 65535
 _USUAL_RATE = 10  # as convert's other writers space captures without times
 _TIME = "recorded_time"
 _STATE, _ACTION = "observation.state", "action"
 _MOST_IN_STATS = 1 << 14  # numbers of a feature: an image or a cloud of numbers is normalized by nobody
-_COMPRESSION = 3  # of PNG: half the time of the default, and as small
 
 
 @register_writer
@@ -67,7 +61,7 @@ class _LeRobotWriter(Writer):
     Args:
         depth: "ffv1": lossless 16-bit videos beside the features; "image": 16-bit PNG in the rows, which the package
             lerobot reads too; "array": float32 metres in the rows; "auto": ffv1 where the depth of the first capture
-            is whole units, else array.
+            is whole units, which those of all others must be too, else array.
         metres_per_unit: of stored depth, which is rounded to it; None = the unit that the first capture is whole in.
         color: "video": H.264, whose loss shows; "image": PNG; "none": left out.
         fps: steps in a second; None = of the times of the episodes, 10 where there are none.
@@ -135,17 +129,6 @@ class _LeRobotWriter(Writer):
             raise
 
 
-@dataclass(frozen=True)
-class _View:
-    """One camera as it is written."""
-
-    facts: CameraFacts
-    unit: float | None
-    depth: VideoWriter | None
-    color: VideoWriter | None
-    images: Mapping[str, VideoWriter]
-
-
 class _Dataset:
     """The files that grow, one step at a time."""
 
@@ -174,7 +157,23 @@ class _Dataset:
         if self._has_times:
             self._features[_TIME] = number_feature("float64", [1])
         names = camera_names(first)
-        self._views = [self._view(name, view) for view, name in enumerate(names)]
+        self._cameras = [
+            CameraWriter(
+                captures,
+                folder,
+                self._fps,
+                first,
+                view,
+                name,
+                depth=options.depth,
+                metres_per_unit=options.metres_per_unit,
+                color=options.color,
+                registered_to=options.registered_to,
+            )
+            for view, name in enumerate(names)
+        ]
+        for camera in self._cameras:
+            self._features |= camera.features
         if options.points:
             self._features |= point_features(first, options.points)
         self._features |= index_features()
@@ -201,81 +200,6 @@ class _Dataset:
 
     # -- what is written -------------------------------------------------------------------------------------------
 
-    def _view(self, name: str, view: int) -> _View:
-        options, first = self._options, self._first
-        height, width = first.size
-        storage, unit = self._storage(view)
-        depth_key = f"depth.{name}" if storage != "image" else f"observation.images.{name}_depth"
-        depth = None
-        if storage == "ffv1":
-            depth = VideoWriter(self._folder, depth_key, self._fps, is_depth=True)
-        elif storage == "image":
-            about = {"is_depth_map": True, **({"depth_unit": "mm"} if unit == 0.001 else {})}
-            names = ["height", "width", "channels"]
-            self._features[depth_key] = {**number_feature("image", [height, width, 1], names), "info": about}
-        else:
-            self._features[depth_key] = number_feature("float32", [height, width], ["height", "width"])
-        color_key, color = None, None
-        if first.colors is not None and options.color == "none":
-            self._captures.lose(
-                "color", "left out, as color=none says", captures=len(self._captures) if not view else 0
-            )
-        elif first.colors is not None:
-            color_key = f"observation.images.{name}"
-            self._features[color_key] = number_feature(
-                options.color, [height, width, 3], ["height", "width", "channels"]
-            )
-            if options.color == "video":
-                color = VideoWriter(self._folder, color_key, self._fps, is_depth=False)
-        images = {role: f"{role}.{name}" for role in IMAGES if getattr(first, role) is not None}
-        base = f"camera.{name}"
-        self._features[f"{base}.intrinsics"] = number_feature("float64", [3, 3])
-        lens, pose = None, None
-        if first.camera.distortion is not None:
-            lens = f"{base}.distortion"
-            self._features[lens] = number_feature("float64", [first.camera.distortion.shape[1]])
-        if first.world_from_camera is not None:
-            pose = f"{base}.{str(first.frame_id).replace('/', '_')}_from_camera"
-            self._features[pose] = number_feature("float64", [4, 4])
-        facts = CameraFacts(
-            name=name,
-            depth=depth_key,
-            storage="video" if storage == "ffv1" else "image" if storage == "image" else "array",
-            size=(height, width),
-            intrinsics=f"{base}.intrinsics",
-            metres_per_unit=unit,
-            registered_to=options.registered_to or color_key,
-            color=color_key,
-            distortion=lens,
-            world_from_camera=pose,
-            is_window=first.camera.is_window,
-            images=images,
-        )
-        videos = {role: VideoWriter(self._folder, key, self._fps, is_depth=True) for role, key in images.items()}
-        return _View(facts, unit, depth, color, videos)
-
-    def _storage(self, view: int) -> tuple[str, float | None]:
-        """Return how the depth of a view is stored, and its unit."""
-        options = self._options
-        if options.depth == "array":
-            return "array", None
-        unit = options.metres_per_unit
-        if unit is None:
-            stated = self._first.provenance.get("metres_per_unit")
-            known = [float(stated)] if isinstance(stated, (int, float)) and 0 < stated < 1 else []
-            metres = self._first.depth[view].numpy()
-            unit = next((one for one in [*known, *_UNITS] if _is_whole(metres, one)), None)
-        if unit is not None:
-            return ("ffv1" if options.depth == "auto" else options.depth), unit
-        if options.depth == "auto":
-            self._captures.note("depth is no whole units of any sensor: float32 metres in the rows (depth=array)")
-            return "array", None
-        raise ConfigError(
-            f"lerobot: depth={options.depth} stores whole numbers, and the depth of {self._first_id} is no whole units "
-            "of any sensor; say metres_per_unit=0.0001 to round to a tenth of a millimetre (it reaches 6.5 m), or "
-            "depth=array to keep it as it is"
-        )
-
     def _check_partners(self) -> None:
         if not self._signals:
             self._captures.note("captures have no signals, so the dataset has neither state nor action")
@@ -293,7 +217,8 @@ class _Dataset:
         self._step = 0
         self._episode = episode
         self._of_episode: dict[str, list[NDArray[Any]]] = {}
-        self._color_stats: dict[str, ColorStats] = {}
+        for camera in self._cameras:
+            camera.begin()
         self._tasks_of_episode: dict[str, None] = {}
         self._place: dict[str, Any] = {f"data/{name}": value for name, value in self._rows.begin_episode().items()}
         for _, key, video in self._videos():
@@ -305,19 +230,20 @@ class _Dataset:
         Raises:
             CaptureError: it has other cameras, images or signals than the first.
         """
-        self._check_alike(sample_id, frame)
+        check_alike(sample_id, frame, self._first_id, self._first)
+        check_same_signals(sample_id, frame, self._first_id, self._signals)
         row: dict[str, Any] = {}
         for name, one in self._signals.items():
             if one.column is not None:
                 row[one.column] = signal_value(one, frame.recorded_signals[name])
         for column, names in self._derived.items():
             row[column] = derived_value(names, frame.recorded_signals)
-        self._off, self._beyond = 0.0, 0
-        for view, written in enumerate(self._views):
-            self._add_view(row, frame, view, written)
-        if self._off or self._beyond:
-            how = f"rounded to whole units of {self._views[0].unit:g} m; no reading where 16 bits do not hold it"
-            self._captures.lose("depth", how, metres=self._off, values=self._beyond, captures=1)
+        lost = [camera.add(row, frame) for camera in self._cameras]
+        off, beyond = max(metres for metres, _ in lost), sum(values for _, values in lost)
+        if off or beyond:
+            unit = self._options.metres_per_unit
+            how = f"rounded to whole units of {unit:g} m; no reading where 16 bits do not hold it"
+            self._captures.lose("depth", how, metres=off, values=beyond, captures=1)
         task = self._task(frame.recorded_signals)
         self._tasks_of_episode[task] = None
         row |= {
@@ -339,86 +265,12 @@ class _Dataset:
         self._step += 1
         self._count += 1
 
-    def _add_view(self, row: dict[str, Any], frame: DepthFrame, view: int, written: _View) -> None:
-        facts = written.facts
-        metres = frame.depth[view].numpy()
-        if written.unit is None:
-            row[facts.depth] = metres
-        else:
-            units = self._units(metres, written.unit)
-            if written.depth is not None:
-                written.depth.add(units)
-            else:
-                row[facts.depth] = _png(units)
-        if facts.color is not None and frame.colors is not None:
-            color = frame.colors[view].numpy()
-            if written.color is not None:
-                written.color.add(color)
-                if not view:
-                    self._captures.lose("color", "coded as H.264; color=image keeps it as it is", captures=1)
-            else:
-                row[facts.color] = _png(color)
-            self._color_stats.setdefault(facts.color, ColorStats()).add(color)
-        for role, video in written.images.items():
-            values = getattr(frame, role)[view].numpy().astype(np.int64) + (role == "labels")
-            if values.min() < 0 or values.max() > _HIGHEST:
-                raise CaptureError(
-                    f"{frame.sample_id}: labels must lie in -1 .. {_HIGHEST - 1} to be written in 16 bits, got "
-                    f"{values.min() - 1} .. {values.max() - 1}; give them other ids"
-                )
-            video.add(values.astype(np.uint16))
-        row[facts.intrinsics] = frame.camera.intrinsics[view].numpy()
-        if facts.distortion is not None and frame.camera.distortion is not None:
-            row[facts.distortion] = frame.camera.distortion[view].numpy()
-        if facts.world_from_camera is not None and frame.world_from_camera is not None:
-            row[facts.world_from_camera] = frame.world_from_camera[view].numpy()
-
-    def _units(self, metres: NDArray[np.float32], unit: float) -> NDArray[np.uint16]:
-        """Return depth in whole units; keep by how much that differs."""
-        units = np.rint(metres.astype(np.float64) / unit)
-        beyond = (units > _HIGHEST) | ((units == 0) & (metres > 0))
-        units[beyond] = 0
-        stored: NDArray[np.uint16] = units.astype(np.uint16)
-        off = np.abs(metres_of_value(unit)[stored].astype(np.float64) - metres)[~beyond]
-        self._off = max(self._off, float(off.max(initial=0.0)))
-        self._beyond += int(beyond.sum())
-        return stored
-
     def _task(self, signals: Mapping[str, Signal]) -> str:
         name = next((name for name, one in self._signals.items() if one.column is None), None)
         if name is not None:
             return str(signals[name].values[0])
         stated = next((self._episode.attributes.get(key) for key in ("task", "instruction")), None)
         return stated if isinstance(stated, str) else ""
-
-    def _check_alike(self, sample_id: str, frame: DepthFrame) -> None:
-        first = self._first
-        if (frame.num_views, frame.size) != (first.num_views, first.size):
-            raise CaptureError(
-                f"{sample_id}: has {frame.num_views} views of {frame.size[1]}x{frame.size[0]}, {self._first_id} has "
-                f"{first.num_views} of {first.size[1]}x{first.size[0]}; write these apart (--only, --skip)"
-            )
-        for name in ("colors", "world_from_camera", *IMAGES):
-            if (getattr(frame, name) is None) != (getattr(first, name) is None):
-                raise CaptureError(f"{sample_id}: has {name} or not, unlike {self._first_id}; write these apart")
-        if frame.frame_id != first.frame_id:
-            raise CaptureError(
-                f"{sample_id}: its poses lead to {frame.frame_id!r}, those of {self._first_id} to {first.frame_id!r}"
-            )
-        lenses = [one.camera.distortion for one in (frame, first)]
-        if [None if lens is None else lens.shape for lens in lenses].count(
-            None if lenses[0] is None else lenses[0].shape
-        ) != 2 or frame.camera.is_window != first.camera.is_window:
-            raise CaptureError(f"{sample_id}: has another lens model than {self._first_id}; write these apart")
-        found = signal_columns(f"lerobot: {sample_id}", frame.recorded_signals)
-        if found != self._signals:
-            unlike = sorted({*found} ^ {*self._signals}) or [
-                name for name, one in found.items() if self._signals[name] != one
-            ]
-            raise CaptureError(
-                f"{sample_id}: its signals are not those of {self._first_id} ({', '.join(unlike)[:200]} differ); a "
-                "dataset has the same in every step: write these apart (--only, --skip)"
-            )
 
     def end(self, episode: Episode) -> None:
         """End an episode."""
@@ -428,7 +280,8 @@ class _Dataset:
         stats: dict[str, Stats] = {
             key: stats_of(np.stack(values), self._step) for key, values in self._of_episode.items()
         }
-        stats |= {key: one.stats() for key, one in self._color_stats.items()}
+        colors = ((camera.facts.color, camera.color_stats) for camera in self._cameras)
+        stats |= {key: one.stats() for key, one in colors if key is not None}
         self._all_stats.add(stats)
         self._episodes.append(
             {
@@ -475,7 +328,7 @@ class _Dataset:
             (self._folder / "conversion_info.json").write_text(json.dumps({"frame_id": frame, "unit": "m"}) + "\n")
         facts = DatasetFacts(
             frame_id=self._first.frame_id,
-            cameras=tuple(view.facts for view in self._views),
+            cameras=tuple(camera.facts for camera in self._cameras),
             signals=self._signals,
             episodes=tuple(self._episode_facts),
             time=_TIME if self._has_times else None,
@@ -498,14 +351,7 @@ class _Dataset:
             self._rows.close()
 
     def _videos(self) -> list[tuple[str, str, VideoWriter]]:
-        found = []
-        for view in self._views:
-            if view.depth is not None:
-                found.append(("depth", view.facts.depth, view.depth))
-            if view.color is not None and view.facts.color is not None:
-                found.append(("color", view.facts.color, view.color))
-            found += [(role, view.facts.images[role], video) for role, video in view.images.items()]
-        return found
+        return [video for camera in self._cameras for video in camera.videos()]
 
 
 def _parts(captures: Captures) -> list[Episode]:
@@ -520,15 +366,3 @@ def _parts(captures: Captures) -> list[Episode]:
             found.append(one)
             end = one.first + one.length
     return found
-
-
-def _is_whole(metres: NDArray[np.float32], unit: float) -> bool:
-    """Whether depth is whole units, bit for bit as the reader gives it back."""
-    units = np.rint(metres.astype(np.float64) / unit)
-    return bool(units.max() <= _HIGHEST and (metres_of_value(unit)[units.astype(np.uint16)] == metres).all())
-
-
-def _png(pixels: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=_COMPRESSION)
-    return buffer.getvalue()

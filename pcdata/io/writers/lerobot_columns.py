@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
-from pcdata.io.sources.lerobot_facts import DTYPES, SignalFacts
+from pcdata.io.sources.lerobot_facts import DTYPES, IMAGES, SignalFacts
 from pcdata.io.sources.lerobot_files import INDEX_COLUMNS
 from pcdata.structures import DepthFrame, Signal
 
@@ -59,6 +59,46 @@ def signal_columns(where: str, signals: Mapping[str, Signal]) -> dict[str, Signa
     if twice := next((one for one in columns if columns.count(one) > 1 or one in INDEX_COLUMNS), None):
         raise CaptureError(f"{where}: two signals would both be the column {twice!r:.100}; rename one")
     return found
+
+
+def check_alike(sample_id: str, frame: DepthFrame, first_id: str, first: DepthFrame) -> None:
+    """Require the cameras and images of the first capture.
+
+    Raises:
+        CaptureError: it has others.
+    """
+    if (frame.num_views, frame.size) != (first.num_views, first.size):
+        raise CaptureError(
+            f"{sample_id}: has {frame.num_views} views of {frame.size[1]}x{frame.size[0]}, {first_id} has "
+            f"{first.num_views} of {first.size[1]}x{first.size[0]}; write these apart (--only, --skip)"
+        )
+    for name in ("colors", "world_from_camera", *IMAGES):
+        if (getattr(frame, name) is None) != (getattr(first, name) is None):
+            raise CaptureError(f"{sample_id}: has {name} or not, unlike {first_id}; write these apart")
+    if frame.frame_id != first.frame_id:
+        raise CaptureError(
+            f"{sample_id}: its poses lead to {frame.frame_id!r}, those of {first_id} to {first.frame_id!r}"
+        )
+    lenses = [one.camera.distortion for one in (frame, first)]
+    if [None if lens is None else lens.shape for lens in lenses].count(
+        None if lenses[0] is None else lenses[0].shape
+    ) != 2 or frame.camera.is_window != first.camera.is_window:
+        raise CaptureError(f"{sample_id}: has another lens model than {first_id}; write these apart")
+
+
+def check_same_signals(sample_id: str, frame: DepthFrame, first_id: str, signals: Mapping[str, SignalFacts]) -> None:
+    """Require the signals of the first capture.
+
+    Raises:
+        CaptureError: it has others.
+    """
+    found = signal_columns(f"lerobot: {sample_id}", frame.recorded_signals)
+    if found != signals:
+        unlike = sorted({*found} ^ {*signals}) or [name for name, one in found.items() if signals[name] != one]
+        raise CaptureError(
+            f"{sample_id}: its signals are not those of {first_id} ({', '.join(unlike)[:200]} differ); a "
+            "dataset has the same in every step: write these apart (--only, --skip)"
+        )
 
 
 def signal_features(facts: Mapping[str, SignalFacts]) -> dict[str, dict[str, Any]]:

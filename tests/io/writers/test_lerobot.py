@@ -129,6 +129,26 @@ def test_depth_that_is_rounded_is_told_in_metres_and_what_16_bits_do_not_hold_is
         convert(MadeCaptures({"0": odd}), "lerobot", tmp_path / "odd", depth="ffv1")
 
 
+def test_what_the_first_capture_decides_is_told_and_holds_for_all(tmp_path: Path) -> None:
+    first, second = made_frame(0), made_frame(1)
+    report = convert(MadeCaptures({"0": first, "1": second}), "lerobot", tmp_path / "fit")
+    assert any("whole units of 0.0001 m" in note for note in report.notes)
+    halves = replace(second, depth=(second.depth.double() * 1.25).float())
+    coarse = replace(first, depth=(first.depth.double() * 10).round().float() / 10, provenance={})
+    far = replace(second, depth=second.depth * 100)
+    for one, other in ((first, halves), (coarse, second), (first, far)):
+        with pytest.raises(CaptureError, match=r"001: its depth is no whole units.*unlike that of 0.*depth=array"):
+            convert(MadeCaptures({"0": one, "1": other}), "lerobot", tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    fine = MadeCaptures({"0": coarse, "1": second})
+    with pytest.raises(CaptureError, match=r"say metres_per_unit=0\.0001 ") as refused:
+        convert(fine, "lerobot", tmp_path / "out")
+    assert "depth=array" in str(refused.value)
+    assert "depth" not in convert(fine, "lerobot", tmp_path / "out", metres_per_unit=0.0001).lost
+    mixed = MadeCaptures({"0": first, "1": far})
+    assert "depth" not in convert(mixed, "lerobot", tmp_path / "array", depth="array").lost
+
+
 def test_floats_of_a_simulator_are_kept_as_they_are(tmp_path: Path) -> None:
     made = TeleopSource(num_episodes=1, size=(12, 16))
     convert(made, "lerobot", tmp_path / "out")
