@@ -1,4 +1,4 @@
-"""Leave bad captures out of a build: it stops at the first one, unless they are listed or --skip-refused is given."""
+"""Leave bad captures out: a build quarantines those that fail, and whoever knows them lists them."""
 
 import tempfile
 from pathlib import Path
@@ -30,10 +30,10 @@ for sample_id, reason in refused.items():
     print(f"{sample_id}: {reason}")
 assert source.without(refused).ids == ["1", "2", "3", "5"]
 
-# 2. The same in a build, said once in its configuration; the dataset remembers what was left out, and why.
+# 2. A build quarantines what fails, by itself. Captures that are known to be bad are listed instead: those it skips.
 config = folder / "build.yaml"
-config.write_text("source: {path: capture, skip: ['2'], skip_refused: true}\ndepth:\n- Deproject: {}\n")
+config.write_text("source: {path: capture, skip: ['2']}\ndepth:\n- Deproject: {}\n")
 settings = pcdata.load_config(config)
-report = pcdata.build_dataset(settings, settings.source.open(), folder / "dataset")
-print(f"built {len(report.samples)}, left out {report.skipped}")
-assert list(report.skipped) == ["2", "0", "4"]
+report = pcdata.build_dataset(settings, settings.source.open(), folder / "dataset", max_bad="50%")
+print(f"built {len(report.samples)}, left out {report.skipped}, quarantined {report.quarantined}")
+assert (list(report.skipped), list(report.quarantined)) == (["2"], ["0", "4"])

@@ -64,6 +64,23 @@ _Loader.add_implicit_resolver(
 )
 
 
+class GivenMark(yaml.Mark):
+    """The place of a value that does not stand in the file: where it was given instead."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(where, 0, -1, -1, None, 0)
+
+
+def compose(text: str) -> yaml.Node:
+    """Return the node of a value written as YAML; nothing is a null.
+
+    Raises:
+        yaml.YAMLError: it is no YAML, or more than a configuration needs.
+    """
+    node: yaml.Node | None = yaml.compose(text, _Loader)
+    return yaml.ScalarNode("tag:yaml.org,2002:null", "") if node is None else node
+
+
 def parse_yaml(text: str) -> Any:
     """Return the plain data of a YAML text of any origin.
 
@@ -203,6 +220,8 @@ class YamlDocument(Document):
         raise self.error(first_lines([f"{self._place(mark)}: {message}" for mark, message in ordered]))
 
     def _place(self, mark: yaml.Mark | None) -> str:
+        if isinstance(mark, GivenMark):
+            return str(mark.name)
         return f"{self.name}:{mark.line + 1}:{mark.column + 1}" if mark else self.name
 
     def mapping(self, node: yaml.Node | None, what: str) -> dict[str, tuple[yaml.Node, yaml.Node]]:

@@ -26,6 +26,7 @@ LAYERS = [
     {"structures"},
     {"alignment", "sensors"},
     {"yaml_nodes"},
+    {"yaml_paths"},
     {"io", "transforms", "synthetic"},
     {"imports"},
     {"datasets", "validation"},
@@ -55,6 +56,7 @@ OUTSIDE = {
     "structures": {"torch", "numpy"},
     "alignment": {"torch", "numpy"},
     "yaml_nodes": {"yaml"},
+    "yaml_paths": {"yaml"},
 }
 OUTSIDE_OF_ONE_MODULE = {"kernels/torch_cluster.py": {"torch_cluster"}}
 

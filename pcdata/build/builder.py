@@ -1,71 +1,34 @@
-"""Build a dataset: run the deterministic steps once on every capture and store the result, all or nothing."""
+"""Build a dataset: run the deterministic steps once on every capture and store the result, shard by shard."""
 
 from __future__ import annotations
 
 import os
-import platform
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-import numpy as np
-import torch
-
-import pcdata
+from pcdata.build.building_folder import BuildingFolder
 from pcdata.build.carried import carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
-from pcdata.build.loading_script import loading_script
-from pcdata.datasets.collate import COLLATES
+from pcdata.build.engines.in_process import work_here
+from pcdata.build.finishing import complete_dataset
+from pcdata.build.plan import Plan, plan_of
+from pcdata.build.records import BuiltSample, ShardRecord
+from pcdata.build.shard_work import Job
+from pcdata.build.source_state import captures_digest
+from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.datasets.splits import FILE_NAME as SPLITS
-from pcdata.errors import (
-    CacheError,
-    CaptureError,
-    ConfigError,
-    DTypeError,
-    FrameError,
-    ShapeError,
-    WriteError,
-    add_note,
-    write_fault,
-)
-from pcdata.files.inputs import recording
-from pcdata.files.whole_folders import complete_or_nothing
-from pcdata.imports import imported_files, step_names
-from pcdata.io.sources.capture_source import (
-    REFUSALS,
-    CaptureSource,
-    checked_ids,
-    episodes_of,
-    inputs_of,
-    kinds_of,
-    reason_of,
-    skipped_of,
-    streams_of,
-)
-from pcdata.io.store.cloud_record import record_from_cloud, record_from_signals
-from pcdata.io.store.manifest import Manifest
-from pcdata.io.store.sample_index import Sample
-from pcdata.io.store.sample_keys import key_of
-from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, seal_shard, shard_folder, shard_size_of
-from pcdata.io.store.stores import STORES, Store
-from pcdata.io.writers.capture_folder import write_capture
+from pcdata.errors import CacheError, ConfigError, DTypeError, add_note
+from pcdata.files.scratch import Note
+from pcdata.files.whole_folders import check_replaceable, prepared, put_into_place
+from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
-from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
-from pcdata.structures.episodes import kept_episodes
-from pcdata.structures.signal_joining import stacked_signals
+from pcdata.structures import PointCloud
 
-
-@dataclass(frozen=True)
-class BuiltSample:
-    """What happened to one capture."""
-
-    id: str
-    entered_at: str  # "depth", or "cloud" where the capture was one already
-    counts: list[tuple[str, int]]  # step name -> points after it, over all clouds of the sample
-    seconds: float
+Engine = Literal["pool", "ray"]
+ENGINES: tuple[Engine, ...] = ("pool", "ray")
 
 
 @dataclass(frozen=True)
@@ -75,7 +38,11 @@ class BuildReport:
     folder: Path
     samples: list[BuiltSample] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
-    notes: list[str] = field(default_factory=list)  # what killed builds had left, and what became of it
+    quarantined: dict[str, str] = field(default_factory=dict)  # id of a capture that failed twice -> why
+    notes: list[str] = field(default_factory=list)  # what was found of builds before, and what became of it
+    num_shards: int = 0
+    num_finished: int = 0  # of them; fewer where others have a part of the work
+    is_complete: bool = False  # the dataset is under its name
 
 
 def build_dataset(
@@ -84,181 +51,175 @@ def build_dataset(
     folder: str | Path,
     *,
     overwrite: bool = False,
-    skip_refused: bool | None = None,
+    restart: bool = False,
+    workers: int = 0,
+    timeout: float | None = None,
+    max_bad: int | str | None = None,
+    engine: Engine = "pool",
+    part: tuple[int, int] | None = None,
+    finalize: bool = False,
     progress: Progress | None = None,
+    note: Note | None = None,
 ) -> BuildReport:
     """Store every capture of a source as the pipeline's deterministic steps leave it.
 
-    The dataset appears under its name only when it is complete: everything is written to a hidden neighbor first, and
-    a failure removes that and leaves what was there before. Nothing is deleted that no build made: a folder that
-    somebody else makes under the name meanwhile makes the build fail.
+    Captures are worked on in shards, each committed when it is on disk; a build that was stopped goes on where it was
+    when it is started again with the same settings and captures. The dataset appears under its name only when it is
+    complete, and its bytes are the same whoever worked on it and however often it was stopped. Nothing is deleted that
+    no build made: a folder that somebody else makes under the name meanwhile makes the build fail.
+
+    A capture that raises, takes too long or ends its worker is tried once more, alone, and then quarantined: left out,
+    and named with its error in the report and the manifest.
 
     Args:
         config: pipeline, storage and loader settings; see :func:`pcdata.load_config`.
         source: the captures; see :func:`pcdata.open_source`.
         folder: where the dataset goes.
         overwrite: replace a dataset that is there already; anything else is never replaced.
-        skip_refused: leave out captures that cannot be read or that a step refuses, and go on; the report and the
-            manifest tell which and why. None = as the configuration says, where the default is to stop at the first.
+        restart: delete an unfinished build of the folder, of these or of other settings, and begin anew.
+        workers: processes, of one thread each; 0 = this process, which a capture that crashes or hangs then takes with
+            it. Of Ray, how many tasks run at once; 0 = as many as fit.
+        timeout: seconds that one capture may take; needs workers. None = any time.
+        max_bad: how many captures may be quarantined, or which share of all, "1%"; more stop the build. None = any
+            number but all of the first 8.
+        engine: "pool" = processes of this machine; "ray" = a Ray cluster, an existing one or one of this machine.
+        part: (k, n): do only every n-th shard, from the k-th on, k from 0; whoever finishes last puts the dataset into
+            place.
+        finalize: only put the dataset into place, of which every shard is finished.
         progress: called after every capture.
+        note: told at once what the report's ``notes`` say in the end.
 
     Raises:
-        ConfigError: the pipeline has nothing deterministic to store.
-        CacheError: the folder exists, another process writes it, or it cannot be written (a full disk).
-        CaptureError: a file of the captures, or of their calibration, changed since it was first read.
-        PcdataError: a capture or a step failed; the note names the sample, the step and its input.
+        ConfigError: the pipeline has nothing deterministic to store, or the arguments do not fit together.
+        CacheError: the folder exists, another process writes it, an unfinished build of other settings is there, or it
+            cannot be written (a full disk).
+        CaptureError: a file of the captures, or of their calibration, changed since it was first read; too many
+            captures failed.
+        PcdataError: all of the first 8 captures failed, or all; of the type that the first one raised.
     """
     _check_arguments(config, source)
+    _check_ways(workers, timeout, engine, part, finalize)
     # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
     folder = Path(os.path.realpath(Path(folder).expanduser()))
     report = BuildReport(folder, skipped=skipped_of(source))
-    skip_refused = config.source.skip_refused if skip_refused is None else skip_refused
-    with complete_or_nothing(
-        folder, overwrite=overwrite, owned=check_only_dataset, note=report.notes.append
-    ) as partial:
-        sections = config.pipeline.sections()
-        steps = {name for file in imported_files() for name in file.transforms}
-        steps &= step_names(sections) if steps else set()
-        kinds = {*kinds_of(source)}
-        # What loads the dataset must know where its steps, its store and its batches are at home.
-        modules = {STORES[config.output.format].__module__, COLLATES[config.loader.collate].__module__}
-        loading = [file for file in imported_files() if steps & {*file.transforms} or file.module in modules]
-        imports = [file for file in imported_files() if file in loading or kinds & {*file.layouts, *file.combinators}]
-        samples, signals = _write_samples(config, source, partial, report, skip_refused, progress)
-        manifest = Manifest(
-            format=config.output.format,
-            compression=config.output.compression,
-            fingerprint=config.pipeline.stored_fingerprint(),
-            pipeline=sections,
-            samples=samples,
-            keep_raw=config.output.keep_raw,
-            shard_size=config.output.shard_size,
-            episodes=tuple(_episodes(source, samples)),
-            signals=signals,
-            skipped=report.skipped,
-            streams=tuple(streams_of(source)),
-            model=_model_of(config),
-            source={**getattr(source, "opened", {}), **({"skip_refused": True} if skip_refused else {})},
-            imports=[file.to_json() for file in imports],
-            versions={
-                "pcdata": pcdata.__version__,
-                "torch": str(torch.__version__),
-                "numpy": np.__version__,
-                "python": platform.python_version(),
-            },
-        )
+    check_replaceable(folder, overwrite, check_only_dataset)
+    plan = plan_of(config, source)
+    limit = most_bad(max_bad, len(plan.ids))
+    building = BuildingFolder(folder)
+    job = Job.of(config, source, plan, building)
+
+    def tell(text: str) -> None:
+        report.notes.append(text)
+        if note is not None:
+            note(text)
+
+    what = "finish" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
+    with building.opened(plan, what, restart=restart, note=tell):
+        replaced = prepared(folder, overwrite, check_only_dataset, tell) if part is None else None
+        shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
+        done = _finished(job, shards, tell)
+        if finalize and len(done) < plan.num_shards:
+            missing = plan.num_shards - len(done)
+            raise CacheError(f"{folder}: {missing} of {plan.num_shards} shards are not finished; build them first")
+        tally = Tally(plan, shards, done, limit, progress)
         try:
-            (partial / "pipeline.yaml").write_text(config.pipeline.to_yaml(), encoding="utf-8")
-            (partial / "load.py").write_text(
-                loading_script(config.loader, config.model, [file.name for file in loading]),
-                encoding="utf-8",
-            )
-            manifest.write(partial)
-            if (folder / SPLITS).is_file():
-                report.notes.extend(carry_splits(folder, partial))
-        except OSError as error:
-            raise CacheError(f"{folder}: cannot be written: {write_fault(error)}") from error
-    return report
+            _work(job, [shard for shard in shards if shard not in done], tally, engine, workers, timeout)
+        except BaseException as error:
+            _tell_kept(error, building, plan)
+            raise
+        done = building.finished(plan)
+        is_complete = len(done) == plan.num_shards and _finish(
+            config, source, job, done, part, replaced, overwrite=overwrite, note=tell
+        )
+    return _told(report, [done[shard] for shard in shards if shard in done], plan.num_shards, len(done), is_complete)
 
 
-def _write_samples(
+def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:
+    if not shards:
+        return
+    if engine == "ray":
+        from pcdata.build.engines.on_ray import work_on_ray
+
+        work_on_ray(job, shards, tally, tasks=workers, timeout=timeout)
+    elif workers:
+        from pcdata.build.engines.pool import work_in_pool
+
+        work_in_pool(job, shards, tally, workers=workers, timeout=timeout)
+    else:
+        work_here(job, shards, tally)
+
+
+def _finished(job: Job, shards: range, note: Note) -> dict[int, ShardRecord]:
+    """Return what is finished already; shards whose captures changed since are to be done again."""
+    plan, source = job.plan, job.work.source
+    done = job.folder.finished(plan)
+    changed = [
+        shard
+        for shard in shards
+        if shard in done and captures_digest(source, plan.ids_of(shard)) != done[shard].captures
+    ]
+    for shard in changed:
+        del done[shard]
+        job.folder.forget(shard)
+    if changed:
+        note(f"{len(changed)} finished shards are built anew, since a file of their captures has changed")
+    if mine := [shard for shard in shards if shard in done]:
+        note(f"{len(mine)} of {len(shards)} shards were finished before")
+    return done
+
+
+def _finish(
     config: BuildConfig,
     source: CaptureSource,
-    partial: Path,
-    report: BuildReport,
-    skip_refused: bool,
-    progress: Progress | None,
-) -> tuple[list[Sample], dict[str, str]]:
-    each = shard_size_of(len(source.ids), config.output.shard_size)
-    store, shard = _store_of(config, shard_folder(partial, 0)), 0
-    prefix, _ = config.pipeline.split()
-    ids = list(source.ids)
-    written: list[Sample] = []
-    signals: list[Mapping[str, Signal]] = []
-    told: dict[str, str] = {}
-    inputs = inputs_of(source)
-    try:
-        for position, sample_id in enumerate(ids):
-            if position // each != shard:
-                _seal(store)
-                shard = position // each
-                store = _store_of(config, shard_folder(partial, shard))
-            started = time.perf_counter()
-            try:
-                try:
-                    with recording(inputs):
-                        capture = source.load(sample_id)
-                    made = prefix(capture)
-                except REFUSALS as error:
-                    if not skip_refused:
-                        raise
-                    report.skipped[sample_id] = reason_of(error)
-                    continue
-                cloud = _with_sample_id(_checked_cloud(made), sample_id)
-                record = record_from_cloud(cloud)
-                key = key_of(sample_id)
-                store.write(key, record)
-                if config.output.keep_raw:
-                    _keep_raw(capture, store.folder / "raw" / key)
-            except Exception as error:
-                way_out = isinstance(error, REFUSALS) and not skip_refused
-                hint = f"; leave it out with --skip {sample_id}, or all such captures with --skip-refused"
-                add_note(error, f"sample {sample_id!r} of {source!r}{hint if way_out else ''}", sample_id=sample_id)
+    job: Job,
+    done: dict[int, ShardRecord],
+    part: tuple[int, int] | None,
+    replaced: object,
+    *,
+    overwrite: bool,
+    note: Note,
+) -> bool:
+    """Put the dataset into place; False where another process that has a part of the work does."""
+    folder, building = job.folder.target, job.folder
+    if not any(record.samples for record in done.values()):
+        failed = {name: why for record in done.values() for name, why in record.quarantined.items()}
+        raise all_failed(failed, len(job.plan.ids))
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(building.claim("finish", note))
+        except CacheError:
+            if part is None:
                 raise
-            inputs.check_latest("build_dataset")
-            written.append(Sample(sample_id, key, cloud.num_points, record.digest(), shard))
-            signals.append(_one_each(cloud))
-            report.samples.append(_built_sample(sample_id, capture, cloud, time.perf_counter() - started))
-            if progress is not None:
-                progress(position + 1, len(ids), sample_id)
-        inputs.check("build_dataset")
-        _seal(store)
-        if any(signals):
-            store = _store_of(config, partial / SIGNALS_FOLDER)
-            told = _write_signals(store, [sample.id for sample in written], signals)
-    finally:
-        store.close()
-    if not written:
-        first, reason = next(iter(report.skipped.items()))
-        raise CaptureError(
-            f"build_dataset: all {len(ids)} captures were refused, so there is nothing to store; {first!r}: {reason}"
+            note("another process puts the dataset into place")
+            return False
+        if part is not None:
+            replaced = prepared(folder, overwrite, check_only_dataset, note)
+        partial = complete_dataset(config, source, job, done)
+        if (folder / SPLITS).is_file():
+            for told in carry_splits(folder, partial):
+                note(told)
+        put_into_place(partial, folder, replaced, check_only_dataset, note)
+        building.remove()
+    return True
+
+
+def _tell_kept(error: BaseException, building: BuildingFolder, plan: Plan) -> None:
+    kept = building.finished(plan)
+    if any(record.samples for record in kept.values()):
+        add_note(
+            error,
+            f"{len(kept)} of {plan.num_shards} shards are finished and kept in {building.path}; the same command goes "
+            "on from there",
         )
-    return written, told
 
 
-def _store_of(config: BuildConfig, folder: Path) -> Store:
-    return STORES[config.output.format](folder, config.output.compression)
-
-
-def _seal(store: Store) -> None:
-    """End a shard: nothing is added to it any more."""
-    store.close()
-    seal_shard(store.folder)
-
-
-def _one_each(cloud: PointCloud) -> Mapping[str, Signal]:
-    """Return the signals of a sample: those of its clouds, where they are the same, as of views of one moment."""
-    found = {}
-    for name, signal in cloud.recorded_signals.items():
-        rows = [signal.rows(slice(b, b + 1)) for b in range(cloud.num_clouds)]
-        found[name] = rows[0] if all(row.same_bits(rows[0]) for row in rows) else signal
-    return found
-
-
-def _write_signals(store: Store, ids: list[str], signals: list[Mapping[str, Signal]]) -> dict[str, str]:
-    """Keep the signals of all samples side by side, so that nobody has to load clouds for them."""
-    try:
-        record = record_from_signals(stacked_signals("signals", ids, signals))
-    except (ShapeError, FrameError, DTypeError) as error:
-        return {"fault": str(error)}  # each sample still has its own
-    store.write(SIGNALS_KEY, record)
-    return {"digest": record.digest()}
-
-
-def _episodes(source: CaptureSource, samples: list[Sample]) -> list[Episode]:
-    written = {sample.id for sample in samples}
-    places = [place for place, sample_id in enumerate(source.ids) if sample_id in written]
-    return kept_episodes(episodes_of(source), places)
+def _told(
+    report: BuildReport, records: list[ShardRecord], num_shards: int, num_finished: int, is_complete: bool
+) -> BuildReport:
+    for record in records:
+        report.samples.extend(record.samples)
+        report.quarantined.update(record.quarantined)
+    return replace(report, num_shards=num_shards, num_finished=num_finished, is_complete=is_complete)
 
 
 def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
@@ -284,37 +245,20 @@ def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
         raise ConfigError("build_dataset: the pipeline gives images, not clouds to store; put Deproject last")
 
 
-def _model_of(config: BuildConfig) -> dict[str, Any]:
-    if config.model is None:
-        return {}
-    return {"name": config.model.contract.name, "choices": config.model.plain_choices()}
-
-
-def _checked_cloud(data: Any) -> PointCloud:
-    if not isinstance(data, PointCloud):
-        raise ConfigError(f"the pipeline gives a {type(data).__name__}, not a cloud to store; end depth in Deproject")
-    return data
-
-
-def _with_sample_id(cloud: PointCloud, sample_id: str) -> PointCloud:
-    return cloud.with_meta([{"sample_id": sample_id}] * cloud.num_clouds)
-
-
-def _keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:
-    if not isinstance(capture, DepthFrame):
-        raise CaptureError("output.keep_raw is on, but this source gives clouds: there is no depth image to keep")
-    try:
-        write_capture(capture, folder)
-    except WriteError as error:
-        raise CacheError(str(error)) from error
-
-
-def _built_sample(sample_id: str, capture: Any, cloud: PointCloud, seconds: float) -> BuiltSample:
-    counts: dict[int, tuple[str, int]] = {}
-    for history in cloud.history:
-        for position, step in enumerate(history):
-            if "points" in step:
-                before = counts.get(position, (step["step"], 0))[1]
-                counts[position] = (step["step"], before + step["points"])
-    entered = "depth" if isinstance(capture, DepthFrame) else "cloud"
-    return BuiltSample(sample_id, entered, [counts[position] for position in sorted(counts)], seconds)
+def _check_ways(workers: int, timeout: float | None, engine: str, part: tuple[int, int] | None, finalize: bool) -> None:
+    where = "build_dataset"
+    if engine not in ENGINES:
+        raise ConfigError(f"{where}: engine must be one of {', '.join(ENGINES)}, got {engine!r:.60}")
+    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
+        raise ConfigError(f"{where}: workers must be a whole number from 0, got {workers!r:.60}")
+    if timeout is not None:
+        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < float("inf"):
+            raise ConfigError(f"{where}: timeout must be seconds above 0, got {timeout!r:.60}")
+        if engine == "pool" and not workers and not finalize:
+            raise ConfigError(f"{where}: timeout needs a process that can be ended: workers=1 or more")
+    if part is not None:
+        whole = isinstance(part, tuple) and len(part) == 2 and all(type(number) is int for number in part)
+        if not whole or not 0 <= part[0] < part[1]:
+            raise ConfigError(f"{where}: part must be (k, n) with 0 <= k < n, got {part!r:.60}")
+        if finalize:
+            raise ConfigError(f"{where}: finalize takes no part: it puts the whole dataset into place")

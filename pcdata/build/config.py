@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,7 +24,8 @@ from pcdata.structures import PointCloud
 from pcdata.transforms import Compose
 from pcdata.transforms.chain_reading import SECTIONS
 from pcdata.transforms.sensor_words import SENSOR
-from pcdata.yaml_nodes import Document, YamlDocument
+from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
+from pcdata.yaml_paths import set_value
 
 
 def _registered(registry: Registry[Any]) -> AfterValidator:
@@ -123,6 +125,23 @@ class BuildConfig:
                 raise ConfigError(f"loader.{name}: the model's preset makes its own batches; leave it out")
         return replace(self, pipeline=stored_preset(made).pipeline, model=made)
 
+    def to_yaml(self) -> str:
+        """Write every setting, as :func:`load_config` reads it: steps with all their fields, paths as they are here."""
+        source = self.source.to_config()
+        steps = self.pipeline.sections() if self.model is None else {"model": self._model_section()}
+        hidden = None if self.model is None else {"collate", "windows"}  # the preset's own
+        parts = {
+            **({"source": source} if source else {}),
+            **steps,
+            "output": self.output.model_dump(mode="json"),
+            "loader": self.loader.model_dump(mode="json", exclude=hidden),
+        }
+        return yaml_text(parts)
+
+    def _model_section(self) -> dict[str, Any]:
+        assert self.model is not None
+        return {"name": self.model.contract.name, **self.model.plain_choices()}
+
     def stored_as(self, format: str) -> BuildConfig:
         """Return this configuration with another format of storage.
 
@@ -140,7 +159,7 @@ _SETTINGS: dict[str, type[BaseModel]] = {"output": _Output, "loader": Loader}
 
 
 @locates_path
-def load_config(path: str | Path) -> BuildConfig:
+def load_config(path: str | Path, *, settings: Iterable[tuple[str, str]] = ()) -> BuildConfig:
     """Read a YAML file; its sections source, sensor, depth, cloud, augment, model, output and loader are optional.
 
     The folder of a built dataset stands for the configuration that builds it again: its steps, its storage and how its
@@ -151,6 +170,9 @@ def load_config(path: str | Path) -> BuildConfig:
 
     ``model`` is ``{name: MODEL, CHOICE: VALUE, ...}``: the steps are those of the model's preset.
 
+    ``settings`` are pairs of a path and a value as YAML writes it, which go before what the file says:
+    ``("cloud.FarthestPointSample.num_points", "2048")``. A step is named by its class, or by its place in its section.
+
     ``sensor`` is a name that ``pcdata profiles`` lists, or ``{name: ..., depth: metres}``: what the steps' values
     ``sensor`` are computed from.
 
@@ -159,14 +181,19 @@ def load_config(path: str | Path) -> BuildConfig:
         CacheError: the dataset's ``dataset.json`` is damaged.
     """
     if (Path(path) / FILE_NAME).is_file():
-        return _config_of_dataset(Path(path))
+        return _config_of_dataset(Path(path), tuple(settings))
     text = read_text("configuration", path, error=ConfigError)
-    return config_from_yaml(text, name=str(path), folder=Path(path).parent)
+    return config_from_yaml(text, name=str(path), folder=Path(path).parent, settings=settings)
 
 
-def config_from_yaml(text: str, *, name: str = "<yaml>", folder: Path | None = None) -> BuildConfig:
+def config_from_yaml(
+    text: str, *, name: str = "<yaml>", folder: Path | None = None, settings: Iterable[tuple[str, str]] = ()
+) -> BuildConfig:
     """Parse the text of a configuration; see :func:`load_config`. Relative paths in it start from ``folder``."""
-    return _config_of(YamlDocument(text, name), folder)
+    document = YamlDocument(text, name)
+    for path, value in settings:
+        set_value(document, path, value)
+    return _config_of(document, folder)
 
 
 def _config_of(document: Document, folder: Path | None = None) -> BuildConfig:
@@ -196,7 +223,7 @@ def _config_of(document: Document, folder: Path | None = None) -> BuildConfig:
     return config if made is None else config.for_model(made)
 
 
-def _config_of_dataset(folder: Path) -> BuildConfig:
+def _config_of_dataset(folder: Path, settings: Sequence[tuple[str, str]] = ()) -> BuildConfig:
     manifest = Manifest.read(folder)
     model = {"name": manifest.model["name"], **manifest.model["choices"]} if manifest.model else None
     output = {
@@ -210,11 +237,14 @@ def _config_of_dataset(folder: Path) -> BuildConfig:
     config = _config_of(Document({**common, **({"model": model} if model else manifest.pipeline)}, name))
     if model and config.pipeline.sections() != manifest.pipeline:  # the steps of the model were changed by hand
         config = _config_of(Document({**common, **manifest.pipeline}, name))
+    if settings:
+        config = config_from_yaml(config.to_yaml(), name=name, settings=settings)
     return replace(config, source=replace(config.source, path=None, by_name=True))
 
 
 def _settings(document: Document, model: type[BaseModel], node: Any) -> Any:
-    entries = document.mapping(node, model.__name__.lower())
+    section = model.__name__.lower().lstrip("_")
+    entries = document.mapping(node, section)
     values = {key: document.plain(value) for key, (_, value) in entries.items()}
     try:
         return model(**values)
@@ -223,8 +253,8 @@ def _settings(document: Document, model: type[BaseModel], node: Any) -> Any:
             name = str(fault["loc"][0]) if fault["loc"] else "collate"  # the one rule of several settings
             if fault["type"] == "extra_forbidden":
                 hint = near_matches(name, model.model_fields) or f"; known: {', '.join(model.model_fields)}"
-                document.fault(entries[name][0], f"{model.__name__.lower()}.{name}: no such setting{hint}")
+                document.fault(entries[name][0], f"{section}.{name}: no such setting{hint}")
             else:
                 place = document.at(entries[name][1], fault["loc"][1:]) if name in entries else node
-                document.fault(place, f"{model.__name__.lower()}.{name}: {fault['msg']} (got {fault['input']!r})")
+                document.fault(place, f"{section}.{name}: {fault['msg']} (got {fault['input']!r})")
         return None

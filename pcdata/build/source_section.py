@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ class SourceSettings:
         only: patterns of the ids that are kept.
         limit: how many samples are kept.
         skip: ids that are left out.
-        skip_refused: whether captures that are refused are left out.
         options: those of the layout's class, and combinators with their fields, in their order.
         by_name: whether files are known by their names alone, as a dataset remembers them: an argument says the place.
     """
@@ -37,7 +36,6 @@ class SourceSettings:
     only: tuple[str, ...] = ()
     limit: int | None = None
     skip: tuple[str, ...] = ()
-    skip_refused: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
     by_name: bool = False
 
@@ -49,10 +47,32 @@ class SourceSettings:
         only: Sequence[str] = (),
         limit: int | None = None,
         skip: Sequence[str] = (),
-        skip_refused: bool | None = False,
         **options: Any,
     ) -> Selectable[Any]:
-        """Open the captures.
+        """Open the captures; of what is said twice see :meth:`with_arguments`.
+
+        Raises:
+            ConfigError: there is no path, or an option has one value here and another in the section.
+            CaptureError: the captures cannot be opened.
+        """
+        said = self.with_arguments(path, kind=kind, only=only, limit=limit, skip=skip, **options)
+        if said.path is None:
+            raise ConfigError("source: nothing says where the captures are; give --source PATH, or source: {path: ...}")
+        return open_source(
+            said.path, kind=said.kind, only=said.only, limit=said.limit, skip=said.skip, **dict(said.options)
+        )
+
+    def with_arguments(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        kind: str | None = None,
+        only: Sequence[str] = (),
+        limit: int | None = None,
+        skip: Sequence[str] = (),
+        **options: Any,
+    ) -> SourceSettings:
+        """Return what the section and arguments say together.
 
         Args:
             path: instead of the path of the section.
@@ -60,27 +80,32 @@ class SourceSettings:
             only: patterns of ids to keep, where the section does not say them.
             limit: keep the first so many samples; the smaller of this and the section's counts.
             skip: ids to leave out besides those of the section.
-            skip_refused: leave out those that are refused. Where captures are combined every one is loaded once for
-                that, since an average would be lost for one bad capture; else the build leaves them out as it goes.
             **options: those of the layout's class and combinators, besides those of the section.
 
         Raises:
-            ConfigError: there is no path, or an option has one value here and another in the section.
-            CaptureError: the captures cannot be opened.
+            ConfigError: an option has one value here and another in the section.
         """
-        where = path if path is not None else self.path
-        if where is None:
-            raise ConfigError("source: nothing says where the captures are; give --source PATH, or source: {path: ...}")
         limits = [number for number in (limit, self.limit) if number is not None]
         merged = self._merged({"kind": kind, "only": list(only) or None, **options})
-        is_combined = any(name in COMBINATORS and value is not False for name, value in merged.items())
-        return open_source(
-            where,
+        where = self.path if path is None else os.fspath(path)
+        return replace(
+            self,
+            path=where,
+            kind=merged.pop("kind", None),
+            only=tuple(merged.pop("only")),
             limit=min(limits, default=None),
-            skip=[*dict.fromkeys([*self.skip, *skip])],
-            skip_refused=is_combined and bool(skip_refused or self.skip_refused),
-            **merged,
+            skip=tuple(dict.fromkeys([*self.skip, *skip])),
+            options=merged,
         )
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the section, as :func:`source_settings` reads it."""
+        own = {"path": self.path, "kind": self.kind, "limit": self.limit, "only": list(self.only)}
+        said = {**own, "skip": list(self.skip), **self.options}
+        for name in _FILES:
+            if isinstance(said.get(name), str):
+                said[name] = os.path.join(os.getcwd(), os.path.expanduser(said[name]))
+        return {name: value for name, value in said.items() if value not in (None, [])}
 
     def _merged(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the section and the arguments say together."""
@@ -117,12 +142,13 @@ def source_settings(document: Document, node: Any, folder: Path | None) -> Sourc
     entries = document.mapping(node, "source")
     values = {key: document.plain(value) for key, (_, value) in entries.items()}
     layouts = [LAYOUTS[values["kind"]]] if values.get("kind") in [*LAYOUTS] else [*LAYOUTS.values()]
-    known = list(dict.fromkeys([*OPENING, *COMBINATORS, *(name for layout in layouts for name in options_of(layout))]))
+    opening = [name for name in OPENING if name != "skip_refused"]  # a build quarantines what fails
+    known = list(dict.fromkeys([*opening, *COMBINATORS, *(name for layout in layouts for name in options_of(layout))]))
     for key in values:
         if key not in known:
             hint = near_matches(key, known) or f"; known: {', '.join(known)}; those of your own need --import FILE.py"
             document.fault(entries[key][0], f"source.{key}: no such setting{hint}")
-        elif key in OPENING and (wrong := _wrong(key, values[key])):
+        elif key in opening and (wrong := _wrong(key, values[key])):
             document.fault(entries[key][1], f"source.{key}: {wrong}, got {values[key]!r:.100}")
         elif key in COMBINATORS and values[key] not in (None, False):
             try:
@@ -145,7 +171,7 @@ def source_settings(document: Document, node: Any, folder: Path | None) -> Sourc
     skip += read_skip_file(skip_file) if skip_file else []
     only = values.pop("only", None) or ()
     only = (only,) if isinstance(only, str) else tuple(only)
-    own = {key: value for key in OPENING if (value := values.pop(key, None)) is not None}
+    own = {key: value for key in opening if (value := values.pop(key, None)) is not None}
     return SourceSettings(**own, only=only, skip=tuple(skip), options=values)
 
 
@@ -164,8 +190,6 @@ def _wrong(key: str, value: Any) -> str:
         return 'must be a pattern of ids such as "left_*", or a list of them'
     if key == "skip" and not _is_texts(value):
         return 'must be a list of ids, texts in quotes such as ["0005"]'
-    if key == "skip_refused" and not isinstance(value, bool):
-        return "must be true or false"
     return ""
 
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from pcdata.models import Preset
 
 
-def add_model_options(command: argparse.ArgumentParser, *, required: bool, help: str) -> None:
-    """Add ``--model`` and ``--set``."""
+def add_model_options(command: argparse.ArgumentParser, *, required: bool, help: str, also: str = "") -> None:
+    """Add ``--model`` and ``--set``; ``also`` says what else may be set."""
     command.add_argument("--model", required=required, metavar="NAME", help=f"{help}: {', '.join(MODELS)}")
     command.add_argument(
         "--set",
@@ -22,7 +22,8 @@ def add_model_options(command: argparse.ArgumentParser, *, required: bool, help:
         default=[],
         metavar="CHOICE=VALUE",
         type=name_and_value,
-        help=f"a choice that the model leaves open, of {', '.join(CHOICES)} ('pcdata models NAME' tells); repeatable",
+        help=f"a choice that the model leaves open, of {', '.join(CHOICES)} ('pcdata models NAME' tells){also}; "
+        "repeatable",
     )
 
 

@@ -1,13 +1,11 @@
-"""Commands that make and show datasets: demo, build, inspect, doctor."""
+"""Commands that show what is there: demo, inspect, doctor."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
-from pcdata.cli.choices import add_model_options, given_preset
-from pcdata.cli.known_names import FORMATS
-from pcdata.cli.options import add_capture_options, given_options, open_captures, positive, said_again, skip_list
+from pcdata.cli.options import add_capture_options, open_captures, positive, said_again
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -17,30 +15,6 @@ def add_to(commands: Any) -> None:
     demo.add_argument("out", nargs="?", default="pcdata_demo", metavar="OUT", help="folder (default: pcdata_demo)")
     demo.add_argument("--scenes", type=positive, default=4, metavar="N", help="captures to build from (default: 4)")
     demo.set_defaults(run=_demo)
-
-    build = commands.add_parser("build", help="build a dataset from captures")
-    build.add_argument(
-        "config",
-        nargs="?",
-        metavar="CONFIG",
-        help="YAML file, see configs/; or a dataset, to build it again (default: none, with --model)",
-    )
-    add_model_options(build, required=False, help="build what a model takes, instead of the steps of CONFIG")
-    build.add_argument(
-        "--source",
-        metavar="PATH",
-        help="folder of captures, or of several cameras' folders, or one cloud file (default: that of CONFIG)",
-    )
-    build.add_argument("--out", required=True, metavar="DIR", help="folder of the new dataset")
-    build.add_argument(
-        "--format",
-        metavar="FORMAT",
-        help=f"of the stored clouds: {', '.join(FORMATS)} (default: that of CONFIG, or hdf5)",
-    )
-    add_capture_options(build)
-    build.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
-    build.add_argument("--overwrite", action="store_true", help="replace the dataset that is in DIR")
-    build.set_defaults(run=_build)
 
     inspect = commands.add_parser("inspect", help="say what captures or a dataset hold, what is missing, how to go on")
     inspect.add_argument("path", metavar="PATH", help="captures of any layout, a cloud file, or a dataset")
@@ -55,51 +29,15 @@ def add_to(commands: Any) -> None:
 
 def _demo(arguments: argparse.Namespace) -> None:
     from pcdata.cli.demo import run_demo
+    from pcdata.report.build_text import build_text
 
     with ProgressBar("demo") as progress:
         report, batches, picture = run_demo(arguments.out, num_scenes=arguments.scenes, progress=progress)
-    print(_build_table(report))
+    print(build_text(report))
     points = sum(int(batch.mask.sum()) for batch in batches)
     print(f"\nloaded back with 2 workers: {len(batches)} batches, {points:,} augmented points")
     print(f"dataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
     print(f"picture  {picture}")
-
-
-def _build(arguments: argparse.Namespace) -> None:
-    from pcdata.build import BuildConfig, build_dataset, load_config
-    from pcdata.errors import ConfigError
-
-    if arguments.config is None and arguments.model is None:
-        raise ConfigError("build: nothing says what to build; give a CONFIG, or --model NAME")
-    if arguments.set and arguments.model is None:
-        raise ConfigError("build: --set makes a choice for a model; give --model NAME, or write it into the CONFIG")
-    config = BuildConfig() if arguments.config is None else load_config(arguments.config)
-    if arguments.model is not None:
-        config = config.for_model(given_preset(arguments.model, arguments.set))
-    if arguments.format is not None:
-        config = config.stored_as(arguments.format)
-    source = config.source.open(
-        arguments.source,
-        kind=arguments.kind,
-        only=arguments.only or (),
-        limit=arguments.limit,
-        skip=skip_list(arguments),
-        skip_refused=arguments.skip_refused,
-        **given_options(arguments),
-    )
-    with ProgressBar("build") as progress:
-        report = build_dataset(
-            config,
-            source,
-            arguments.out,
-            overwrite=arguments.overwrite,
-            skip_refused=arguments.skip_refused,
-            progress=progress,
-        )
-    print(_build_table(report))
-    for note in report.notes:
-        print(f"note     {note}")
-    print(f"\ndataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
 
 
 def _inspect(arguments: argparse.Namespace) -> None:
@@ -147,9 +85,3 @@ def _doctor(arguments: argparse.Namespace) -> None:
     from pcdata.report.health_text import health_text
 
     print(health_text())
-
-
-def _build_table(report: Any) -> str:
-    from pcdata.report.inspection_text import build_text
-
-    return build_text(report)

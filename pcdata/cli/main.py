@@ -17,23 +17,28 @@ from pcdata.cli.threads import wait_asleep
 from pcdata.cli.warning_lines import warnings_in_one_line
 from pcdata.errors import ConfigError, PcdataError
 
+_NOTHING_LEFT = "nothing half-written was left behind"
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code: 0 done, 1 the data or a file is at fault, 2 the request is.
 
-    128 and the number of the signal where one ended it. Without ``argv`` this is the whole life of the process.
+    3 of a build that is done but for captures that were quarantined; 128 and the number of the signal where one ended
+    it. Without ``argv`` this is the whole life of the process.
     """
     with printable_output(), warnings_in_one_line(), signals_interrupt(until_exit=argv is None) as heard:
+        kept: list[str] = []  # what an unfinished build says of itself
         try:
             return _run(argv)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             heard.over = True
+            kept = [str(note) for note in getattr(error, "__notes__", ())]
         except Exception:  # a library may turn what a signal raises into an error of its own
             if heard.first is None:
                 raise
             heard.over = True
         with suppress(OSError):  # the terminal may be gone
-            print("interrupted; nothing half-written was left behind", file=sys.stderr, flush=True)
+            print("; ".join(["interrupted", *(kept or [_NOTHING_LEFT])]), file=sys.stderr, flush=True)
         return heard.code
 
 
@@ -83,13 +88,14 @@ def _import(paths: Sequence[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     # Imported here, where a signal is heard already.
-    from pcdata.cli import calib, convert, datasets, export, fuse, models, sensors, split, validate, verify
+    from pcdata.cli import build, calib, convert, datasets, export, fuse, models, sensors, split, validate, verify
 
     parser = argparse.ArgumentParser(prog="pcdata", description="From raw depth frames to training-ready point clouds.")
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (datasets, split, verify, convert, fuse, export, validate, models, sensors, calib):
+    groups = (datasets, build, split, verify, convert, fuse, export, validate, models, sensors, calib)
+    for group in groups:
         group.add_to(commands)
     for command in commands.choices.values():  # also after the command, where one adds it to a line that failed
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)

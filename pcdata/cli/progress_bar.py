@@ -9,6 +9,8 @@ from typing import Any
 from pcdata.cli import signals
 from pcdata.cli.printable import printable, terminal
 
+_SELDOM = 10.0  # seconds between two plain lines, which a log keeps
+
 
 class ProgressBar:
     """A bar on a terminal, plain lines elsewhere; also the place where a lost Ctrl-C is heard."""
@@ -17,7 +19,8 @@ class ProgressBar:
         self.what = what
         self.unit = unit
         self.bar: Any = None
-        self.started = time.perf_counter()
+        self.started = self.told = time.perf_counter()
+        self.done_before = -1  # by a command that was stopped; -1: not known yet
 
     def __enter__(self) -> ProgressBar:
         return self
@@ -30,12 +33,45 @@ class ProgressBar:
         """Show that ``done`` of ``total`` samples are finished."""
         if signals.current.first is not None:  # raised inside a destructor or a callback, where Python drops exceptions
             raise KeyboardInterrupt
+        is_first = self.done_before < 0
+        if is_first:
+            self.done_before = done - 1
         if not sys.stderr.isatty():
-            print(f"{self.what} {done}/{total} {sample_id} {time.perf_counter() - self.started:.1f} s", file=sys.stderr)
+            now = time.perf_counter()
+            if is_first or done >= total or now - self.told >= _SELDOM:
+                self.told = now
+                print(f"{self.what} {done}/{total} {sample_id} {self._speed(done, total, now)}", file=sys.stderr)
             return
         if self.bar is None:
             from tqdm import tqdm
 
-            self.bar = tqdm(total=total, desc=printable(self.what), unit=self.unit, file=terminal(sys.stderr))
+            self.bar = tqdm(
+                total=total,
+                initial=self.done_before,
+                desc=printable(self.what),
+                unit=self.unit,
+                file=terminal(sys.stderr),
+            )
         self.bar.set_postfix_str(printable(sample_id))
         self.bar.update(done - self.bar.n)
+
+    def note(self, text: str) -> None:
+        """Tell something that is no error."""
+        line = f"{self.what}: {text}"
+        if self.bar is None:
+            print(line, file=sys.stderr)
+        else:
+            self.bar.write(printable(line), file=terminal(sys.stderr))
+
+    def _speed(self, done: int, total: int, now: float) -> str:
+        """Return the seconds so far, the rate, and the time left at that rate."""
+        seconds = now - self.started
+        rate = (done - self.done_before) / max(seconds, 1e-9)
+        left = "" if done >= total or rate <= 0 else f", {_in_words((total - done) / rate)} left"
+        return f"{seconds:.1f} s, {rate:.3g}/s{left}"
+
+
+def _in_words(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import BinaryIO, NamedTuple
@@ -45,6 +45,10 @@ class Inputs:
         """Remember what others have read too."""
         for name, state in other._first.items():
             self._first.setdefault(name, state)
+
+    def states(self) -> list[list[str | int]]:
+        """Return what the files are compared by, without their folders: name, size, and content or time."""
+        return [[os.path.basename(name), *_told(state)] for name, state in self._first.items()]
 
     def check_latest(self, where: str) -> None:
         """Require that the files read since the last call are as they were when they were first read.
@@ -96,6 +100,26 @@ def note_input(path: str | os.PathLike[str], file: BinaryIO) -> None:
     """Tell whoever records that a file is being read."""
     for inputs in _recording.get():
         inputs.note(path, file)
+
+
+def states_of(paths: Iterable[str | os.PathLike[str]]) -> list[list[str | int]]:
+    """Return what files are compared by, as they are now; of one that is missing or no file, nothing."""
+    found: list[list[str | int]] = []
+    for path in paths:
+        try:
+            status = os.stat(path)
+            if status.st_size > _SMALL or not stat.S_ISREG(status.st_mode):
+                found.append([status.st_size, status.st_mtime_ns])
+                continue
+            with open(path, "rb") as file:
+                found.append(_told(_state(file)))
+        except OSError:
+            found.append([])
+    return found
+
+
+def _told(state: _State) -> list[str | int]:
+    return [state.size, state.marks[0] if state.digest is None else state.digest.hex()]
 
 
 def _state(file: BinaryIO) -> _State:

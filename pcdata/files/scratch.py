@@ -76,9 +76,76 @@ def scratch_beside(folder: Path, *, alone: bool = False, note: Note = silent) ->
                 os.close(lock)
 
 
+@contextmanager
+def claimed(path: Path, note: Note = silent) -> Iterator[Path | None]:
+    """Claim what a name stands for, with a file beside it that is locked; give the claim of who came first, if any.
+
+    Claims of dead processes are removed. Where the file system has no locks, a process of this machine counts as long
+    as it runs, and of one of another machine nothing is known: that is noted, and does not hinder.
+
+    Raises:
+        CacheError: no file can be made there.
+    """
+    own = path.with_name(f"{path.name}.{_maker()}")
+    lock: int | None = None
+    try:
+        try:
+            with open(own, "xb"):
+                pass
+        except OSError as error:
+            raise CacheError(f"{path.parent}: cannot write there: {write_fault(error)}") from error
+        lock, _ = try_lock(own)
+        first = None
+        for other in sorted(path.parent.glob(glob.escape(path.name) + ".*")):
+            made_by = other.name.removeprefix(f"{path.name}.")
+            if other == own or (state := _settled(other, made_by)) == "dead":
+                continue
+            if state == "unknown":
+                note(f"{other} was left by a process of which nothing is known here; remove it if that has ended")
+            elif _made(made_by) < _made(own.name):  # of two at once, the first goes on
+                first = other
+        yield first
+    finally:
+        with shielded():
+            with suppress(OSError):
+                os.unlink(own)
+            if lock is not None:
+                os.close(lock)
+
+
+def living_claims(folder: Path) -> list[Path]:
+    """Return the claims in a folder whose processes live, this one's too."""
+    try:
+        claims = sorted(folder.iterdir())
+    except OSError:
+        return []
+    return [one for one in claims if _settled(one, one.name.partition(".")[2]) == "alive"]
+
+
+def _settled(claim: Path, made_by: str) -> str:
+    """Say what became of the process of a claim; a dead one's is removed."""
+    state, lock = _owner(claim, made_by)
+    if state == "dead":
+        with suppress(OSError):
+            os.unlink(claim)
+    if lock is not None:
+        os.close(lock)
+    return state
+
+
+def hidden_folder(folder: Path, what: str) -> Path:
+    """Return the one hidden neighbor of a kind that a folder has, whoever made it."""
+    return folder.with_name(_prefix(folder, what).removesuffix("-"))
+
+
 def hidden_name(folder: Path, what: str) -> str:
     """Return a new name for a hidden neighbor of a folder; it says who made it, and when."""
-    return f"{_prefix(folder, what)}{platform.node()}-{os.getpid()}-{time.time_ns():x}{uuid.uuid4().hex[:4]}"
+    return _prefix(folder, what) + _maker()
+
+
+def _maker() -> str:
+    """Return what a name says of who made it, and when."""
+    return f"{platform.node()}-{os.getpid()}-{time.time_ns():x}{uuid.uuid4().hex[:4]}"
 
 
 def retired_of(folder: Path) -> list[Path]:

@@ -24,6 +24,7 @@ from pcdata.files.scratch import (
     scratch_beside,
     silent,
 )
+from pcdata.files.syncing import sync_folder
 
 # The file at the top of a folder that says what it is; without it nobody could tell what a killed removal left.
 DATASET, EXPORT = "dataset.json", "pcdata_export.json"
@@ -51,17 +52,37 @@ def complete_or_nothing(
     Raises:
         CacheError: the name is taken, before or after the work; somebody else is writing it; it cannot be written.
     """
-    if not is_free(folder):
-        _check_replaceable(folder, overwrite, owned)
+    check_replaceable(folder, overwrite, owned)
     with scratch_beside(folder, alone=True, note=note) as partial:
-        restore_retired(folder, owned, note)
-        replaced = None
-        if not is_free(folder):
-            _check_replaceable(folder, overwrite, owned)
-            replaced = _identity(folder)
+        replaced = prepared(folder, overwrite, owned, note)
         yield partial
-        with shielded():
-            _put_into_place(partial, folder, replaced, owned, note)
+        put_into_place(partial, folder, replaced, owned, note)
+
+
+def check_replaceable(folder: Path, overwrite: bool, owned: Owned) -> None:
+    """Require that a name is free, or that what is there may be replaced.
+
+    Raises:
+        CacheError: it is neither.
+    """
+    if is_free(folder):
+        return
+    if not overwrite:
+        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting (--overwrite)")
+    owned(folder)
+
+
+def prepared(folder: Path, overwrite: bool, owned: Owned, note: Note) -> object:
+    """Put right what killed overwrites left at a name; return what is there, for :func:`put_into_place`.
+
+    Only the sole writer may.
+
+    Raises:
+        CacheError: as for :func:`check_replaceable`.
+    """
+    restore_retired(folder, owned, note)
+    check_replaceable(folder, overwrite, owned)
+    return None if is_free(folder) else _identity(folder)
 
 
 def is_free(folder: Path) -> bool:
@@ -113,12 +134,6 @@ def remove_owned(folder: Path, owned: Owned) -> None:
         os.rmdir(place)
 
 
-def _check_replaceable(folder: Path, overwrite: bool, owned: Owned) -> None:
-    if not overwrite:
-        raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting (--overwrite)")
-    owned(folder)
-
-
 def _identity(folder: Path) -> object:
     """Return what tells a folder from another of the same name."""
     with suppress(OSError):
@@ -126,6 +141,23 @@ def _identity(folder: Path) -> object:
         files = [(entry.name, entry.stat()) for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
         return about.st_dev, about.st_ino, sorted((name, file.st_ino, file.st_mtime_ns) for name, file in files)
     return None
+
+
+def put_into_place(partial: Path, folder: Path, replaced: object, owned: Owned, note: Note) -> None:
+    """Give a complete folder its name, at once; what was there before is deleted.
+
+    Args:
+        partial: the folder, on the same file system.
+        folder: the name.
+        replaced: what :func:`prepared` found there.
+        owned: raises unless a folder holds only what may be deleted.
+        note: told what is left.
+
+    Raises:
+        CacheError: something else is there now, or it cannot be renamed.
+    """
+    with shielded():
+        _put_into_place(partial, folder, replaced, owned, note)
 
 
 def _put_into_place(partial: Path, folder: Path, replaced: object, owned: Owned, note: Note) -> None:
@@ -140,7 +172,7 @@ def _put_into_place(partial: Path, folder: Path, replaced: object, owned: Owned,
                 )
             owned(folder)
             _remove_replaced(_swap(partial, folder), folder, owned, note)
-        _sync(folder.parent)
+        sync_folder(folder.parent)
     except OSError as error:
         raise CacheError(f"{folder}: cannot be put into place: {write_fault(error)}") from error
 
@@ -188,13 +220,3 @@ def _remove_replaced(replaced: Path, folder: Path, owned: Owned, note: Note) -> 
         remove_owned(replaced, owned)
     except (CacheError, OSError) as error:
         note(f"what was replaced at {folder} is not deleted whole, the rest is kept as {replaced}: {error}")
-
-
-def _sync(folder: Path) -> None:
-    """Force renames in a folder to disk, where the system can."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

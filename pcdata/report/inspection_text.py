@@ -9,7 +9,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pcdata.build import BuildReport
 from pcdata.datasets import CachedCloudDataset, Splits
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.writers.writers import WRITERS
@@ -22,30 +21,12 @@ _SKIPPED_SHOWN = 20  # captures that were left out, in a summary
 _COUNTS = ("dropped", "doubled", "interpolated", "missing")  # of a stream
 
 
-def build_text(report: BuildReport) -> str:
-    """Tell how many points every step left, over all captures of a build."""
-    rows: list[list[object]] = []
-    chains: dict[tuple[str, ...], list[list[int]]] = {}
-    for sample in report.samples:
-        names = tuple(name for name, _ in sample.counts)
-        chains.setdefault(names, []).append([count for _, count in sample.counts])
-    for names, counts in chains.items():
-        for position, name in enumerate(names):
-            left = [sample[position] for sample in counts]
-            rows.append([name, min(left), round(median(left)), max(left)])
-    seconds = sum(sample.seconds for sample in report.samples)
-    as_clouds = sum(sample.entered_at == "cloud" for sample in report.samples)
-    head = f"{len(report.samples)} samples in {seconds:.1f} s"
-    if as_clouds:
-        head += f"; {as_clouds} captures were clouds already and entered at the first step that takes one"
-    table = f"{head}\n\n{text_table(['points after', 'fewest', 'median', 'most'], rows)}"
-    return f"{table}\n\n{skipped_text(report.skipped)}" if report.skipped else table
-
-
-def skipped_text(skipped: Mapping[str, str], what: str = "captures", listed_in: str = "dataset.json") -> str:
+def skipped_text(
+    skipped: Mapping[str, str], what: str = "captures", listed_in: str = "dataset.json", how: str = "left out"
+) -> str:
     """Tell which captures, or others, were left out: how many for each kind of reason, and the first with their own."""
     kinds = Counter(reason.partition(":")[0] for reason in skipped.values())
-    head = f"{len(skipped)} {what} left out: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    head = f"{len(skipped)} {what} {how}: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     lines = [f"  {sample_id}: {reason}" for sample_id, reason in list(skipped.items())[:_SKIPPED_SHOWN]]
     more = len(skipped) - len(lines)
     return "\n".join([head, *lines, *([f"  and {more} more; {listed_in} lists them all"] if more else [])])
@@ -60,6 +41,7 @@ def dataset_text(folder: str | Path) -> str:
     facts: list[list[object]] = [
         ["samples", len(dataset)],
         *([["left out", len(manifest.skipped)]] if manifest.skipped else []),
+        *([["quarantined", len(manifest.quarantined)]] if manifest.quarantined else []),
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
         ["format", f"{manifest.format}, compression {manifest.compression}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
@@ -75,7 +57,13 @@ def dataset_text(folder: str | Path) -> str:
     steps = [["stored", repr(step)] for step in stored.steps]
     steps += [["on the fly", repr(step)] for step in on_the_fly.steps]
     tables = f"{text_table(['dataset', str(folder)], facts)}\n\n{text_table(['when', 'step'], steps)}"
-    return f"{tables}\n\n{skipped_text(manifest.skipped)}" if manifest.skipped else tables
+    return "\n\n".join([tables, *left_out_texts(manifest.skipped, manifest.quarantined)])
+
+
+def left_out_texts(skipped: Mapping[str, str], quarantined: Mapping[str, str]) -> list[str]:
+    """Tell which captures a dataset lacks: those that somebody left out, and those that failed."""
+    parts = [skipped_text(skipped)] if skipped else []
+    return parts + ([skipped_text(quarantined, how="failed twice and are quarantined")] if quarantined else [])
 
 
 def capture_text(source: CaptureSource, words: Sequence[str] = ()) -> str:
@@ -113,16 +101,16 @@ def facts_text(facts: Mapping[str, Any], words: Sequence[str] = ()) -> str:
 
 def next_commands(facts: Mapping[str, Any], words: Sequence[str]) -> list[str]:
     """Return the commands to go on with captures that are opened by these words."""
-    if "cameras" not in facts:
-        return [f"pcdata build --model MODEL --source {shlex.join(words)} --out DATASET   # pcdata models lists them"]
     checked = shlex.join(word for word in words if word != "--skip-refused")
+    if "cameras" not in facts:
+        return [f"pcdata build --model MODEL --source {checked} --out DATASET   # pcdata models lists them"]
     known = [name for name in ("lerobot", "mcap", "folder") if name in WRITERS]
     others = ", ".join(f"--to {name}" for name in known[1:])
     model = "dp3_sim" if facts["signals"] and facts["episodes"] else "MODEL"
     return [
         f"pcdata validate {checked}",
         f"pcdata convert {shlex.join(words)} --to {known[0]} --out DIR   # or {others}",
-        f"pcdata build --model {model} --source {shlex.join(words)} --out DATASET   # pcdata models lists them",
+        f"pcdata build --model {model} --source {checked} --out DATASET   # pcdata models lists them",
     ]
 
 

@@ -51,7 +51,7 @@ def test_raw_captures_that_do_not_fit_are_no_reason_to_leave_captures_out(tmp_pa
     with largest_file(100_000):
         build_dataset(config, source, tmp_path / "fits")
     with largest_file(size), pytest.raises(CacheError, match="cannot be written: a file may not become so large") as e:
-        build_dataset(config, source, tmp_path / "out", skip_refused=False)
+        build_dataset(config, source, tmp_path / "out")
     assert "--skip" not in str(getattr(e.value, "__notes__", ""))
     assert [path.name for path in tmp_path.iterdir()] == ["fits"]
 

@@ -73,7 +73,7 @@ def test_a_dataset_is_built_again_from_what_it_remembers(captures, tmp_path):
     text = (
         STEPS + "augment: [RandomFlip: {about: centroid}]\noutput: {format: npz, compression: gzip, keep_raw: true}\n"
     )
-    (tmp_path / "build.yaml").write_text(text + "source: {path: captures, skip: [frame-000020], skip_refused: true}\n")
+    (tmp_path / "build.yaml").write_text(text + "source: {path: captures, skip: [frame-000020]}\n")
     first = built(tmp_path / "build.yaml", tmp_path / "a")
     (tmp_path / "elsewhere").mkdir()
     captures.rename(tmp_path / "elsewhere" / "captures")
@@ -130,15 +130,14 @@ def test_section_and_command_line_join_the_fields_of_a_combinator_and_may_not_co
         load_config(config(tmp_path, "{path: captures, only: 'frame-*'}")).source.open(only=["b"])
 
 
-def test_refused_captures_cost_no_other_one_where_captures_are_combined(captures, tmp_path):
+def test_what_is_made_of_a_bad_capture_is_quarantined_until_that_is_left_out(captures, tmp_path):
     (captures / "frame-000020.pose.txt").write_text("nan " * 16)
-    for section, words in (
-        ("{path: captures, temporal: 2, skip_refused: true}", []),
-        ("{path: captures, temporal: 2}", ["--skip-refused"]),
-    ):
-        out = tmp_path / f"out{len(words)}"
-        assert list(built(config(tmp_path, section), out, *words).skipped) == ["frame-000020"]
-        assert CachedCloudDataset(out).ids == ["frame-000000", "frame-000040"]
+    file = config(tmp_path, "{path: captures, temporal: 2}")
+    manifest = built(file, tmp_path / "a", "--max-bad", "2")
+    assert list(manifest.quarantined) == ["frame-000020", "frame-000040"]  # the second is filtered with it
+    assert all("frame-000020" in reason for reason in manifest.quarantined.values())
+    assert built(file, tmp_path / "b", "--skip", "frame-000020").quarantined == {}
+    assert CachedCloudDataset(tmp_path / "b").ids == ["frame-000000", "frame-000040"]
 
 
 def test_every_command_on_captures_takes_combinators_and_patterns(captures, tmp_path, capsys):

@@ -99,7 +99,8 @@ def test_help_is_on_stdout(capsys, arguments):
     [
         ([], ["required", "COMMAND"]),
         (["biuld"], ["invalid choice", "build"]),
-        (["build"], ["CONFIG", "--source", "--out"]),
+        (["build"], ["CONFIG", "--model"]),
+        (["build", "--model", "dp3_sim"], ["frame"]),
         (["build", "c.yaml", "--source", "x", "--out", "y", "--limit", "0"], ["--limit", "at least 1", "'0'"]),
         (["build", "c.yaml", "--source", "x", "--out", "y", "--limit", "two"], ["--limit", "whole number", "'two'"]),
         (["demo", "--scenes", "-1"], ["--scenes"]),
@@ -146,9 +147,10 @@ def test_build_makes_a_dataset_and_tells_of_it(capsys, config, captures, tmp_pat
     assert "FarthestPointSample" in out
     assert str(tmp_path / "out" / "load.py") in out
     assert CachedCloudDataset(tmp_path / "out").ids == ["scan0", "scan1", "scan2", "scan3"]
-    # No terminal: one plain line per sample, no control characters.
-    lines = err.splitlines()
-    assert [" ".join(line.split()[:3]) for line in lines] == [f"build {n + 1}/4 scan{n}" for n in range(4)]
+    # No terminal: plain lines, seldom, with rate and time left, no control characters.
+    first, last = err.splitlines()
+    assert re.fullmatch(r"build 1/4 scan0 [0-9.]+ s, [0-9.]+/s, \d+ s left", first)
+    assert re.fullmatch(r"build 4/4 scan3 [0-9.]+ s, [0-9.]+/s", last)
     assert "\r" not in err
     assert "\x1b" not in err
 
@@ -217,14 +219,20 @@ def test_a_missing_configuration_is_exit_2(capsys, captures, tmp_path):
     assert "no.yaml" in err
 
 
-def test_a_damaged_capture_names_the_sample_and_leaves_nothing(capsys, config, captures, tmp_path):
+def test_a_damaged_capture_is_quarantined_and_the_exit_code_says_so(capsys, config, captures, tmp_path):
     (captures / "scan2.ply").write_bytes((captures / "scan2.ply").read_bytes()[:-7])
-    before = sorted(tmp_path.rglob("*"))
-    code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "out")
+    code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "out", "--max-bad", 0)
     assert (code, out) == (1, "")
+    assert "'scan2': CaptureError: " in err
     assert "scan2.ply" in err
-    assert re.search(r"^  .*sample 'scan2'", err, re.MULTILINE)  # the notes, indented
-    assert sorted(tmp_path.rglob("*")) == before
+    assert "--max-bad" in err
+    assert not (tmp_path / "out").exists()
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out"]
+    for options, wanted in (([], 3), (["--overwrite", "--max-bad", 1], 0), (["--overwrite", "--max-bad", "25%"], 0)):
+        code, out, err = run(capsys, *call, *options)
+        assert code == wanted
+        assert "1 captures failed twice and are quarantined: 1 CaptureError\n  scan2: CaptureError: " in out
+    assert "quarantined" in run(capsys, "inspect", tmp_path / "out")[1]
 
 
 @pytest.mark.parametrize("place", ["before", "after"])
@@ -365,11 +373,10 @@ def test_a_killed_build_leaves_nothing(config, tmp_path, number):
     write_ply(many / "scan0.ply", PointCloud(points=torch.rand(50, 3) + 0.2, frame_id="camera"))
     for copy in range(1, 3000):
         os.link(many / "scan0.ply", many / f"scan{copy}.ply")
-    with started("build", config, "--source", many, "--out", tmp_path / "result" / "out") as process:
+    call = ["build", config, "--source", many, "--out", tmp_path / "result" / "out", "--workers", 0]
+    with started(*call, "--set", "output.shard_size=3000") as process:
         assert process.stderr.readline().startswith("build 1/3000")
-        partial = list((tmp_path / "result").iterdir())
-        assert len(partial) == 1
-        assert partial[0].name.startswith(".out.partial-")
+        assert [path.name for path in (tmp_path / "result").iterdir()] == [".out.building"]
         process.send_signal(number)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + number, err[-2000:]

@@ -432,7 +432,7 @@ def test_captures_that_are_left_out_cut_the_episode_of_a_build(tmp_path):
                 raise CaptureError("damaged")
             return super().load(sample_id)
 
-    config = config_from_yaml("cloud: [Center]\nsource: {skip_refused: true}\n")
+    config = config_from_yaml("cloud: [Center]\n")
     build_dataset(config, Faulty((4, 2)), tmp_path / "set")
     data = CachedCloudDataset(tmp_path / "set")
     assert [(one.id, one.first, one.length) for one in data.episodes] == [("e0~0", 0, 1), ("e0~1", 1, 2), ("e1", 3, 2)]

@@ -16,7 +16,8 @@ from pcdata.errors import MissingExtraError
 from pcdata.io import open_source, write_ply
 from pcdata.io.sources.source import Source
 from pcdata.report import save_pipeline_figure, text_table
-from pcdata.report.inspection_text import build_text, capture_text
+from pcdata.report.build_text import build_text
+from pcdata.report.inspection_text import capture_text
 from pcdata.synthetic import tabletop
 
 needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="matplotlib is absent")

@@ -29,7 +29,7 @@ class _Recorded(ABCMeta):
         with recording(inputs):
             source = super().__call__(*args, **kwargs)
             source._episodes = source._read_episodes()
-        source.inputs = inputs
+        source.inputs, source.given = inputs, (args[1:], kwargs)
         return source
 
     @property
@@ -52,6 +52,7 @@ class Source(Selectable["Source"], metaclass=_Recorded):
         False  # the samples follow each other in time: one episode, unless said otherwise
     )
     inputs: Inputs  # the files that were read to open it
+    given: tuple[tuple[Any, ...], dict[str, Any]]  # what it was made with besides the path: how captures are read
     _episodes: list[Episode]
 
     def __init__(self, path: Path, ids: Iterable[str], links_to: LinkTargets = ()) -> None:

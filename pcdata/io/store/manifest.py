@@ -43,6 +43,7 @@ class Manifest:
     keep_raw: bool = False  # whether the captures lie beside the clouds
     shard_size: int | None = None  # what was asked for; None = what fits the number of captures
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
+    quarantined: Mapping[str, str] = field(default_factory=dict)  # id of a capture that failed twice -> why
     model: Mapping[str, Any] = field(default_factory=dict)  # name and choices of the model that it was built for
     source: Mapping[str, Any] = field(default_factory=dict)  # the section source that it was built with; {} = unknown
     imports: Sequence[
@@ -171,6 +172,7 @@ def _check(manifest: Manifest) -> None:
         ("pipeline", dict),
         ("versions", dict),
         ("skipped", dict),
+        ("quarantined", dict),
         ("model", dict),
         ("source", dict),
         ("signals", dict),

@@ -13,7 +13,7 @@ from pcdata import load_config, open_source, refused_captures
 from pcdata.build import build_dataset
 from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset
-from pcdata.errors import CaptureError, ConfigError, DTypeError, PoseError
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, PoseError, WriteError
 from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.open_source import read_skip_file
 from pcdata.io.store.manifest import Manifest
@@ -77,36 +77,26 @@ def test_the_limit_counts_what_is_left(capture: Path) -> None:
     assert open_source(capture, limit=3, skip=["0"], skip_refused=True).ids == ["1", "3"]
 
 
-def test_a_build_is_strict_by_default_and_says_the_way_out(capture: Path, config: Path, tmp_path: Path) -> None:
-    with pytest.raises(PoseError) as caught:
-        build_dataset(load_config(config), open_source(capture), tmp_path / "out")
-    told = str(caught.value) + "".join(getattr(caught.value, "__notes__", ()))
-    assert "--skip 2" in told
-    assert "--skip-refused" in told
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_build_leaves_refused_captures_out_and_records_why(capture: Path, config: Path, tmp_path: Path) -> None:
+def test_a_build_quarantines_refused_captures_and_records_why(capture: Path, config: Path, tmp_path: Path) -> None:
     source = open_source(capture).without(["0"])
-    report = build_dataset(load_config(config), source, tmp_path / "out", skip_refused=True)
-    assert list(report.skipped) == ["0", "2", "4"]
+    report = build_dataset(load_config(config), source, tmp_path / "out")
+    assert report.skipped == {"0": "listed"}
+    assert [reason.partition(":")[0] for reason in report.quarantined.values()] == ["PoseError", "NoReadingError"]
     assert [sample.id for sample in report.samples] == ["1", "3", "5"]
-    assert dict(Manifest.read(tmp_path / "out").skipped) == report.skipped
+    manifest = Manifest.read(tmp_path / "out")
+    assert (manifest.skipped, manifest.quarantined) == (report.skipped, report.quarantined)
     assert CachedCloudDataset(tmp_path / "out").ids == ["1", "3", "5"]
 
 
-def test_what_a_step_refuses_is_left_out_too(capture: Path, tmp_path: Path) -> None:
+def test_what_a_step_refuses_is_quarantined_too(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "many.yaml").write_text("depth:\n- Deproject: {}\ncloud:\n- RemovePlane: {distance: 0.01}\n")
     depth = np.full(SIZE, 800, np.uint16)
     depth[:, 16:] = np.linspace(500, 700, 16).astype(np.uint16)
     for number in (0, 1):
         Image.fromarray(depth).save(capture / "depth" / f"{number}.png")
     Image.fromarray(np.where(np.indices(SIZE).sum(0) == 3, 800, 0).astype(np.uint16)).save(capture / "depth" / "3.png")
-    report = build_dataset(
-        load_config(tmp_path / "many.yaml"), open_source(capture), tmp_path / "out", skip_refused=True
-    )
-    assert "3" in report.skipped
-    assert report.skipped["3"].startswith("NoPlaneError: ")
+    report = build_dataset(load_config(tmp_path / "many.yaml"), open_source(capture), tmp_path / "out")
+    assert report.quarantined["3"].startswith("NoPlaneError in RemovePlane: ")
 
 
 def test_a_summary_of_thousands_stays_short() -> None:
@@ -116,21 +106,16 @@ def test_a_summary_of_thousands_stays_short() -> None:
     assert len(told.splitlines()) == 22
 
 
-def test_nothing_left_is_an_error(capture: Path, config: Path, tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="all 2 captures were refused"):
-        build_dataset(load_config(config), open_source(capture).subset(["2", "4"]), tmp_path / "o", skip_refused=True)
-    assert not (tmp_path / "o").exists()
-
-
 def test_a_full_disk_is_no_refused_capture(capture: Path, config: Path, tmp_path: Path, monkeypatch) -> None:
     config.write_text(STEPS + "output: {keep_raw: true}\n")
 
     def fail(*arguments: object) -> None:
-        raise CaptureError("cannot be written")
+        raise WriteError("cannot be written")
 
-    monkeypatch.setattr("pcdata.build.builder.write_capture", fail)
-    with pytest.raises(CaptureError, match="cannot be written"):
-        build_dataset(load_config(config), open_source(capture), tmp_path / "out", skip_refused=True)
+    monkeypatch.setattr("pcdata.build.capture_work.write_capture", fail)
+    with pytest.raises(CacheError, match="cannot be written"):
+        build_dataset(load_config(config), open_source(capture), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 # -- the command line and the configuration ----------------------------------------------------------------------------
@@ -138,11 +123,11 @@ def test_a_full_disk_is_no_refused_capture(capture: Path, config: Path, tmp_path
 
 def test_the_command_line_leaves_out_and_tells(capture: Path, config: Path, tmp_path: Path, capsys) -> None:
     build = ["build", str(config), "--source", str(capture), "--out"]
-    assert main([*build, str(tmp_path / "strict")]) == 1
-    assert "--skip-refused" in capsys.readouterr().err
-    assert main([*build, str(tmp_path / "a"), "--skip-refused"]) == 0
+    assert main([*build, str(tmp_path / "strict"), "--max-bad", "1"]) == 1
+    assert "--max-bad" in capsys.readouterr().err
+    assert main([*build, str(tmp_path / "a")]) == 3
     out = capsys.readouterr().out
-    assert "2 captures left out: 1 PoseError, 1 NoReadingError" in out
+    assert "2 captures failed twice and are quarantined: 1 PoseError, 1 NoReadingError" in out
     assert "  2: PoseError: " in out
     assert main(["inspect", str(tmp_path / "a")]) == 0
     assert "4: NoReadingError" in capsys.readouterr().out
@@ -170,8 +155,8 @@ def test_other_commands_leave_out_and_tell(capture: Path, tmp_path: Path, capsys
 
 
 def test_the_configuration_says_it_all(capture: Path, config: Path, tmp_path: Path) -> None:
-    config.write_text(STEPS + 'source: {path: capture, kind: folder, limit: 5, skip: ["0"], skip_refused: true}\n')
-    assert main(["build", str(config), "--out", str(tmp_path / "a")]) == 0
+    config.write_text(STEPS + 'source: {path: capture, kind: folder, limit: 5, skip: ["0"]}\n')
+    assert main(["build", str(config), "--out", str(tmp_path / "a"), "--max-bad", "2"]) == 0
     assert CachedCloudDataset(tmp_path / "a").ids == ["1", "3", "5"]
     (capture / "bad.txt").write_text("2\n4\n")
     config.write_text(STEPS + "source: {path: capture, skip_file: capture/bad.txt}\n")
@@ -179,13 +164,16 @@ def test_the_configuration_says_it_all(capture: Path, config: Path, tmp_path: Pa
     assert source.ids == ["0", "1", "3", "5"]
 
 
-def test_an_average_loses_the_bad_capture_and_not_its_group(capture: Path, config: Path) -> None:
-    config.write_text(STEPS + "source: {path: capture, averaged: {num_frames: 4}, skip_refused: true}\n")
+def test_an_average_with_a_bad_capture_is_quarantined_until_that_is_left_out(capture: Path, config: Path) -> None:
+    config.write_text(STEPS + "source: {path: capture, averaged: {num_frames: 3}}\n")
     source = load_config(config).source.open()
     assert isinstance(source, AveragedSource)
-    assert source.group("0") == ["0", "1", "3", "5"]
+    with pytest.raises(PoseError, match=r"all 2 captures failed.*poses/2\.txt"):
+        build_dataset(load_config(config), source, config.parent / "out")
+    source = load_config(config).source.open(skip=["2", "4"])
+    assert source.group("0") == ["0", "1", "3"]
     report = build_dataset(load_config(config), source, config.parent / "out")
-    assert list(report.skipped) == ["2", "4"]
+    assert (report.quarantined, report.skipped) == ({}, {"2": "listed", "4": "listed"})
 
 
 def test_options_of_the_layout_come_from_the_configuration_and_may_not_be_contradicted(
@@ -213,7 +201,7 @@ def test_options_of_the_layout_come_from_the_configuration_and_may_not_be_contra
         ("{kind: foldr}", "did you mean 'folder'"),
         ("{skip: [5]}", "texts in quotes"),
         ("{limit: 0}", "whole number of at least 1"),
-        ("{skip_refused: 3}", "true or false"),
+        ("{skip_refused: true}", "no such setting"),
         ("{averaged: 3, temporal: 3}", "choose one"),
         ("{average: 3}", "did you mean 'averaged'"),
         ("{averaged: {num_frame: 3}}", "2:20.*did you mean 'num_frames'"),
@@ -247,7 +235,7 @@ def test_an_export_of_captures_leaves_out_and_a_built_dataset_refuses_the_flags(
     export = ["export", str(capture), "--to", "ggcnn", "--out", str(tmp_path / "out"), "--skip-refused"]
     main(export)
     assert "left out 2: PoseError" in capsys.readouterr().err
-    assert main(["build", str(config), "--source", str(capture), "--out", str(tmp_path / "a"), "--skip-refused"]) == 0
+    assert main(["build", str(config), "--source", str(capture), "--out", str(tmp_path / "a")]) == 3
     built = ["export", str(tmp_path / "a"), "--to", "dp3", "--out", str(tmp_path / "out2"), "--skip", "1"]
     assert main([*built, "--invalid-values", "65535", "--set", "episodes=x"]) == 2
     assert "--invalid-values, --skip cannot change" in capsys.readouterr().err

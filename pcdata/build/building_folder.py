@@ -1,0 +1,217 @@
+"""The hidden folder that an unfinished build lives in: its plan, its finished shards, and who works on it.
+
+``.NAME.building`` beside ``NAME``::
+
+    plan.json                  which build it is
+    shards/00012-DIGEST/       a finished shard: a store in its folder ``shard``, its signals in another
+    records/00012.json         the commit: written when the shard is on disk under its name
+    claims/WHAT.HOST-PID-...   who works on it, each locked as long as its process lives
+    dataset/                   what becomes NAME
+
+A shard's folder has the digest of its record in its name. So whoever commits the same shard twice, because a process of
+a dead build still runs or because a file system has no locks, does the same work twice and spoils nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pcdata.build.plan import FILE_NAME as PLAN
+from pcdata.build.plan import Plan
+from pcdata.build.records import ShardRecord
+from pcdata.errors import CacheError, write_fault
+from pcdata.files.interrupts import shielded
+from pcdata.files.scratch import Note, claimed, hidden_folder, living_claims, scratch_beside
+from pcdata.files.syncing import sync_folder, sync_tree
+from pcdata.io.store.shards import shard_folder
+
+_SHARDS, _RECORDS, _CLAIMS, _DATASET = "shards", "records", "claims", "dataset"
+SHARD, SIGNALS = "shard", "signals"  # in the folder of a finished shard: what the dataset gets, and what is joined
+
+
+class BuildingFolder:
+    """The folder of the unfinished build of one dataset; holds names alone, so it can be pickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+        self.path = hidden_folder(target, "building")
+        self.dataset = self.path / _DATASET
+
+    # -- who works on it -------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def opened(self, plan: Plan, what: str, *, restart: bool, note: Note) -> Iterator[None]:
+        """Take part in the build as the only one that does ``what``; begin it where there is none.
+
+        At the end, an unfinished build without a finished shard leaves nothing.
+
+        Raises:
+            CacheError: another process does it now, another build is unfinished there, or nothing can be written.
+        """
+        made = [parent for parent in self.path.parents if not parent.exists()]
+        is_mine = False
+        try:
+            try:
+                for part in (_SHARDS, _RECORDS, _CLAIMS):
+                    (self.path / part).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise CacheError(f"{self.target}: cannot write there: {write_fault(error)}") from error
+            with self.claim(what, note):
+                self._settle(plan, what, restart, note)
+                is_mine = True
+                yield
+        finally:
+            with shielded():
+                if is_mine or not (self.path / PLAN).exists():
+                    self._remove_if_empty(plan, made)
+
+    @contextmanager
+    def claim(self, what: str, note: Note) -> Iterator[None]:
+        """Be the only process that does ``what`` here.
+
+        Raises:
+            CacheError: another process does; says which.
+        """
+        with claimed(self.path / _CLAIMS / what, note) as other:
+            if other is not None:
+                raise CacheError(
+                    f"{self.target}: another process writes it now (see {other}); wait until that ends, choose another "
+                    "folder, or share the work: --num-shards N --shard-index K"
+                )
+            yield
+
+    def _settle(self, plan: Plan, what: str, restart: bool, note: Note) -> None:
+        """Make the folder that of this plan."""
+        try:
+            different = plan.differences(self.path)
+        except CacheError:
+            different = ["plan.json, which is damaged"]
+        records = self._num_kept()
+        if different == [] and not restart:
+            return
+        if different is not None:
+            others = [one for one in living_claims(self.path / _CLAIMS) if not one.name.startswith(f"{what}.")]
+            if others:
+                raise CacheError(f"{self.target}: other processes build it now with other settings (see {others[0]})")
+            if different and records and not restart:
+                raise CacheError(
+                    f"{self.target}: an unfinished build with {records} finished shards is there ({self.path}), which "
+                    f"differs in its {', '.join(different)}; finish it with its own settings, choose another folder, "
+                    "or start over, which deletes it: --restart"
+                )
+            self._empty()
+            if records:
+                note(f"deleted the {records} finished shards of an unfinished build of {self.target}")
+        plan.write(self.path)
+
+    def _num_kept(self) -> int:
+        """Return how many shards are finished and still here."""
+        names = {place.name[:5] for folder in (self.path, self.dataset) for place in (folder / _SHARDS).glob("[0-9]*")}
+        return len(names & {place.name[:5] for place in (self.path / _RECORDS).glob("[0-9]*")})
+
+    def _empty(self) -> None:
+        with suppress(FileNotFoundError):
+            os.unlink(self.path / PLAN)
+        for part in (_RECORDS, _SHARDS, _DATASET):
+            shutil.rmtree(self.path / part, ignore_errors=True)
+        for part in (_SHARDS, _RECORDS):
+            (self.path / part).mkdir(exist_ok=True)
+
+    def _remove_if_empty(self, plan: Plan, made: list[Path]) -> None:
+        if any(record.samples for record in self.finished(plan).values()) or living_claims(self.path / _CLAIMS):
+            return
+        self.remove()
+        with suppress(OSError):  # not empty: somebody else uses it
+            for parent in made:
+                parent.rmdir()
+
+    def remove(self) -> None:
+        """Delete the folder; the plan goes last, so that what is left of a removal is known."""
+        for part in (_RECORDS, _SHARDS, _DATASET, _CLAIMS):
+            shutil.rmtree(self.path / part, ignore_errors=True)
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    # -- shards ----------------------------------------------------------------------------------------------------
+
+    def finished(self, plan: Plan) -> dict[int, ShardRecord]:
+        """Return the valid records by shard; what a record does not fit is worked on again."""
+        found: dict[int, ShardRecord] = {}
+        try:
+            names = sorted(os.listdir(self.path / _RECORDS))
+        except OSError:  # the last process has put it into place
+            return found
+        for name in names:
+            number, _, suffix = name.partition(".")
+            if suffix != "json" or not number.isdecimal() or int(number) >= plan.num_shards:
+                continue
+            with suppress(CacheError):
+                record = ShardRecord.read(self._record_path(int(number)), plan, int(number))
+                if self.place_of(record) is not None:
+                    found[int(number)] = record
+        return found
+
+    def forget(self, shard: int) -> None:
+        """Take the record of a shard back: it is to be done again."""
+        self._record_path(shard).unlink(missing_ok=True)
+
+    def is_finished(self, plan: Plan, shard: int) -> bool:
+        """Say whether a shard has a record and its files; it does not ask whether its captures are still the same."""
+        with suppress(CacheError):
+            return self.place_of(ShardRecord.read(self._record_path(shard), plan, shard)) is not None
+        return False
+
+    def _record_path(self, shard: int) -> Path:
+        return self.path / _RECORDS / f"{shard:05d}.json"
+
+    def place_of(self, record: ShardRecord) -> Path | None:
+        """Return where the store of a shard is: among the shards, or in the dataset already; None = not whole."""
+        for place in (self.work_place(record) / SHARD, shard_folder(self.dataset, record.shard)):
+            if record.is_whole(place):
+                return place
+        return None
+
+    def work_place(self, record: ShardRecord) -> Path:
+        """Return the folder that a finished shard was given."""
+        return self.path / _SHARDS / record.folder_name
+
+    @contextmanager
+    def shard_scratch(self, shard: int) -> Iterator[Path]:
+        """Give an empty folder to write a shard in, which :meth:`commit` takes; what is not committed is removed."""
+        with scratch_beside(self.path / _SHARDS / f"{shard:05d}") as scratch:
+            yield scratch
+
+    def sizes_on_disk(self, folder: Path) -> dict[str, int]:
+        """Force a written store to disk and return the size of every file.
+
+        Raises:
+            CacheError: the disk is full.
+        """
+        try:
+            return sync_tree(folder)
+        except OSError as error:
+            raise CacheError(f"{self.target}: cannot be written: {write_fault(error)}") from error
+
+    def commit(self, scratch: Path, record: ShardRecord) -> None:
+        """Give a shard that is on disk its name, then write its record.
+
+        Raises:
+            CacheError: they cannot be written.
+        """
+        place = self.work_place(record)
+        try:
+            with shielded():
+                try:
+                    os.rename(scratch, place)
+                except OSError:
+                    if not place.is_dir():  # else it was made meanwhile, with the same content
+                        raise
+                sync_folder(place.parent)
+                record.write(self._record_path(record.shard))
+        except OSError as error:
+            if isinstance(error, CacheError):
+                raise
+            raise CacheError(f"{self.target}: cannot be written: {write_fault(error)}") from error

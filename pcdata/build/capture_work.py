@@ -1,0 +1,98 @@
+"""What a build does with one capture: load it, run the deterministic steps, make the record that is stored."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pcdata.build.config import BuildConfig
+from pcdata.build.records import BuiltSample
+from pcdata.errors import CacheError, CaptureError, ConfigError, WriteError
+from pcdata.files.inputs import Inputs, recording
+from pcdata.io.sources.capture_source import CaptureSource
+from pcdata.io.store.cloud_record import Record, record_from_cloud
+from pcdata.io.writers.capture_folder import write_capture
+from pcdata.structures import DepthFrame, PointCloud, Signal
+from pcdata.transforms import Compose
+
+
+@dataclass(frozen=True)
+class Made:
+    """One capture, ready to be stored."""
+
+    capture: DepthFrame | PointCloud
+    record: Record
+    signals: Mapping[str, Signal]
+    sample: BuiltSample
+
+
+class CaptureWork:
+    """The work on every capture of a build; pickled to workers."""
+
+    def __init__(self, config: BuildConfig, source: CaptureSource) -> None:
+        self.prefix: Compose = config.pipeline.split()[0]
+        self.keep_raw = config.output.keep_raw
+        self.source = source
+
+    def make(self, sample_id: str, inputs: Inputs) -> Made:
+        """Load and process one capture.
+
+        Raises:
+            Exception: whatever a source, a step or the store has against it.
+        """
+        started = time.perf_counter()
+        with recording(inputs):
+            capture = self.source.load(sample_id)
+        if self.keep_raw and not isinstance(capture, DepthFrame):
+            raise CaptureError("output.keep_raw is on, but this source gives clouds: there is no depth image to keep")
+        cloud = self.prefix(capture)
+        if not isinstance(cloud, PointCloud):
+            raise ConfigError(
+                f"the pipeline gives a {type(cloud).__name__}, not a cloud to store; end depth in Deproject"
+            )
+        cloud = cloud.with_meta([{"sample_id": sample_id}] * cloud.num_clouds)
+        record = record_from_cloud(cloud)
+        sample = BuiltSample(
+            sample_id,
+            "depth" if isinstance(capture, DepthFrame) else "cloud",
+            _counts(cloud),
+            time.perf_counter() - started,
+            cloud.num_points,
+            record.digest(),
+        )
+        return Made(capture, record, _one_each(cloud), sample)
+
+
+def keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:
+    """Write a capture beside its cloud.
+
+    Raises:
+        CacheError: it cannot be written.
+    """
+    assert isinstance(capture, DepthFrame)  # CaptureWork refuses others
+    try:
+        write_capture(capture, folder)
+    except WriteError as error:
+        raise CacheError(str(error)) from error
+
+
+def _one_each(cloud: PointCloud) -> Mapping[str, Signal]:
+    """Return the signals of a sample: those of its clouds, where they are the same, as of views of one moment."""
+    found = {}
+    for name, signal in cloud.recorded_signals.items():
+        rows = [signal.rows(slice(b, b + 1)) for b in range(cloud.num_clouds)]
+        found[name] = rows[0] if all(row.same_bits(rows[0]) for row in rows) else signal
+    return found
+
+
+def _counts(cloud: PointCloud) -> list[tuple[str, int]]:
+    """Return the points after every step, over all clouds."""
+    counts: dict[int, tuple[str, int]] = {}
+    for history in cloud.history:
+        for position, step in enumerate(history):
+            if "points" in step:
+                before = counts.get(position, (step["step"], 0))[1]
+                counts[position] = (step["step"], before + step["points"])
+    return [counts[position] for position in sorted(counts)]

@@ -1,0 +1,258 @@
+"""A pool of spawned processes: what ends or blocks one costs one capture, not the build.
+
+Every worker has a pipe of its own to this process and shares no lock with others, so one that is killed at any moment
+leaves nothing behind that the rest waits for. Workers end by themselves when this process is gone.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection, wait
+
+import torch
+
+from pcdata.build.records import ShardRecord
+from pcdata.build.schedule import Schedule, Task
+from pcdata.build.shard_work import Job
+from pcdata.build.tally import Tally, told_error
+from pcdata.errors import CacheError, ConfigError, PcdataError, add_note
+from pcdata.files.interrupts import deaf_children, shielded
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+START = "spawn"  # how workers are started: a fork copies the locks of threads that it does not have
+_GRACE = 5.0  # seconds that workers have to end by themselves when the work is done
+
+
+def work_in_pool(job: Job, shards: Iterable[int], tally: Tally, *, workers: int, timeout: float | None) -> None:
+    """Do the shards in so many processes.
+
+    Args:
+        job: what is done.
+        shards: those to be done.
+        tally: told of every capture.
+        workers: how many processes; each uses one thread.
+        timeout: seconds that one capture may take; None = any time.
+
+    Raises:
+        ConfigError: the source or a step cannot be sent to another process.
+        PcdataError: the build must stop; what is committed stays.
+    """
+    todo = list(shards)
+    schedule = Schedule(todo)
+    pool: list[_Worker] = []
+    try:
+        while True:
+            _hand_out(job, schedule, pool, min(workers, len(todo)), tally)
+            busy = [worker for worker in pool if worker.task is not None]
+            if not busy:
+                break
+            ready = wait([worker.pipe for worker in busy], _time_left(busy, timeout))
+            for worker in busy:
+                if worker.pipe in ready:
+                    _hear(worker, schedule, tally)
+                elif timeout is not None and worker.sample_id is not None and time.monotonic() - worker.since > timeout:
+                    worker.end()
+                    what = f"TimeoutError: took longer than {timeout:g} s"
+                    schedule.ended(worker.taken(), worker.sample_id, what, was_killed=False)
+            pool[:] = [worker for worker in pool if worker.is_alive]
+        for worker in pool:
+            worker.dismiss()
+    finally:
+        with shielded():
+            for worker in pool:
+                worker.end()
+
+
+def _time_left(busy: Iterable[_Worker], timeout: float | None) -> float | None:
+    """Return the seconds until the first capture will have taken too long."""
+    begun = [worker.since for worker in busy if worker.sample_id is not None]
+    return None if timeout is None or not begun else max(min(begun) + timeout - time.monotonic(), 0.0)
+
+
+def _hand_out(job: Job, schedule: Schedule, pool: list[_Worker], most: int, tally: Tally) -> None:
+    """Give every idle worker a task, and start workers while there are more."""
+    while (running := sum(worker.task is not None for worker in pool)) < most:
+        task = schedule.next(running)
+        if task is None:
+            return
+        if task.sample_id is None and not task.given_up and job.folder.is_finished(job.plan, task.shard):
+            continue  # by another process, meanwhile
+        worker = next((one for one in pool if one.task is None), None)
+        if worker is None:
+            worker = _Worker(job)
+            pool.append(worker)
+        worker.give(task)
+
+
+def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
+    """Take what a worker tells, or find that it has ended."""
+    try:
+        kind, *told = worker.pipe.recv()
+    except (EOFError, OSError):
+        _bury(worker, schedule)
+        return
+    worker.since = time.monotonic()
+    if kind == "ready":
+        worker.is_ready = True
+    elif kind == "begins":
+        (worker.sample_id,) = told
+    elif kind == "ends":
+        worker.sample_id = None
+        assert worker.task is not None
+        tally.captured(worker.task.shard, *told)
+    elif kind == "tried":
+        schedule.tried(worker.taken(), *told)
+    elif kind == "committed":
+        worker.taken()
+        tally.committed(ShardRecord.from_text(*told))
+    else:
+        reason, message, notes = told
+        error = told_error(reason, message)
+        for note in notes:
+            add_note(error, note)
+        raise error
+
+
+def _bury(worker: _Worker, schedule: Schedule) -> None:
+    worker.end()
+    code = worker.process.exitcode or 0
+    if not worker.is_ready:
+        raise CacheError(
+            f"build_dataset: a worker process could not start (exit code {code}; what it said is above). A script "
+            'needs `if __name__ == "__main__":` around its call, since workers import it; workers=0 starts none'
+        )
+    what = _signal_name(-code) if code < 0 else f"exit code {code}"
+    schedule.ended(worker.taken(), worker.sample_id, f"ProcessEnded: its process ended by {what}", was_killed=code < 0)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+class _Worker:
+    """One process of the pool, and what it does now."""
+
+    def __init__(self, job: Job) -> None:
+        context = multiprocessing.get_context(START)
+        self.pipe, far_end = context.Pipe()
+        self.process = context.Process(target=_serve, args=(far_end, job), name="pcdata-build", daemon=True)
+        self.task: Task | None = None
+        self.sample_id: str | None = None  # the capture that it works on
+        self.since = time.monotonic()
+        self.is_ready = False
+        self.is_alive = True
+        try:
+            with _one_thread_each(), deaf_children():
+                self.process.start()
+        except (TypeError, AttributeError, ValueError, pickle.PicklingError) as error:  # as pickling raises them
+            raise ConfigError(
+                f"build_dataset: the source and the steps must be sent to worker processes, and cannot: {error}; "
+                "workers=0 builds in this process"
+            ) from error
+        finally:
+            far_end.close()
+
+    def give(self, task: Task) -> None:
+        """Let it begin with a task."""
+        self.task, self.sample_id, self.since = task, None, time.monotonic()
+        with suppress(OSError):  # it has ended: found when it is listened to
+            self.pipe.send(task)
+
+    def taken(self) -> Task:
+        """Return the task that is done."""
+        task, self.task = self.task, None
+        assert task is not None
+        return task
+
+    def dismiss(self) -> None:
+        """Let it end by itself."""
+        with suppress(OSError):
+            self.pipe.send(None)
+        self.process.join(_GRACE)
+
+    def end(self) -> None:
+        """End it, at once."""
+        self.is_alive = False
+        if self.process.is_alive():
+            self.process.kill()
+        self.process.join(_GRACE)  # one that waits for a disk that is away ends later
+        self.pipe.close()
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that are started in the block use one thread each: libraries read these when they are loaded."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+# -- in the worker -----------------------------------------------------------------------------------------------------
+
+
+class _Teller:
+    """Tells the parent of every capture."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self.pipe = pipe
+
+    def begins(self, sample_id: str) -> None:
+        self.pipe.send(("begins", sample_id))
+
+    def ends(self, sample_id: str, error: str | None) -> None:
+        self.pipe.send(("ends", sample_id, error))
+
+
+def _serve(pipe: Connection, job: Job) -> None:
+    """Do tasks until there are no more."""
+    _end_with_parent()
+    torch.set_num_threads(1)
+    teller = _Teller(pipe)
+    pipe.send(("ready",))
+    while True:
+        try:
+            task: Task | None = pipe.recv()
+        except EOFError:
+            return
+        if task is None:
+            return
+        try:
+            if task.sample_id is None:
+                pipe.send(("committed", job.do(task.shard, task.given_up, teller).to_text()))
+            else:
+                pipe.send(("tried", job.try_alone(task.sample_id, teller)))
+        except BrokenPipeError:
+            return
+        except Exception as error:
+            kind = type(error).__name__
+            message = str(error) if isinstance(error, PcdataError) else f"{kind}: {error}"
+            pipe.send(("stops", kind, message, [str(note) for note in getattr(error, "__notes__", [])]))
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, whatever it is doing."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,167 @@
+"""The end of a build: its shards become one dataset, which appears under its name at once.
+
+Every step may be done again after a kill: shards are moved one by one, everything else is written anew.
+"""
+
+from __future__ import annotations
+
+import platform
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import pcdata
+from pcdata.build.config import BuildConfig
+from pcdata.build.loading_script import loading_script
+from pcdata.build.records import ShardRecord
+from pcdata.build.shard_work import Job, signals_of_shard
+from pcdata.build.source_state import captures_digest
+from pcdata.datasets.collate import COLLATES
+from pcdata.errors import CacheError, CaptureError, DTypeError, FrameError, ShapeError, write_fault
+from pcdata.files.syncing import sync_file, sync_folder
+from pcdata.imports import ImportedFile, imported_files, step_names
+from pcdata.io.sources.capture_source import CaptureSource, episodes_of, kinds_of, skipped_of, streams_of
+from pcdata.io.store.cloud_record import record_from_signals
+from pcdata.io.store.manifest import Manifest
+from pcdata.io.store.sample_index import Sample
+from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.shards import FOLDER, SIGNALS_FOLDER, SIGNALS_KEY, shard_folder
+from pcdata.io.store.stores import STORES
+from pcdata.structures import Episode, Signal
+from pcdata.structures.episodes import kept_episodes
+from pcdata.structures.signal_joining import stacked_signals
+
+
+def complete_dataset(config: BuildConfig, source: CaptureSource, job: Job, records: Mapping[int, ShardRecord]) -> Path:
+    """Make the dataset of a build whose shards are all finished, in its hidden folder, and return that.
+
+    Raises:
+        CacheError: it cannot be written.
+        CaptureError: the captures changed since they were read.
+    """
+    ordered = [records[shard] for shard in range(job.plan.num_shards)]
+    _check_captures(source, job, ordered)
+    dataset = job.folder.dataset
+    try:
+        _gather(job, ordered)
+        samples = [
+            Sample(one.id, key_of(one.id), one.num_points, one.digest, record.shard)
+            for record in ordered
+            for one in record.samples
+        ]
+        signals = _write_signals(config, job, ordered)
+        loading, imports = _imports(config, source)
+        manifest = Manifest(
+            format=config.output.format,
+            compression=config.output.compression,
+            fingerprint=config.pipeline.stored_fingerprint(),
+            pipeline=config.pipeline.sections(),
+            samples=samples,
+            keep_raw=config.output.keep_raw,
+            shard_size=config.output.shard_size,
+            episodes=tuple(_episodes(source, samples)),
+            signals=signals,
+            skipped=skipped_of(source),
+            quarantined={name: why for record in ordered for name, why in record.quarantined.items()},
+            streams=tuple(streams_of(source)),
+            model=_model_of(config),
+            source={name: value for name, value in getattr(source, "opened", {}).items() if name != "skip_refused"},
+            imports=[file.to_json() for file in imports],
+            versions={
+                "pcdata": pcdata.__version__,
+                "torch": str(torch.__version__),
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+        )
+        script = loading_script(config.loader, config.model, [file.name for file in loading])
+        for name, text in (("pipeline.yaml", config.pipeline.to_yaml()), ("load.py", script)):
+            (dataset / name).write_text(text, encoding="utf-8")
+            sync_file(dataset / name)
+        manifest.write(dataset)
+        for folder in (dataset / FOLDER, dataset):
+            sync_folder(folder)
+    except OSError as error:
+        raise CacheError(f"{job.folder.target}: cannot be written: {write_fault(error)}") from error
+    return dataset
+
+
+def _check_captures(source: CaptureSource, job: Job, records: Sequence[ShardRecord]) -> None:
+    for record in records:
+        ids = job.plan.ids_of(record.shard)
+        if captures_digest(source, ids) != record.captures:
+            raise CaptureError(
+                f"build_dataset: a file of the captures {ids[0]!r} to {ids[-1]!r} was changed after it was read, so "
+                "the dataset would mix two states of them; let them rest and start again: only these are built anew"
+            )
+
+
+def _gather(job: Job, records: Sequence[ShardRecord]) -> None:
+    """Move the shards into the dataset, and remove whatever else is there."""
+    dataset = job.folder.dataset
+    (dataset / FOLDER).mkdir(parents=True, exist_ok=True)
+    for record in records:
+        place, final = job.folder.place_of(record), shard_folder(dataset, record.shard)
+        if place is None:
+            raise CacheError(f"{job.folder.target}: shard {record.shard} is gone; start again: only it is built anew")
+        if place != final:
+            shutil.rmtree(final, ignore_errors=True)
+            place.rename(final)
+    wanted = {dataset / FOLDER, *(shard_folder(dataset, record.shard) for record in records)}
+    for path in [*dataset.iterdir(), *(dataset / FOLDER).iterdir()]:
+        if path not in wanted:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _write_signals(config: BuildConfig, job: Job, records: Sequence[ShardRecord]) -> dict[str, str]:
+    """Keep the signals of all samples side by side, so that nobody has to load clouds for them."""
+    if not any(record.signals for record in records):
+        return {}
+    faults = [record.signals["fault"] for record in records if "fault" in record.signals]
+    if faults:
+        return {"fault": faults[0]}
+    ids = [sample.id for record in records for sample in record.samples]
+    try:
+        together = record_from_signals(stacked_signals("signals", ids, _signals(job, records)))
+    except (ShapeError, FrameError, DTypeError) as error:
+        return {"fault": str(error)}
+    store = STORES[config.output.format](job.folder.dataset / SIGNALS_FOLDER, config.output.compression)
+    try:
+        store.write(SIGNALS_KEY, together)
+    finally:
+        store.close()
+    return {"digest": together.digest()}
+
+
+def _signals(job: Job, records: Sequence[ShardRecord]) -> Iterator[Mapping[str, Signal]]:
+    for record in records:
+        yield from signals_of_shard(job, job.folder.work_place(record), record)
+
+
+def _imports(config: BuildConfig, source: CaptureSource) -> tuple[list[ImportedFile], list[ImportedFile]]:
+    """Return the files of one's own that loading the dataset needs, and those that building it needed."""
+    sections = config.pipeline.sections()
+    steps = {name for file in imported_files() for name in file.transforms}
+    steps &= step_names(sections) if steps else set()
+    kinds = {*kinds_of(source)}
+    # What loads the dataset must know where its steps, its store and its batches are at home.
+    modules = {STORES[config.output.format].__module__, COLLATES[config.loader.collate].__module__}
+    loading = [file for file in imported_files() if steps & {*file.transforms} or file.module in modules]
+    built = [file for file in imported_files() if file in loading or kinds & {*file.layouts, *file.combinators}]
+    return loading, built
+
+
+def _episodes(source: CaptureSource, samples: Sequence[Sample]) -> list[Episode]:
+    written = {sample.id for sample in samples}
+    places = [place for place, sample_id in enumerate(source.ids) if sample_id in written]
+    return kept_episodes(episodes_of(source), places)
+
+
+def _model_of(config: BuildConfig) -> dict[str, Any]:
+    if config.model is None:
+        return {}
+    return {"name": config.model.contract.name, "choices": config.model.plain_choices()}

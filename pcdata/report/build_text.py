@@ -1,0 +1,55 @@
+"""Builds in words: what one did, and what one would do."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from statistics import median
+
+from pcdata.build import BuildConfig, BuildReport, outlook
+from pcdata.io.sources.capture_source import CaptureSource
+from pcdata.report.inspection_text import left_out_texts, size_in_words
+from pcdata.report.plain_table import text_table
+
+
+def build_text(report: BuildReport) -> str:
+    """Tell how many points every step left, over all captures of a build."""
+    rows: list[list[object]] = []
+    chains: dict[tuple[str, ...], list[list[int]]] = {}
+    for sample in report.samples:
+        names = tuple(name for name, _ in sample.counts)
+        chains.setdefault(names, []).append([count for _, count in sample.counts])
+    for names, counts in chains.items():
+        for position, name in enumerate(names):
+            left = [sample[position] for sample in counts]
+            rows.append([name, min(left), round(median(left)), max(left)])
+    seconds = sum(sample.seconds for sample in report.samples)
+    as_clouds = sum(sample.entered_at == "cloud" for sample in report.samples)
+    head = f"{len(report.samples)} samples in {seconds:.1f} s"
+    if as_clouds:
+        head += f"; {as_clouds} captures were clouds already and entered at the first step that takes one"
+    if report.num_finished < report.num_shards:
+        head += f"; {report.num_finished} of {report.num_shards} shards are finished, the rest is others' work"
+    tables = [head, text_table(["points after", "fewest", "median", "most"], rows)] if rows else [head]
+    return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
+
+
+def plan_text(config: BuildConfig, source: CaptureSource, folder: str | os.PathLike[str]) -> str:
+    """Tell what a build would do, how large the result may become, and what of it is finished."""
+    plan = outlook(config, source, folder)
+    left = plan.num_shards - plan.num_finished
+    rows = [
+        ["captures", f"{plan.num_samples:,} in {plan.num_shards:,} shards of {plan.shard_size:,}"],
+        ["read", "unknown" if plan.bytes_to_read is None else size_in_words(plan.bytes_to_read)],
+        ["format", f"{config.output.format}, compression {config.output.compression}"],
+        ["steps", ", ".join(type(step).__name__ for step in config.pipeline.split()[0].steps) or "none"],
+        ["identity", plan.identity[:16]],
+        ["finished", f"{plan.num_finished:,} shards, {size_in_words(plan.bytes_finished)}"],
+        ["to do", f"{left:,} shards"],
+    ]
+    if plan.num_finished:
+        rows.append(["about", f"{size_in_words(plan.bytes_finished / plan.num_finished * plan.num_shards)} in the end"])
+    if plan.quarantined:
+        rows.append(["quarantined", f"{len(plan.quarantined)} so far"])
+    rows += [["in the way", text] for text in plan.hindrances]
+    return text_table(["build", str(Path(folder))], rows)
