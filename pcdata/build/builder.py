@@ -113,7 +113,7 @@ def build_dataset(
         if note is not None:
             note(text)
 
-    what = "finish" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
+    what = "finalize" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
     with building.opened(plan, what, restart=restart, note=tell):
         replaced = prepared(folder, overwrite, check_only_dataset, tell) if part is None else None
         shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])

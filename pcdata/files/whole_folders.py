@@ -88,9 +88,12 @@ def prepared(folder: Path, overwrite: bool, owned: Owned, note: Note) -> object:
 def is_free(folder: Path) -> bool:
     """Say whether nothing is under a name, or an empty folder."""
     try:
-        return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
-    except OSError as error:
-        raise CacheError(f"{folder}: cannot be examined: {error}") from error
+        os.lstat(folder)
+        return folder.is_dir() and not os.listdir(folder)
+    except FileNotFoundError:
+        return True
+    except OSError as error:  # a name that is too long, a file where a folder is to be
+        raise CacheError(f"{folder}: cannot be written there: {write_fault(error)}") from error
 
 
 def restore_retired(folder: Path, owned: Owned, note: Note) -> None:
