@@ -27,8 +27,8 @@ from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episode
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
 
-Engine = Literal["pool", "ray"]
-ENGINES: tuple[Engine, ...] = ("pool", "ray")
+Engine = Literal["pool"]
+ENGINES: tuple[Engine, ...] = ("pool",)
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,8 @@ def build_dataset(
             _tell_kept(error, building, plan)
             raise
         done = building.finished(plan)
+        if part is None and len(done) < plan.num_shards:
+            raise CacheError(f"{folder}: shards that were finished are gone or damaged; start again to build them anew")
         is_complete = len(done) == plan.num_shards and _finish(
             config, source, job, done, part, replaced, overwrite=overwrite, note=tell
         )
@@ -137,11 +139,7 @@ def build_dataset(
 def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:
     if not shards:
         return
-    if engine == "ray":
-        from pcdata.build.engines.on_ray import work_on_ray
-
-        work_on_ray(job, shards, tally, tasks=workers, timeout=timeout)
-    elif workers:
+    if workers:
         from pcdata.build.engines.pool import work_in_pool
 
         work_in_pool(job, shards, tally, workers=workers, timeout=timeout)

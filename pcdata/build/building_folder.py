@@ -207,8 +207,11 @@ class BuildingFolder:
                 try:
                     os.rename(scratch, place)
                 except OSError:
-                    if not place.is_dir():  # else it was made meanwhile, with the same content
+                    if not place.is_dir():
                         raise
+                    if not record.is_whole(place / SHARD):  # else it was made meanwhile, with the same content
+                        shutil.rmtree(place)
+                        os.rename(scratch, place)
                 sync_folder(place.parent)
                 record.write(self._record_path(record.shard))
         except OSError as error:

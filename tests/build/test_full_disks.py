@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 
@@ -96,6 +97,7 @@ def small_disk(tmp_path):
     if mounted.returncode:
         pytest.skip(f"nothing can be mounted here: {mounted.stderr.decode(errors='replace').strip()}")
     yield place
+    gc.collect()  # what an error's traceback held of a dataset, such as its index, is mapped until then
     subprocess.run(["umount", str(place)], check=True)
 
 

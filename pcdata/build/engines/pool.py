@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
+from typing import Any
 
 import torch
 
@@ -143,7 +144,7 @@ class _Worker:
     """One process of the pool, and what it does now."""
 
     def __init__(self, job: Job) -> None:
-        context = multiprocessing.get_context(START)
+        context: Any = multiprocessing.get_context(START)
         self.pipe, far_end = context.Pipe()
         self.process = context.Process(target=_serve, args=(far_end, job), name="pcdata-build", daemon=True)
         self.task: Task | None = None
