@@ -36,9 +36,9 @@ ALLOWED = {
     "files/locks.py": {"os.open": "to lock it"},
     "files/part_files.py": {"os.open": "to write"},
     "files/scratch.py": {"Path(f'/proc/{pid}/stat').read_bytes": "of the system, not of a user"},
-    "files/whole_folders.py": {"os.open": "a folder, to force it to disk"},
+    "files/syncing.py": {"os.open": "to force it to disk"},
     "kernels/core/write_signatures.py": {"HEADER.read_text": "a source of the package, by who builds it"},
-    "cli/datasets.py": {"config.source.open": "a capture, not a file"},
+    "cli/build.py": {"config.source.open": "a capture, not a file"},
 }
 
 

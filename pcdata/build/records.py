@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -14,7 +13,7 @@ from pcdata.build.source_state import digest_of
 from pcdata.errors import CacheError
 from pcdata.files.opening import read_bytes
 from pcdata.files.strict_json import json_object
-from pcdata.io.store.shards import TABLE
+from pcdata.io.store.shards import TABLE, hash_of
 
 SCHEMA = "pcdata.shard/1"
 _MAX_BYTES = 1 << 30
@@ -93,11 +92,10 @@ class ShardRecord:
     def is_whole(self, folder: Path) -> bool:
         """Say whether the files of the record lie in a folder: their list by its content, they by their sizes."""
         try:
-            table = hashlib.sha256((folder / TABLE).read_bytes()).hexdigest()
-            return table == self.table and all(
+            return hash_of(folder / TABLE)[1] == self.table and all(
                 (folder / name).stat().st_size == size for name, size in self.files.items()
             )
-        except OSError:
+        except (OSError, CacheError):
             return False
 
     def to_text(self) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pcdata import errors
 from pcdata.build.plan import Plan
 from pcdata.build.records import ShardRecord
-from pcdata.errors import CaptureError, ConfigError, PcdataError
+from pcdata.errors import CaptureError, ConfigError, PcdataError, locate
 from pcdata.progress import Progress
 
 _FIRST = 8  # captures: where all of them fail, the configuration is at fault
@@ -107,11 +107,14 @@ def all_failed(failed: Mapping[str, str], num_samples: int) -> PcdataError:
     """Return the error of a build of which nothing comes: of the type that the first capture raised."""
     sample_id, reason = next(iter(failed.items()))
     which = f"all of the first {len(failed)}" if len(failed) < num_samples else f"all {num_samples}"
-    return told_error(
+    error = told_error(
         reason,
         f"build_dataset: {which} captures failed, so the configuration or the source is at fault and nothing can "
         f"be stored; {sample_id!r}: {reason}",
     )
+    step = re.match(r"\w+ in (\w+)", reason)  # as shard_work.error_in_words writes it
+    locate(error, step=step[1] if step else None, sample_id=sample_id)
+    return error
 
 
 def told_error(reason: str, message: str) -> PcdataError:
