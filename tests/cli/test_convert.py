@@ -55,6 +55,13 @@ def test_a_dry_run_tells_what_would_be_written_and_writes_nothing(capture, tmp_p
     assert "exists already" in capsys.readouterr().err
 
 
+def test_which_sensor_took_a_capture_is_written_and_read_back(tmp_path):
+    said = {"sensor_name": "Intel RealSense D435", "serial": "0123", "registered_to": "color"}
+    convert(made_captures(6, provenance=said), "folder", tmp_path / "out")
+    source = open_source(tmp_path / "out")
+    assert said.items() <= source.load(source.ids[0]).provenance.items()
+
+
 def test_captures_of_clouds_among_depth_images_are_named_with_how_to_leave_them_out(tmp_path):
     made = made_captures(6)
     made.frames["004"] = PointCloud(points=torch.rand(9, 3), frame_id="camera")

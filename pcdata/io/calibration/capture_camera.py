@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ _STATED = {  # key: attribute of CaptureCamera; what a capture may say of itself
     "folders": "folders",
 }
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
+REMARKS_OF = {"sensor_name": "sensor", "serial": "serial", "registered_to": "registered_to"}  # by key of provenance
 _DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
     "depth_scale": "depth_scale has three incompatible meanings; write metres_per_unit (0.001 for millimetres)",
@@ -61,6 +62,7 @@ class CaptureCamera:
     calibration: str | None = None  # a calibration file beside it, whose camera counts instead; None = not said
     camera_name: str | None = None  # which camera of that calibration; None = the only one
     folders: Mapping[str, str | None] | None = None  # names of the folders by role, where they are not the usual ones
+    remarks: Mapping[str, str] = field(default_factory=dict)  # free text: sensor, serial, registered_to, notes, date
 
 
 @locates_path
@@ -145,6 +147,7 @@ def capture_camera_of(where: str, data: dict[str, Any]) -> CaptureCamera:
         calibration=calibration,
         camera_name=camera_name,
         folders=folders,
+        remarks={key: data[key] for key in _REMARKS if isinstance(data.get(key), str) and data[key]},
     )
 
 
@@ -167,6 +170,7 @@ def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamer
     if camera.distortion is not None:
         data["distortion"] = camera.distortion[0].tolist()
     data |= {key: value for key, name in _STATED.items() if (value := getattr(calibration, name)) is not None}
+    data |= {key: calibration.remarks[key] for key in _REMARKS if key in calibration.remarks}
     with replacing(where, path) as temporary:
         temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 

@@ -15,7 +15,7 @@ from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, positions
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.io.arrays.signal_files import read_signals
-from pcdata.io.calibration.capture_camera import read_camera, read_capture_camera
+from pcdata.io.calibration.capture_camera import REMARKS_OF, read_camera, read_capture_camera
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.folder_roles import ROLES, role_folders
 from pcdata.io.sources.frame_files import make_frame
@@ -104,6 +104,7 @@ class FolderSource(Source):
         allowed = [path, *link_targets(links_to)]
         check_inside(str(path), present[0], allowed)
         stated = read_capture_camera(present[0])
+        self._remarks = {key: stated.remarks[remark] for key, remark in REMARKS_OF.items() if remark in stated.remarks}
         self.metres_per_unit = one_unit(present[0], stated.metres_per_unit, metres_per_unit)
         encoding = one_value(present[0], "depth_encoding", stated.depth_encoding, depth_encoding, error=UnitError)
         self.depth_encoding = check_depth_encoding(str(present[0]), encoding or "plain")
@@ -193,6 +194,7 @@ class FolderSource(Source):
                 "metres_per_unit": self.metres_per_unit,
                 **({} if self.depth_encoding == "plain" else {"depth_encoding": self.depth_encoding}),
                 **self._calibrated,
+                **self._remarks,
                 **({"timestamps": [self.timestamps[sample_id]]} if self.timestamps else {}),
             },
             background_label=self.background_label,

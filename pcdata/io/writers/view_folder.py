@@ -14,7 +14,7 @@ from pcdata.errors import CaptureError
 from pcdata.files.npy import write_npy
 from pcdata.functional.depth.stored_depth import metres_of_value
 from pcdata.io.arrays.signal_files import write_signals
-from pcdata.io.calibration.capture_camera import CaptureCamera, write_capture_camera, write_pose
+from pcdata.io.calibration.capture_camera import REMARKS_OF, CaptureCamera, write_capture_camera, write_pose
 from pcdata.io.images.confidence import write_confidence
 from pcdata.io.images.reading import read_labels, read_raw_depth
 from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
@@ -48,6 +48,7 @@ class ViewFolder:
         self._labels_used: set[int] = set()
         self._camera: Camera | None = None  # of the first capture
         self._frame_id: str | None = None
+        self._remarks: dict[str, str] = {}
 
     def add(self, name: str, frame: DepthFrame, view: int) -> None:
         """Write one view of a capture under a name.
@@ -80,6 +81,7 @@ class ViewFolder:
             metres_per_unit=self._unit or 1.0,
             frame_id=self._frame_id,
             background_label=self._background,
+            remarks=self._remarks,
         )
         write_capture_camera(self.folder / "intrinsics.json", calibration)
         if times:
@@ -89,6 +91,9 @@ class ViewFolder:
         self._roles, self._frame_id = roles, frame.frame_id
         unit = frame.provenance.get("metres_per_unit")
         self._unit = unit if isinstance(unit, float) and 0 < unit < 1 else None
+        if frame.num_views == 1:  # of several views nobody knows which camera is meant
+            said = {remark: frame.provenance.get(key) for key, remark in REMARKS_OF.items()}
+            self._remarks = {remark: text for remark, text in said.items() if isinstance(text, str) and text}
         for folder in ("depth", *("labels" if role == "labels" else _ROLES[role][0] for role in roles)):
             (self.folder / folder).mkdir(parents=True)
 
