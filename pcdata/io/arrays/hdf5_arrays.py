@@ -44,7 +44,7 @@ def open_hdf5(path: Path, mode: str = "r") -> Any:
     try:
         return h5py.File(path, mode)
     except OSError as error:
-        if "lock" not in str(error):
+        if not re.search(r"\block", str(error)):  # not that of "superblock", where the file is cut short
             raise
         told = re.search(r"errno = (\d+)", str(error))
         number = int(told[1]) if told else error.errno

@@ -72,7 +72,8 @@ class _GraspNetSource(Source):
 
     def files(self, sample_id: str) -> dict[str, Path]:
         """Return the files of one sample by role."""
-        return _known_files(self._folders[sample_id])
+        folder = self._folders[sample_id]  # what was there is told as missing where it is gone by now
+        return {role: folder / name for role, name in _REQUIRED.items()} | _known_files(folder)
 
     def unread(self) -> list[str]:
         """Name what is in the folders besides the files that are read."""

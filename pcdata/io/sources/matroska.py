@@ -115,4 +115,7 @@ def opened_matroska(where: str, path: Path) -> Iterator[_Matroska]:
         add_note(error, f"while reading {where}")
         raise
     except Exception as error:  # FFmpeg's errors are of many types, some of them of Python's own
-        raise CaptureError(f"{where}: not a readable recording: {type(error).__name__}: {str(error)[:300]}") from error
+        raise CaptureError(
+            f"{where}: not a readable recording: {type(error).__name__}: {str(error)[:300]}; the file is damaged or "
+            "cut short: copy it again from where it was recorded"
+        ) from error

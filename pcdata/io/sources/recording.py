@@ -201,7 +201,10 @@ class RecordingSource(Source):
             raise CaptureError(f"{where}: holds no recording; this layout needs {cls.needs}")
         if len(recordings) > 1:
             names = name_some(file.name for file in recordings)
-            raise CaptureError(f"{where}: holds {len(recordings)} recordings, {names}; give the path of one")
+            raise CaptureError(
+                f"{where}: holds {len(recordings)} recordings, {names}; give the path of one, or "
+                f"'{folder}/*{cls.suffix}' for all"
+            )
         return recordings[0]
 
     def _nearest_colors(self, where: str, limit: float) -> tuple[dict[int, int], dict[str, str]]:

@@ -80,9 +80,15 @@ class Source(Selectable["Source"], metaclass=_Recorded):
         file = self.path / EPISODES
         if not is_folder(self.path) or not has_file(file):
             times = self._times() if self.is_one_recording else {}
-            return [Episode(self.path.stem, 0, len(self._ids), [*times.values()])] if self.is_one_recording else []
+            return (
+                [Episode(self._printable_name(), 0, len(self._ids), [*times.values()])] if self.is_one_recording else []
+            )
         check_inside(str(self), file, [self.path, *self.links_to])
         return read_episodes(file, self._ids, self._times())
+
+    def _printable_name(self) -> str:
+        """Return the name of the folder or file without suffix; what of it is no text, which a disk allows, as _."""
+        return "".join(sign if sign.isprintable() else "_" for sign in self.path.stem) or "recording"
 
     def _times(self) -> Mapping[str, float]:
         """Return the seconds of every sample by id, or nothing where they are not known."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import pickle
 import typing
 from collections.abc import Callable
@@ -147,6 +148,32 @@ def test_a_process_that_opened_none_of_them_loads_every_source(tmp_path: Path) -
     done = run_python(WORKER, str(tmp_path / "sources"), folder=tmp_path)
     found = [[float(number) for number in line.split()] for line in done.stdout.splitlines()]
     assert found == [[number for _, number in reversed(numbers(one))] for one in sources], done.stderr
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_what_is_cut_or_gone_after_opening_is_a_typed_error(name: str, tmp_path: Path) -> None:
+    source = open_source(CAPTURES[name](tmp_path / "captures"), kind=name, **OPTIONS.get(name, {}))
+    last = source.ids[-1]
+    files = [path for path in source.files(last).values() if path.is_file()]
+    raw = files[0].read_bytes()
+    files[0].write_bytes(raw[: len(raw) // 3])
+    with pytest.raises(PcdataError) as caught:
+        source.load(last)
+    assert "no locks" not in str(caught.value)
+    files[0].unlink()
+    with pytest.raises(CaptureError, match="no such file"):
+        source.load(last)
+
+
+@pytest.mark.parametrize("name", ["seven_scenes", "rlbench"])
+def test_a_recording_in_a_folder_whose_name_is_no_text_opens(name: str, tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/of\xffmine\n"))
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system has no such names")
+    (episode,) = open_source(CAPTURES[name](folder), kind=name).episodes
+    assert episode.id == "of_mine_"
 
 
 @pytest.mark.parametrize("name", ["graspnet_frame", "osd", "pcd", "realsense_bag", "seven_scenes"])

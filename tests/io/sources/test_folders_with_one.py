@@ -55,6 +55,22 @@ def test_of_several_files_the_names_and_the_pattern_for_all_are_told(
     assert len(open_source(tmp_path / f"*{ends}")) == 2 * len(open_source(first))
 
 
+def test_of_recordings_of_two_kinds_none_is_chosen(tmp_path: Path) -> None:
+    for make in (robomimic, published_captures.azure_kinect):
+        make(tmp_path)
+    with pytest.raises(CaptureError, match=r"robomimic and azure_kinect.*--kind robomimic or --kind azure_kinect"):
+        open_source(tmp_path)
+    assert open_source(tmp_path, kind="azure_kinect").kind == "azure_kinect"
+
+
+def test_of_several_recordings_the_pattern_for_all_is_told(tmp_path: Path) -> None:
+    first = published_captures.azure_kinect(tmp_path)
+    shutil.copy(first, tmp_path / "second.mkv")
+    with pytest.raises(CaptureError, match=r"give the path of one, or '.*/\*\.mkv' for all"):
+        open_source(tmp_path)
+    assert len(open_source(tmp_path / "*.mkv")) == 4
+
+
 def test_a_recording_beside_a_capture_is_not_the_capture(tmp_path: Path) -> None:
     robomimic(tmp_path)
     published_captures.pairs(tmp_path)
