@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata.contracts.lengths import check_metres_per_unit, ways
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, near_matches
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files.handles import Handles
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, name_some
@@ -25,33 +25,31 @@ from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
 from pcdata.io.arrays.parquet import ParquetColumns
 from pcdata.io.sources.episode_file import EPISODES
 from pcdata.io.sources.joined_views import join_views
-from pcdata.io.sources.lerobot_cameras import (
-    DepthStream,
-    check_direction,
-    depth_streams,
-    is_number,
-    with_partners,
+from pcdata.io.sources.lerobot_cameras import DepthStream, check_direction
+from pcdata.io.sources.lerobot_choice import (
+    all_depth,
+    check_cameras,
+    check_sizes,
+    chosen_cameras,
+    unit_of_clouds,
 )
 from pcdata.io.sources.lerobot_clouds import CloudColumns, cloud_columns
-from pcdata.io.sources.lerobot_facts import DTYPES, FACTS, IMAGES, SignalFacts, facts_of_json
-from pcdata.io.sources.lerobot_files import INDEX_COLUMNS, INFO, read_json
+from pcdata.io.sources.lerobot_facts import FACTS, IMAGES, facts_of_json
+from pcdata.io.sources.lerobot_files import INDEX_COLUMNS, INFO, dataset_of, is_dataset, read_json
 from pcdata.io.sources.lerobot_index import RecordedEpisode, read_index
 from pcdata.io.sources.lerobot_pictures import Pictures
-from pcdata.io.sources.lerobot_sidecars import depth_beside, intrinsics_beside
+from pcdata.io.sources.lerobot_sidecars import intrinsics_beside
+from pcdata.io.sources.lerobot_signals import signal_columns, signals_of
 from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
 from pcdata.io.sources.listed import checked_folder
-from pcdata.io.sources.listing import LinkTargets, absolute, entries, has_file, is_file, is_folder, link_targets
+from pcdata.io.sources.listing import LinkTargets, absolute, has_file, link_targets
 from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole, check_switch
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
-from pcdata.io.sources.stated_kinds import check_stated_names, kind_of, signal_of, stated_kinds
+from pcdata.io.sources.stated_kinds import stated_kinds
 from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
 
-_TASK = "task"
-_LANGUAGE = ("language_persistent", "language_events")
-_MOST_NUMBERS = 1 << 14  # of a signal: more are an image or a cloud
 _NAMED = 0.001  # probability above which a unit is worth a mention
-_MAX_LOOKED_INTO = 100  # entries of a folder that is no dataset, of which one may be
 
 
 @register_layout
@@ -101,7 +99,7 @@ class _LeRobotSource(Source):
             ConfigError: an option has no such value, or names what is not there.
             MissingExtraError: pyarrow is not installed, or av where there are videos.
         """
-        given, path = absolute(path), checked_folder(self.kind, _dataset_of(path), self.needs, INFO)
+        given, path = absolute(path), checked_folder(self.kind, dataset_of(path), self.needs, INFO)
         where = f"{self.kind} source {path}"
         check_inside(where, path, [given, *link_targets(links_to)])
         self._inside = [path, *link_targets(links_to)]
@@ -120,53 +118,35 @@ class _LeRobotSource(Source):
         self._views: list[tuple[DepthStream, Lens, Pose | None]] = []
         self._cloud: CloudColumns | None = None
         self._told: list[str] = []
-        found = self._all_depth(where, path)
+        found = all_depth(where, path, self._inside, self._index, self._facts)
         for option, given_of in (("metres_per_unit", metres_per_unit), ("intrinsics", intrinsics)):
-            _check_cameras(where, option, given_of, [one.camera for one in found])
+            check_cameras(where, option, given_of, [one.camera for one in found])
         self.frame_id = frame or "world"
         if clouds is not None:
             check_switch(where, "clouds", clouds)
         if clouds or (clouds is None and not found):
             self._cloud = cloud_columns(
-                where, path, self._inside, self._index, self._facts, frame, _one_number(where, metres_per_unit)
+                where, path, self._inside, self._index, self._facts, frame, unit_of_clouds(where, metres_per_unit)
             )
             self._told += [f"depth of {name_some(one.camera for one in found)}; clouds=false reads it"] * bool(found)
         else:
             if self._facts is not None and self._facts.frame_id is not None:
                 self.frame_id = frame or self._facts.frame_id
-            chosen = _chosen(where, camera, found)
+            chosen = chosen_cameras(where, camera, found)
             self._told += [f"depth of camera {one.camera}" for one in found if one not in chosen]
             for stream in chosen:
                 self._views.append(self._view(where, path, stream, metres_per_unit, intrinsics, len(found)))
-            _check_sizes(where, [stream for stream, _, _ in self._views])
-        self._signals = self._signal_columns(where, stated)
+            check_sizes(where, [stream for stream, _, _ in self._views])
+        self._signals = signal_columns(where, self._index, self._facts, self._used(), stated)
         ids = [f"{one.number:06d}-{step:06d}" for one in self._index.episodes for step in range(one.length)]
         super().__init__(path, ids, links_to)
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         """``meta/info.json`` beside ``data``, or a folder with one such folder."""
-        return _is_dataset(_dataset_of(path))
+        return is_dataset(dataset_of(path))
 
     # -- what is there ---------------------------------------------------------------------------------------------
-
-    def _all_depth(self, where: str, path: Path) -> list[DepthStream]:
-        if self._facts is not None:
-            return [one.stream() for one in self._facts.cameras]
-        files = self._index.episodes[0].videos
-        lossless = [
-            key
-            for key in files
-            if any(one.videos[key][0].endswith(".mkv") for one in self._index.episodes if key in one.videos)
-        ]
-        found = depth_streams(where, self._index.features, lossless)
-        found += [
-            DepthStream(camera=key, key=key, storage="video")
-            for key in files
-            if key not in self._index.features and "depth" in key
-        ]
-        found += depth_beside(where, path, self._inside, self._index)
-        return [with_partners(one, len(found), self._index.features) for one in found]
 
     def _view(
         self, where: str, path: Path, stream: DepthStream, units: Any, intrinsics: Any, count: int
@@ -234,30 +214,10 @@ class _LeRobotSource(Source):
             return None
         return Pose(stream.extrinsics, direction == "frame_to_camera")
 
-    def _signal_columns(self, where: str, stated: Mapping[str, Any]) -> dict[str, SignalFacts]:
-        """Return the signals by name: as the dataset's own facts say, else every column that is nothing else."""
-        if self._facts is not None:
-            known = dict(self._facts.signals)
-        else:
-            used = {name for view in self._views for name in _columns_of(*view)}
-            used |= set(self._cloud.columns) if self._cloud is not None else set()
-            known = {}
-            for key, said in self._index.features.items():
-                if key in INDEX_COLUMNS or key in used or key in _LANGUAGE:
-                    continue
-                if str(said.get("dtype")) == "string":
-                    known[key] = SignalFacts(key, "text")
-                elif is_number(said) and _numbers(said) <= _MOST_NUMBERS:
-                    known[key] = SignalFacts(key, "invariant", None, str(said["dtype"]), tuple(_shape(said)))
-            if self._index.episodes[0].tasks and _TASK not in known:
-                known[_TASK] = SignalFacts(None, "text")
-        check_stated_names(where, stated, known)
-        found = {}
-        for name, one in known.items():
-            kind = kind_of(name, stated, (one.kind, one.frame))
-            if kind is not None:
-                found[name] = replace(one, kind=kind[0], frame=kind[1])
-        return found
+    def _used(self) -> set[str]:
+        """Return the columns that images, clouds and cameras are read from."""
+        used = {name for view in self._views for name in _columns_of(*view)}
+        return used | set(self._cloud.columns if self._cloud is not None else ())
 
     # -- what a sample is ------------------------------------------------------------------------------------------
 
@@ -305,8 +265,7 @@ class _LeRobotSource(Source):
 
     def unread(self) -> list[str]:
         """Name the features that are not read, and episodes whose files are not there."""
-        used = {name for view in self._views for name in _columns_of(*view)} | {*INDEX_COLUMNS}
-        used |= set(self._cloud.columns) if self._cloud is not None else set()
+        used = self._used() | {*INDEX_COLUMNS}
         used |= {one.column for one in self._signals.values() if one.column is not None}
         if self._facts is not None:
             used |= {*self._facts.derived, *([self._facts.time] if self._facts.time else [])}
@@ -323,7 +282,7 @@ class _LeRobotSource(Source):
         check_known(str(self), sample_id, self._known)
         episode, step = self._place(sample_id)
         columns = [one.column for one in self._signals.values() if one.column is not None]
-        return self._signals_of(episode, step, self._row(episode, step, columns))
+        return signals_of(str(self), self._signals, episode, step, self._row(episode, step, columns))
 
     def _read_episodes(self) -> list[Episode]:
         if has_file(self.path / EPISODES):  # what is said beside a capture goes before what it says
@@ -394,7 +353,7 @@ class _LeRobotSource(Source):
         columns = [one.column for one in self._signals.values() if one.column is not None]
         columns += [name for _, lens, pose in self._views for name in (*lens.columns, *([pose.column] if pose else []))]
         row = self._row(episode, step, list(dict.fromkeys(columns)))
-        signals = self._signals_of(episode, step, row)
+        signals = signals_of(str(self), self._signals, episode, step, row)
         facts = {
             **self.provenance(sample_id),
             "episode": episode.number,
@@ -460,20 +419,6 @@ class _LeRobotSource(Source):
             recorded_signals=signals,
         )
 
-    def _signals_of(self, episode: RecordedEpisode, step: int, row: Mapping[str, Any]) -> dict[str, Signal]:
-        found = {}
-        for name, one in self._signals.items():
-            values: Any
-            if one.dtype is None:
-                text = row[one.column] if one.column is not None else episode.tasks[step]
-                if not isinstance(text, str):
-                    raise CaptureError(f"{self}: column {one.column!r} must hold texts, got {type(text).__name__}")
-                values = (text,)
-            else:
-                values = _tensor(f"{self}: column {one.column!r}", row[str(one.column)], one)
-            found[name] = signal_of(str(self), name, values, (one.kind, one.frame))
-        return found
-
 
 def _columns_of(stream: DepthStream, lens: Lens, pose: Pose | None) -> list[str]:
     return [
@@ -484,86 +429,5 @@ def _columns_of(stream: DepthStream, lens: Lens, pose: Pose | None) -> list[str]
     ]
 
 
-def _tensor(where: str, values: Any, one: SignalFacts) -> torch.Tensor:
-    count = int(np.prod(one.shape, dtype=np.int64))
-    if not isinstance(values, np.ndarray) or values.size != count:
-        found = f"{values.size} numbers" if isinstance(values, np.ndarray) else type(values).__name__
-        raise CaptureError(f"{where}: must hold {list(one.shape)} numbers as its feature says, got {found}")
-    # torch has no unsigned integers above 8 bits to compute with: the next wider signed ones hold them all.
-    wider = {"uint16": "int32", "uint32": "int64", "uint64": "int64"}.get(values.dtype.name)
-    if values.dtype == np.uint64 and values.size and values.max() >= 1 << 63:
-        raise CaptureError(f"{where}: holds {values.max()}, above what int64 holds")
-    tensor = torch.from_numpy(np.array(values if wider is None else values.astype(wider)))
-    wanted = DTYPES.get(str(one.dtype), tensor.dtype)
-    return tensor.to(wanted).reshape(1, *one.shape)
-
-
 def _shared(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {key: value for key, value in facts[0].items() if all(one.get(key) == value for one in facts)}
-
-
-def _shape(said: Mapping[str, Any]) -> list[int]:
-    shape = said.get("shape", [1])
-    return list(shape) if isinstance(shape, list) else [shape]
-
-
-def _numbers(said: Mapping[str, Any]) -> int:
-    return int(np.prod(_shape(said), dtype=np.float64))
-
-
-def _one_number(where: str, unit: Any) -> float | None:
-    if isinstance(unit, Mapping):
-        raise ConfigError(f"{where}: metres_per_unit of clouds must be one number, got {unit!r:.100}")
-    return None if unit is None else check_metres_per_unit(where, unit)
-
-
-def _chosen(where: str, camera: Any, found: list[DepthStream]) -> list[DepthStream]:
-    names = [one.camera for one in found]
-    if camera is None:
-        return found
-    wanted = [camera] if isinstance(camera, str) else camera
-    if not isinstance(wanted, (list, tuple)) or not wanted or not all(isinstance(name, str) for name in wanted):
-        raise ConfigError(f"{where}: camera must be a name, or a list of names, got {camera!r:.100}")
-    for name in wanted:
-        if name not in names:
-            raise ConfigError(
-                f"{where}: there is no depth of a camera {name!r:.100}{near_matches(name, names)}; there is of "
-                f"{', '.join(names) or 'none'}"
-            )
-    return [found[names.index(name)] for name in dict.fromkeys(wanted)]
-
-
-def _check_cameras(where: str, option: str, given: Any, names: Sequence[str]) -> None:
-    """Require an option that is told of cameras by name to name those that are there."""
-    for name in given if isinstance(given, Mapping) else ():
-        if name not in names:
-            raise ConfigError(
-                f"{where}: {option}: there is no depth of a camera {name!r:.100}{near_matches(str(name), names)}; "
-                f"there is of {', '.join(names) or 'none'}"
-            )
-
-
-def _check_sizes(where: str, streams: Sequence[DepthStream]) -> None:
-    sizes = {one.camera: one.size for one in streams if one.size is not None}
-    if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{name} {size[1]}x{size[0]}" for name, size in sizes.items())
-        raise CaptureError(
-            f"{where}: its cameras have images of different sizes ({told}), which are no views of one sample; say "
-            "which to read: camera=NAME (--camera NAME)"
-        )
-
-
-def _is_dataset(path: Path) -> bool:
-    return is_file(path / INFO) and (path / "data").is_dir()
-
-
-def _dataset_of(path: Path) -> Path:
-    """Return the only dataset in a folder that is none itself, or the path as it is."""
-    if _is_dataset(path):
-        return path
-    try:
-        found = entries(path) if is_folder(path) else []
-    except CaptureError:
-        return path
-    inside = [entry for entry in found if _is_dataset(entry)] if len(found) <= _MAX_LOOKED_INTO else []
-    return inside[0] if len(inside) == 1 else path

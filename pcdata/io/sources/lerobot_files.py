@@ -15,7 +15,7 @@ from pcdata.errors import CaptureError
 from pcdata.files.opening import check_inside, read_text
 from pcdata.files.strict_json import json_object
 from pcdata.io.arrays.parquet import ParquetColumns
-from pcdata.io.sources.listing import entries, has_file, is_folder
+from pcdata.io.sources.listing import entries, has_file, is_file, is_folder
 
 INFO = "meta/info.json"
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -29,6 +29,7 @@ _VIDEO = {3: VIDEO_PATH,
           2: "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"}  # fmt: skip
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 MAX_TEXT = 1 << 28
+_MAX_LOOKED_INTO = 100  # entries of a folder that is no dataset, of which one may be
 
 
 @dataclass(frozen=True)
@@ -111,3 +112,20 @@ def read_json(where: str, root: Path, name: str, inside: Sequence[Path]) -> dict
         return None
     check_inside(where, root / name, inside)
     return json_object(f"{where}: {name}", read_text(where, root / name, max_bytes=MAX_TEXT), error=CaptureError)
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a dataset."""
+    return is_file(path / INFO) and (path / "data").is_dir()
+
+
+def dataset_of(path: Path) -> Path:
+    """Return the only dataset in a folder that is none itself, or the path as it is."""
+    if is_dataset(path):
+        return path
+    try:
+        found = entries(path) if is_folder(path) else []
+    except CaptureError:
+        return path
+    inside = [entry for entry in found if is_dataset(entry)] if len(found) <= _MAX_LOOKED_INTO else []
+    return inside[0] if len(inside) == 1 else path

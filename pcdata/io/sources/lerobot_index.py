@@ -304,5 +304,5 @@ def _whole(where: str, name: str, value: Any) -> int:
     if isinstance(value, (float, np.floating)) and float(value).is_integer():  # pandas makes floats of gaps
         is_whole = True
     if not is_whole or not 0 <= value < _MOST:
-        raise CaptureError(f"{where}: {name} must be a whole number from 0, got {value!r:.60}")
+        raise CaptureError(f"{where}: {name} must be a whole number from 0, got {value!s:.60}")
     return int(value)

@@ -182,8 +182,13 @@ def _time(where: str, key: str, episode: RecordedEpisode, step: int) -> tuple[st
         raise CaptureError(f"{where}: meta/episodes does not say where its video is")
     file, begin, end = episode.videos[key]
     seconds = begin + episode.seconds[step]
-    if not seconds < end:  # what follows in the file is of another episode
-        raise CaptureError(f"{where}: is at {seconds:g} s of {file}, but the video of its episode ends at {end:g} s")
+    last = begin + episode.seconds[-1]
+    # What follows in the file is of another episode; and steps before it are at the wrong pictures if the last is.
+    if not (seconds < end and last < end):
+        raise CaptureError(
+            f"{where}: is at {seconds:g} s of {file}, and the last step at {last:g} s, but the video of its episode "
+            f"ends at {end:g} s"
+        )
     return file, seconds
 
 

@@ -407,6 +407,16 @@ def load_all(path: Path) -> None:
         source.load(name)
 
 
+def test_no_step_is_read_where_times_and_video_contradict_each_other(tmp_path: Path) -> None:
+    path = made.lossless(tmp_path / "set")
+    changed_rows(timestamp=[0.0, 0.1, 0.0, 0.2, 0.4])(path)  # seconds twice as long as the video
+    source = open_source(path, metres_per_unit=0.0001)
+    assert torch.equal(source.load(IDS[1]).depth, metres(1))
+    for name in IDS[2:]:
+        with pytest.raises(CaptureError, match=r"last step at 0\.6 s, but the video of its episode ends at 0\.5 s"):
+            source.load(name)
+
+
 def test_links_out_of_a_dataset_are_followed_only_where_that_is_allowed(tmp_path: Path) -> None:
     path = made.lossless(tmp_path / "set")
     (tmp_path / "store").mkdir()
