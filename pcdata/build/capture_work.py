@@ -34,6 +34,7 @@ class CaptureWork:
     def __init__(self, config: BuildConfig, source: CaptureSource) -> None:
         self.prefix: Compose = config.pipeline.split()[0]
         self.keep_raw = config.output.keep_raw
+        self.compact = config.output.compact
         self.source = source
 
     def make(self, sample_id: str, inputs: Inputs) -> Made:
@@ -53,7 +54,7 @@ class CaptureWork:
                 f"the pipeline gives a {type(cloud).__name__}, not a cloud to store; end depth in Deproject"
             )
         cloud = cloud.with_meta([{"sample_id": sample_id}] * cloud.num_clouds)
-        record = record_from_cloud(cloud)
+        record = record_from_cloud(cloud, compact=self.compact)
         sample = BuiltSample(
             sample_id,
             "depth" if isinstance(capture, DepthFrame) else "cloud",

@@ -52,6 +52,7 @@ class _Output(BaseModel):
     format: Format = "hdf5"
     compression: Compression = "none"  # lzf (hdf5) or gzip; reads are 2-4 times faster without
     keep_raw: bool = False  # also deliver depth, color and calibration beside the clouds
+    compact: bool = False  # colors as bytes, normals as two 16-bit numbers: see docs/training.md
     shard_size: Annotated[int, Ge(1)] | None = None  # captures; None = such that there are at most 1,000 shards
 
 
@@ -231,6 +232,7 @@ def _config_of_dataset(folder: Path, settings: Sequence[tuple[str, str]] = ()) -
         "compression": manifest.compression,
         "keep_raw": manifest.keep_raw,
         "shard_size": manifest.shard_size,
+        "compact": manifest.compact,
     }
     common = {"source": dict(manifest.source), "output": output}
     name = str(folder / FILE_NAME)

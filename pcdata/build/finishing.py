@@ -62,6 +62,7 @@ def complete_dataset(config: BuildConfig, source: CaptureSource, job: Job, recor
             pipeline=config.pipeline.sections(),
             samples=samples,
             keep_raw=config.output.keep_raw,
+            compact=config.output.compact,
             shard_size=config.output.shard_size,
             episodes=tuple(_episodes(source, samples)),
             signals=signals,

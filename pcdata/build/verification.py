@@ -21,6 +21,7 @@ from pcdata.io.store.shards import (
     Shards,
     StoredFile,
     hash_of,
+    hashes_below,
     read_table,
     shard_folder,
 )
@@ -181,10 +182,16 @@ class _Verification:
         if told is None:
             return
         try:
+            found = hashes_below(self.folder / SIGNALS_FOLDER)
             if self.shards.signals().digest() != told:
                 raise CacheError("the signals differ from what was written")
         except CacheError as error:
             self._add(SIGNALS_FOLDER, "damaged", str(error), ())
+            return
+        for name, written in self.manifest.signals_files.items():
+            if name in found and found[name] != written:
+                why = "its bytes are not those that were written"
+                self._add(f"{SIGNALS_FOLDER}/{name}", "damaged", why, ())
 
     def _tell(self, shards: int) -> int:
         """Say how many shards are done."""

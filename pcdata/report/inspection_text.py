@@ -43,7 +43,7 @@ def dataset_text(folder: str | Path) -> str:
         *([["left out", len(manifest.skipped)]] if manifest.skipped else []),
         *([["quarantined", len(manifest.quarantined)]] if manifest.quarantined else []),
         ["points", f"{min(counts):,} fewest, {round(median(counts)):,} median, {max(counts):,} most"],
-        ["format", f"{manifest.format}, compression {manifest.compression}"],
+        ["format", f"{manifest.format}, compression {manifest.compression}{', compact' * manifest.compact}"],
         ["frame, unit", f"{cloud.frame_id}, {cloud.unit}"],
         ["fields", ", ".join(f"{name} {tuple(value.shape)}" for name, value in cloud.fields().items())],
         ["fingerprint", manifest.fingerprint[:16]],

@@ -1,8 +1,8 @@
 """A cloud as named arrays and one JSON text: the form that every file format stores.
 
 Arrays follow the field's customs, so that other tools can read them: ``points``, ``colors`` and ``normals`` are (N, 3)
-float32, colors in [0, 1], and ``labels`` is (N, 1) int32. ``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4)
-world_from_camera repeat what the JSON says of the cameras.
+float32, colors in [0, 1], and ``labels`` is (N, 1) int32; compact, ``colors`` are bytes and ``normals`` (N, 2) int16.
+``intrinsics`` (V, 3, 3) and ``extrinsics`` (V, 4, 4) world_from_camera repeat what the JSON says of the cameras.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pcdata.errors import CacheError, PcdataError
 from pcdata.files.strict_json import json_object, parse_json
+from pcdata.io.store.compact_fields import compacted, expanded
 from pcdata.structures import PointCloud, Signal
 from pcdata.structures.kinds import FIELDS
 from pcdata.structures.signals import checked_signal
@@ -62,8 +63,10 @@ class Record:
         return total.hexdigest()
 
 
-def record_from_cloud(cloud: PointCloud) -> Record:
+def record_from_cloud(cloud: PointCloud, *, compact: bool = False) -> Record:
     """Write a cloud, or a batch, as a record; everything it knows is kept.
+
+    ``compact`` stores colors and normals as :mod:`pcdata.io.store.compact_fields` says, with errors within its bounds.
 
     Raises:
         CacheError: a label does not fit into int32, a dtype has no NumPy counterpart, or meta or history hold what JSON
@@ -93,7 +96,7 @@ def record_from_cloud(cloud: PointCloud) -> Record:
     }
     if cloud.recorded_signals:
         info["signals"] = [_told(name, signal) for name, signal in cloud.recorded_signals.items()]
-    return Record(arrays, _as_json(info))
+    return Record(compacted(arrays) if compact else arrays, _as_json(info))
 
 
 def cloud_from_record(record: Record) -> PointCloud:
@@ -108,6 +111,7 @@ def cloud_from_record(record: Record) -> PointCloud:
         raise CacheError(f"not a cloud record: schema must be {SCHEMA!r}, got {schema!r}")
     _check_info(info)
     tensors = {name: _tensor(name, array) for name, array in record.arrays.items() if name not in DERIVED}
+    tensors = expanded(tensors)
     extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
     frames = {
         unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)

@@ -17,7 +17,7 @@ from pcdata.files.scratch import retired_of
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
 from pcdata.io.store.sample_index import Sample, SampleIndex
-from pcdata.io.store.shards import read_tables
+from pcdata.io.store.shards import SIGNALS_FOLDER, hashes_below, read_tables
 from pcdata.io.store.stores import STORES, Compression
 from pcdata.structures import Episode
 from pcdata.structures.episodes import episodes_from_json
@@ -41,6 +41,7 @@ class Manifest:
     samples: SampleIndex | Sequence[Sample]  # an index afterwards
     versions: Mapping[str, str] = field(default_factory=dict)
     keep_raw: bool = False  # whether the captures lie beside the clouds
+    compact: bool = False  # whether colors are bytes and normals two numbers: see compact_fields
     shard_size: int | None = None  # what was asked for; None = what fits the number of captures
     skipped: Mapping[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     quarantined: Mapping[str, str] = field(default_factory=dict)  # id of a capture that failed twice -> why
@@ -51,6 +52,7 @@ class Manifest:
     ] = ()  # files with steps or the reader that were used: name, hash, what is in it
     episodes: Sequence[Episode] = ()  # over the samples
     signals: Mapping[str, str] = field(default_factory=dict)  # "digest" of the record of all, or the "fault" they have
+    signals_files: Mapping[str, Any] = field(default_factory=dict)  # bytes and sha256 of each; filled in when written
     streams: Sequence[Mapping[str, Any]] = ()  # of the recordings: how each was joined, and what that left
     schema: str = SCHEMA
 
@@ -75,6 +77,7 @@ class Manifest:
         content = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "samples"}
         content["episodes"] = [asdict(episode) for episode in self.episodes]
         content["num_samples"] = len(self.index)
+        content["signals_files"] = hashes_below(folder / SIGNALS_FOLDER)
         content["index"] = self.index.write(folder, read_tables(folder))
         with open(folder / FILE_NAME, "x", encoding="utf-8") as file:
             json.dump({**content, _CHECKSUM: checksum_of(content)}, file, indent=1, allow_nan=False)
@@ -176,11 +179,13 @@ def _check(manifest: Manifest) -> None:
         ("model", dict),
         ("source", dict),
         ("signals", dict),
+        ("signals_files", dict),
     ):
         if not isinstance(getattr(manifest, name), kind):
             raise CacheError(f"{name} must be a {kind.__name__}, got {getattr(manifest, name)!r:.100}")
-    if type(manifest.keep_raw) is not bool:
-        raise CacheError(f"keep_raw must be true or false, got {manifest.keep_raw!r:.100}")
+    for name in ("keep_raw", "compact"):
+        if type(getattr(manifest, name)) is not bool:
+            raise CacheError(f"{name} must be true or false, got {getattr(manifest, name)!r:.100}")
     if manifest.shard_size is not None and (type(manifest.shard_size) is not int or manifest.shard_size < 1):
         raise CacheError(f"shard_size must be a whole number from 1, or null, got {manifest.shard_size!r:.100}")
     if manifest.model and not (isinstance(manifest.model.get("name"), str) and _is_choices(manifest.model)):
@@ -189,6 +194,8 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"imports must list files with their sha256 and names, got {manifest.imports!r:.100}")
     if set(manifest.signals) - {"digest", "fault"} or not all(isinstance(t, str) for t in manifest.signals.values()):
         raise CacheError(f"signals must have a digest or a fault, got {manifest.signals!r:.100}")
+    if not all(isinstance(told, dict) and set(told) == {"bytes", "sha256"} for told in manifest.signals_files.values()):
+        raise CacheError(f"signals_files must give bytes and sha256 of each, got {manifest.signals_files!r:.100}")
     if not isinstance(manifest.streams, tuple) or not all(isinstance(one, dict) for one in manifest.streams):
         raise CacheError(f"streams must list objects, got {manifest.streams!r:.100}")
 

@@ -14,7 +14,7 @@ import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pcdata.errors import CacheError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input, read_bytes
@@ -75,6 +75,16 @@ def seal_shard(folder: Path) -> str:
     except OSError as error:
         raise CacheError(f"{folder / TABLE}: cannot be written: {write_fault(error)}") from error
     return hashlib.sha256(content).hexdigest()
+
+
+def hashes_below(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the bytes and the SHA-256 of every file below a folder, if there is one.
+
+    Raises:
+        CacheError: it holds what is no file, or that cannot be read.
+    """
+    hashes = {name: hash_of(folder / name) for name in _names_below(folder)}
+    return {name: {"bytes": size, "sha256": sha256} for name, (size, sha256) in hashes.items()}
 
 
 def read_tables(folder: Path) -> list[bytes]:
