@@ -81,6 +81,8 @@ def read_robot_poses(
 
 def _from_yaml(text: str, name: str, folder: Path, locate: Callable[[Path], Tensor] | None) -> RobotPoses:
     document = YamlDocument(text, name, error=CalibrationError)
+    if isinstance(document.root, yaml.SequenceNode) and name.lower().endswith(".json"):
+        return _from_moveit(document, document.root, name)
     top = known_entries(document, document.root, "a file of poses", required=("unit", "poses"))
     if "unit" in top and (unit := document.plain(top["unit"][1])) != "metre":
         document.fault(top["unit"][1], f"unit must be 'metre', got {unit!r}; convert every translation to metres")
@@ -100,6 +102,23 @@ def _from_yaml(text: str, name: str, folder: Path, locate: Callable[[Path], Tens
             target.append(locate(folder / str(document.plain(entries[IMAGE][1]))))
     document.raise_faults()
     return _joined(name, names, cast("list[Tensor]", robot), cast("list[Tensor]", target))
+
+
+def _from_moveit(document: YamlDocument, root: yaml.SequenceNode, name: str) -> RobotPoses:
+    """Read what MoveIt Calibration saves: pairs of 4x4 matrices, metres as all of ROS.
+
+    Source: moveit_calibration, ``HandEyeSolverBase``: the effector in the robot's base, the object in the camera.
+    """
+    robot, target = [], []
+    for index, node in enumerate(root.value):
+        pair = document.sequence(node, f"sample {index}")
+        if len(pair) != 2:
+            document.fault(node, f"sample {index}: must be a pair, the effector's pose and the object's, 4x4 each")
+            continue
+        robot.append(_read_pose(document, pair[0], f"sample {index}: {ROBOT}"))
+        target.append(_read_pose(document, pair[1], f"sample {index}: {TARGET}"))
+    document.raise_faults()
+    return _joined(name, [*map(str, range(len(robot)))], cast("list[Tensor]", robot), cast("list[Tensor]", target))
 
 
 def _read_pose(document: YamlDocument, node: yaml.Node, what: str) -> Tensor | None:
