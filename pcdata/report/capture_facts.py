@@ -20,6 +20,8 @@ from pcdata.io.sources.capture_source import (
     skipped_of,
     unread_of,
 )
+from pcdata.io.sources.layouts import LAYOUTS
+from pcdata.io.sources.registry import options_of
 from pcdata.io.sources.source import Source, stored_captures
 from pcdata.structures import DepthFrame, PointCloud, Signal
 
@@ -150,7 +152,11 @@ def _missing(first: DepthFrame | PointCloud, facts: Mapping[str, Any]) -> list[s
         return []
     lines = [str(line) for line in first.provenance.get("missing", ())]
     if first.world_from_camera is None:
-        lines.append("poses: clouds stay in the camera's frame (--calibration FILE --frame NAME gives them)")
+        takes_one = all(
+            "calibration" in options_of(LAYOUTS[kind]) for kind in facts.get("layout", ()) if kind in LAYOUTS
+        )
+        given = " (--calibration FILE --frame NAME gives them)" if takes_one else ""
+        lines.append(f"poses: clouds stay in the camera's frame{given}")
     if first.colors is None:
         lines.append("color")
     if facts["episodes"] and facts["captures"] > 1 and not any("seconds" in one for one in facts["episodes"]):
