@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pcdata.cli.known_names import PUBLISHED_SPLITS, SPLIT_RULES
 from pcdata.cli.options import add_import_option
+from pcdata.cli.progress_bar import ProgressBar
+
+if TYPE_CHECKING:
+    from pcdata.datasets import Splits
 
 
 def add_to(commands: Any) -> None:
@@ -40,6 +44,9 @@ def add_to(commands: Any) -> None:
     split.add_argument("--seed", type=int, metavar="N", help="of the draw (default: 0)")
     split.add_argument("--file", metavar="FILE", help="write the splits there (default: splits.json in DATASET)")
     split.add_argument("--fresh", action="store_true", help="draw all anew (default: what has a split keeps it)")
+    check = split.add_mutually_exclusive_group()
+    check.add_argument("--check", action="store_true", help="draw nothing; look for leaks in the splits that are there")
+    check.add_argument("--no-check", action="store_true", help="do not look for near duplicates across the splits")
     add_import_option(split)
     split.set_defaults(run=_split)
 
@@ -61,11 +68,33 @@ def _parts(text: str) -> dict[str, float | int | None]:
     return parts
 
 
-def _split(arguments: argparse.Namespace) -> None:
-    from pcdata.datasets import split_dataset
-    from pcdata.report.split_text import splits_text
+def _split(arguments: argparse.Namespace) -> int:
+    from pcdata.datasets import Splits
+    from pcdata.datasets.leak_check import check_leaks
+    from pcdata.errors import ConfigError
+    from pcdata.report.split_text import leaks_text, splits_text
 
-    splits = split_dataset(
+    drawing = ("parts", "by", "named_by", "stratify", "seed", "table", "fresh")
+    if arguments.check:
+        if given := [
+            f"--{name.replace('_', '-')}" for name in drawing if getattr(arguments, name) not in (None, False)
+        ]:
+            raise ConfigError(f"split: --check draws nothing, so {', '.join(given)} say nothing; leave one out")
+        print(splits_text(Splits.read(arguments.file or arguments.dataset)))
+    else:
+        print(splits_text(_drawn(arguments)))
+    if arguments.no_check:
+        return 0
+    with ProgressBar("leaks") as progress:
+        report = check_leaks(arguments.dataset, path=arguments.file, progress=progress)
+    print(f"\n{leaks_text(report)}")
+    return int(not report.is_clean)
+
+
+def _drawn(arguments: argparse.Namespace) -> Splits:
+    from pcdata.datasets import split_dataset
+
+    return split_dataset(
         arguments.dataset,
         arguments.parts,
         by=arguments.by,
@@ -76,4 +105,3 @@ def _split(arguments: argparse.Namespace) -> None:
         path=arguments.file,
         fresh=arguments.fresh,
     )
-    print(splits_text(splits))

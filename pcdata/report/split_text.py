@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pcdata.datasets.leak_check import LeakReport
 from pcdata.datasets.splits import Splits
 from pcdata.report.plain_table import text_table
+
+_SHOWN = 20  # pairs, in a summary
 
 
 def splits_text(splits: Splits) -> str:
@@ -20,6 +23,27 @@ def splits_text(splits: Splits) -> str:
 def splits_in_words(splits: Splits) -> str:
     """Tell the samples of every split in a line."""
     return ", ".join(f"{name} {len(splits.ids(name)):,}" for name in splits.names)
+
+
+def leaks_text(report: LeakReport) -> str:
+    """Tell what is in two splits, with numbers and what to do."""
+    small = f"; {len(report.too_small)} clouds have too few points to be compared" if report.too_small else ""
+    head = f"leaks    {len(report.leaks)} near duplicates across splits among {report.num_samples} samples{small}"
+    rows = [
+        [f"{one.first} ({one.splits[0]})", f"{one.second} ({one.splits[1]})", f"{one.distance:.3g} {report.unit}"]
+        for one in report.leaks[:_SHOWN]
+    ]
+    more = len(report.leaks) - len(rows)
+    lines = [head]
+    lines += [f"  {first} shows the same as {second}: {apart} apart" for first, second, apart in rows]
+    lines += [f"  and {more} more"] if more > 0 else []
+    lines += [f"  episode {name} is in {' and '.join(splits)}" for name, splits in report.episodes.items()]
+    if not report.is_clean:
+        lines.append(
+            "  -> keep such samples together: give both the same value in a column of a table, and draw anew with --by "
+            "column:NAME --table FILE --fresh; or leave copies out of the build with --skip ID"
+        )
+    return "\n".join(lines)
 
 
 def _plain(value: object) -> str:

@@ -1,0 +1,243 @@
+"""Clouds that show the same thing: copies of one another in another order, thinned out, noisy, or moved as a whole.
+
+Two clouds are near duplicates where each lies on the other: nearly all points of the sparser one are, along the local
+normal, as close to the denser one as noise is, and nearly all of the denser one have a point of the sparser one near.
+A rigid motion does not matter: a moved copy holds the same answer as the original. Another view of the same object is
+no duplicate: what one view shows and the other does not lies apart.
+
+Comparing all pairs is out of reach, so a descriptor that none of that changes much finds the candidates: quantiles of
+the distance from the centroid, the standard deviations along the principal axes, and quantiles of how far points are
+from the median along each of these (shape distributions after Osada et al., ACM Transactions on Graphics 21(4), 2002,
+of the distances to a point and to three planes instead of between points).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]  # (N, 3)
+
+FEWEST = 100  # points: fewer say too little of a surface
+
+_RADIAL = np.linspace(0.0, 1.0, 18)[1:-1]  # quantiles, without the ends, which single stray points make
+_AXIAL = np.linspace(0.0, 1.0, 12)[1:-1]
+_NUM_RADIAL = len(_RADIAL) + 3
+SIZE = _NUM_RADIAL + 3 * len(_AXIAL)  # numbers of a descriptor
+
+_CANDIDATES = 8  # nearest descriptors that are looked at
+# How far descriptors of duplicates are apart, as shares of the size: quantiles of n points that were drawn from one
+# surface differ by about 1 / sqrt(n). Measured on clouds thinned out to a half and a quarter, 95 of 100 lie within.
+_ALIKE_RADIAL, _LEAST_RADIAL = 1.0, 0.01
+_ALIKE_AXIAL, _LEAST_AXIAL = 2.6, 0.03
+_NEARLY_ALL = 0.98  # of the points
+_NOISE_M = 0.003  # metres: three standard deviations of the noise of a depth camera close by
+_NOISE = 0.01  # of the size of a cloud that is in no metres
+_OF_SPACING = 0.25  # of the distance of neighbors: between points of a curved surface it is not where its plane is
+_BESIDE = 3.0  # distances of neighbors: how far beside a point the next one of an independent sample may be
+_MOST = 2048  # points of a cloud that are looked up
+_ALIGNED = 192  # points that are brought onto the other cloud
+_STEPS = 24  # of the alignment, at most
+_SNAPS = 4  # times that what is nearly aligned is judged on the way
+_ON_THE_WAY = {0: 0.2, 4: 0.4, 8: 0.6, 13: 0.8}  # step -> the share of points that must be near by then
+_FIT = 8  # neighbors that a local plane is fitted to
+
+
+def descriptor(points: Points) -> NDArray[np.float32]:  # (SIZE,)
+    """Return what is alike for near duplicates; all zero where there are too few points."""
+    if len(points) < FEWEST:
+        return np.zeros(SIZE, np.float32)
+    centered = points - points.mean(0)
+    variances, axes = np.linalg.eigh(centered.T @ centered / len(points))
+    spread = np.sqrt(np.clip(variances, 0.0, None))
+    distances = _quantiles(np.linalg.norm(centered, axis=1), _RADIAL)
+    along = centered @ axes
+    away = _quantiles(np.abs(along - np.median(along, axis=0)), _AXIAL) / np.maximum(spread, 1e-12)
+    return np.concatenate([distances, spread, away.T.ravel()]).astype(np.float32)
+
+
+def _quantiles(values: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quantiles of columns, as ``numpy.quantile`` does, which takes several times as long for few values."""
+    ordered = np.sort(values, axis=0)
+    place = shares * (len(ordered) - 1)
+    below = place.astype(np.int64)
+    part = (place - below).reshape(-1, *[1] * (ordered.ndim - 1))
+    return ordered[below] * (1 - part) + ordered[np.minimum(below + 1, len(ordered) - 1)] * part
+
+
+def candidates(
+    descriptors: NDArray[np.float32],  # (N, SIZE)
+    counts: NDArray[np.int64],  # (N,) points
+    parts: Sequence[NDArray[np.int64]],  # rows of each part
+) -> Iterator[tuple[int, int]]:
+    """Yield pairs of rows of different parts that could be near duplicates, those of the smaller part in turn."""
+    from scipy.spatial import cKDTree
+
+    filled = [part[descriptors[part].any(axis=1)] for part in parts]
+    radial, axial = descriptors[:, :_NUM_RADIAL], descriptors[:, _NUM_RADIAL:]
+    size = np.linalg.norm(radial[:, -3:], axis=1)  # the root of the mean squared distance from the centroid
+    trees = [cKDTree(radial[part]) if len(part) else None for part in filled]
+    order = sorted(range(len(filled)), key=lambda number: len(filled[number]))
+    for small, large in itertools.combinations(order, 2):
+        tree, asked = trees[large], filled[small]
+        if tree is None or not len(asked):
+            continue
+        count = min(_CANDIDATES, len(filled[large]))
+        distances, found = tree.query(radial[asked], k=[*range(1, count + 1)])
+        others = filled[large][found]
+        noise = 1.0 / np.sqrt(np.minimum(counts[asked][:, None], counts[others]))
+        apart = distances / np.sqrt(_NUM_RADIAL) / size[asked][:, None]
+        is_near = apart <= np.maximum(_LEAST_RADIAL, _ALIKE_RADIAL * noise)
+        for row, column in zip(*np.nonzero(is_near)):
+            first, second = int(asked[row]), int(others[row, column])
+            differences = (axial[first] - axial[second]).reshape(3, -1)
+            limit = max(_LEAST_AXIAL, _ALIKE_AXIAL * noise[row, column])
+            if np.sqrt((differences**2).mean(1)).max() <= limit:
+                yield first, second
+
+
+def duplicate_distance(first: Points, second: Surface) -> float | None:
+    """Return how far two near duplicates are apart (root mean square, in their unit); None = they are none.
+
+    Args:
+        first: as many points as ``second`` has, or fewer.
+        second: the other cloud.
+    """
+    sparse = _some(first, _MOST)
+    few = _some(sparse, _ALIGNED)
+    for start in _starts(sparse, second.points):
+        motion = start
+        for step in range(_STEPS):
+            moved = _applied(motion, few)
+            near, along = second.offsets(moved)
+            share = float(((near <= second.reach) & (along <= 3 * second.noise)).mean())
+            if share < _ON_THE_WAY.get(step, 0.0):
+                break
+            if share >= _NEARLY_ALL:
+                return _settled(motion, sparse, few, second)
+            motion = second.toward(moved, near) @ motion
+    return None
+
+
+def _settled(motion: NDArray[np.float64], sparse: Points, few: Points, second: Surface) -> float | None:
+    """Judge clouds that lie on each other but for a little: along a plane, planes do not say where, and points do."""
+    for _ in range(_SNAPS):
+        moved = _applied(motion, sparse)
+        if (found := second.judged(moved)) is not None:
+            return found if _covers(moved, second) else None
+        for _ in range(_STEPS // _SNAPS):
+            motion = second.snapping(_applied(motion, few)) @ motion
+    return None
+
+
+def _applied(motion: NDArray[np.float64], points: Points) -> Points:
+    return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+def _starts(sparse: Points, dense: Points) -> Iterator[NDArray[np.float64]]:
+    """Yield the motions to begin with: none, then those that lay the principal axes on each other."""
+    yield np.eye(4)
+    axes = [np.linalg.eigh(np.cov(points.T))[1] for points in (sparse, dense)]
+    axes = [own * np.array([1.0, 1.0, np.linalg.det(own)]) for own in axes]
+    for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
+        rotation = axes[1] @ np.diag(signs) @ axes[0].T
+        motion = np.eye(4)
+        motion[:3, :3] = rotation
+        motion[:3, 3] = dense.mean(0) - rotation @ sparse.mean(0)
+        yield motion
+
+
+def _some(points: Points, count: int) -> Points:
+    """Return so many of the points at most, spread over their order."""
+    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
+
+
+class Surface:
+    """The denser of two clouds, with what counts as near it.
+
+    Args:
+        points: its points, :data:`FEWEST` or more.
+        in_metres: whether they are in metres, where the noise of depth cameras is known.
+    """
+
+    def __init__(self, points: Points, in_metres: bool) -> None:
+        from scipy.spatial import cKDTree
+
+        self.points = points
+        self._tree: Any = cKDTree(points)
+        some = _some(points, 256)
+        self.spacing = float(np.median(self._tree.query(some, k=[2])[0]))  # the nearest is the point itself
+        size = float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
+        self.noise = max(_NOISE_M if in_metres else _NOISE * size, _OF_SPACING * self.spacing)
+        self.reach = max(_BESIDE * self.spacing, self.noise)
+        self._planes: tuple[Points, Points] | None = None
+
+    def _nearest(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
+        """Return of every point the distance to the nearest one, a point of the local plane there, and its normal."""
+        distance, near = self._tree.query(points)
+        if len(self.points) > _MOST:
+            return (distance, *self._fitted(near))
+        if self._planes is None:
+            self._planes = self._fitted(np.arange(len(self.points)))
+        return distance, self._planes[0][near], self._planes[1][near]
+
+    def _fitted(self, rows: NDArray[np.int64]) -> tuple[Points, Points]:
+        own = self.points[self._tree.query(self.points[rows], k=[*range(1, _FIT + 1)])[1]]
+        middle = own.mean(1)
+        centered = own - middle[:, None]
+        return middle, np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))[1][:, :, 0]
+
+    def offsets(self, points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return of every point the distance to the nearest one, and along the normal there to the local plane."""
+        distance, middle, normal = self._nearest(points)
+        along = np.abs(((middle - points) * normal).sum(1))
+        return distance, np.minimum(along, distance)  # at an edge a copy is on the point, if not on the plane
+
+    def judged(self, points: Points) -> float | None:
+        """Return the root mean square distance where nearly all points lie on the surface; else None."""
+        distance, along = self.offsets(points)
+        on_it = (along <= self.noise) & (distance <= self.reach)
+        return float(np.sqrt((along**2).mean())) if on_it.mean() >= _NEARLY_ALL else None
+
+    def toward(self, points: Points, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the motion (4, 4) that brings points onto the surface: one step, from point to plane.
+
+        Source: Chen and Medioni, Object modelling by registration of multiple range images, 1992.
+        """
+        near = distance <= max(self.reach, float(np.quantile(distance, 0.8)))
+        _, plane, normal = self._nearest(points[near])
+        middle = points.mean(0)
+        rows = np.hstack([np.cross(points[near] - middle, normal), normal])
+        turn = np.linalg.lstsq(rows, ((plane - points[near]) * normal).sum(1), rcond=1e-6)[0]
+        cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
+        left, _, right = np.linalg.svd(np.eye(3) + cross)
+        motion = np.eye(4)
+        motion[:3, :3] = left @ right
+        motion[:3, 3] = middle + turn[3:] - motion[:3, :3] @ middle
+        return motion
+
+    def snapping(self, points: Points) -> NDArray[np.float64]:
+        """Return the motion (4, 4) that brings points onto their nearest ones: one step.
+
+        Source: Arun et al., Least-squares fitting of two 3-D point sets, PAMI 9(5), 1987.
+        """
+        near = self.points[self._tree.query(points)[1]]
+        left, _, right = np.linalg.svd((near - near.mean(0)).T @ (points - points.mean(0)))
+        motion = np.eye(4)
+        motion[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        motion[:3, 3] = near.mean(0) - motion[:3, :3] @ points.mean(0)
+        return motion
+
+
+def _covers(points: Points, surface: Surface) -> bool:
+    """Whether nearly all of the denser cloud has a point of the sparser one near."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    spacing = float(np.median(tree.query(_some(points, 256), k=[2])[0]))
+    distance, _ = tree.query(_some(surface.points, _MOST))
+    return bool((distance <= max(_BESIDE * spacing, surface.noise)).mean() >= _NEARLY_ALL)
