@@ -13,19 +13,20 @@ from pcdata.build.carried import carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.engines.in_process import work_here
-from pcdata.build.finishing import complete_dataset
+from pcdata.build.finishing import complete_dataset, counts_of
 from pcdata.build.plan import Plan, plan_of
 from pcdata.build.records import BuiltSample, ShardRecord
 from pcdata.build.shard_work import Job
 from pcdata.build.source_state import captures_digest
 from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.datasets.splits import FILE_NAME as SPLITS
-from pcdata.errors import CacheError, ConfigError, DTypeError, add_note
+from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
 from pcdata.files.whole_folders import check_replaceable, prepared, put_into_place
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
+from pcdata.validation.step_losses import judge_step_losses
 
 Engine = Literal["pool"]
 ENGINES: tuple[Engine, ...] = ("pool",)
@@ -58,6 +59,7 @@ def build_dataset(
     engine: Engine = "pool",
     part: tuple[int, int] | None = None,
     finalize: bool = False,
+    strict: bool = False,
     progress: Progress | None = None,
     note: Note | None = None,
 ) -> BuildReport:
@@ -86,6 +88,8 @@ def build_dataset(
         part: (k, n): do only every n-th shard, from the k-th on, k from 0; whoever finishes last puts the dataset into
             place.
         finalize: only put the dataset into place, of which every shard is finished.
+        strict: fail before the dataset is put into place where a step drops more than is usual, or a capture is an
+            outlier of the rest; see :mod:`pcdata.validation.step_losses`. Otherwise notes say so.
         progress: called after every capture.
         note: told at once what the report's ``notes`` say in the end.
 
@@ -94,7 +98,7 @@ def build_dataset(
         CacheError: the folder exists, another process writes it, an unfinished build of other settings is there, or it
             cannot be written (a full disk).
         CaptureError: a file of the captures, or of their calibration, changed since it was first read; too many
-            captures failed.
+            captures failed; steps drop too much (strict).
         PcdataError: all of the first 8 captures failed, or all; of the type that the first one raised.
     """
     _check_arguments(config, source)
@@ -131,7 +135,7 @@ def build_dataset(
         if part is None and len(done) < plan.num_shards:
             raise CacheError(f"{folder}: shards that were finished are gone or damaged; start again to build them anew")
         is_complete = len(done) == plan.num_shards and _finish(
-            config, source, job, done, part, replaced, overwrite=overwrite, note=tell
+            config, source, job, done, part, replaced, overwrite=overwrite, strict=strict, note=tell
         )
     return _told(report, [done[shard] for shard in shards if shard in done], plan.num_shards, len(done), is_complete)
 
@@ -175,6 +179,7 @@ def _finish(
     replaced: object,
     *,
     overwrite: bool,
+    strict: bool,
     note: Note,
 ) -> bool:
     """Put the dataset into place; False where another process that has a part of the work does."""
@@ -192,7 +197,15 @@ def _finish(
             return False
         if part is not None:
             replaced = prepared(folder, overwrite, check_only_dataset, note)
-        partial = complete_dataset(config, source, job, done)
+        alarms = judge_step_losses(counts_of(done))
+        for one in alarms:
+            note(f"{one.name} {one.found}; {one.advice}")
+        if alarms and strict:
+            raise CaptureError(
+                f"build_dataset: steps drop more than is usual, of which the notes tell; what is finished is kept in "
+                f"{building.path}: mend the steps or leave captures out, or take it as it is without strict"
+            )
+        partial = complete_dataset(config, source, job, done, alarms)
         if (folder / SPLITS).is_file():
             for told in carry_splits(folder, partial):
                 note(told)

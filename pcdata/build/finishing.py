@@ -34,9 +34,17 @@ from pcdata.io.store.stores import STORES
 from pcdata.structures import Episode, Signal
 from pcdata.structures.episodes import kept_episodes
 from pcdata.structures.signal_joining import stacked_signals
+from pcdata.validation.step_losses import Counts, step_statistics
+from pcdata.verdicts import Finding
 
 
-def complete_dataset(config: BuildConfig, source: CaptureSource, job: Job, records: Mapping[int, ShardRecord]) -> Path:
+def complete_dataset(
+    config: BuildConfig,
+    source: CaptureSource,
+    job: Job,
+    records: Mapping[int, ShardRecord],
+    alarms: Sequence[Finding] = (),
+) -> Path:
     """Make the dataset of a build whose shards are all finished, in its hidden folder, and return that.
 
     Raises:
@@ -69,6 +77,8 @@ def complete_dataset(config: BuildConfig, source: CaptureSource, job: Job, recor
             skipped=skipped_of(source),
             quarantined={name: why for record in ordered for name, why in record.quarantined.items()},
             streams=tuple(streams_of(source)),
+            steps=tuple(step_statistics(counts_of(records))),
+            alarms=tuple(finding.to_json() for finding in alarms),
             model=_model_of(config),
             source={name: value for name, value in getattr(source, "opened", {}).items() if name != "skip_refused"},
             imports=[file.to_json() for file in imports],
@@ -89,6 +99,11 @@ def complete_dataset(config: BuildConfig, source: CaptureSource, job: Job, recor
     except OSError as error:
         raise CacheError(f"{job.folder.target}: cannot be written: {write_fault(error)}") from error
     return dataset
+
+
+def counts_of(records: Mapping[int, ShardRecord]) -> dict[str, Counts]:
+    """Return the points after every step of every sample, in their order."""
+    return {one.id: one.counts for shard in sorted(records) for one in records[shard].samples}
 
 
 def _check_captures(source: CaptureSource, job: Job, records: Sequence[ShardRecord]) -> None:

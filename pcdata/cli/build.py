@@ -87,6 +87,11 @@ def _add_ways(build: argparse.ArgumentParser) -> None:
         "0 (default: go on, and exit with 3)",
     )
     ways.add_argument(
+        "--strict",
+        action="store_true",
+        help="fail where a step drops more than is usual or a capture is an outlier of the rest (default: say so)",
+    )
+    ways.add_argument(
         "--engine", default="pool", metavar="NAME", help="pool: processes of this machine; ray: a cluster"
     )
     ways.add_argument("--num-shards", type=positive, metavar="N", help="of jobs that share the work: how many they are")
@@ -137,6 +142,7 @@ def _build(arguments: argparse.Namespace) -> int:
             engine=arguments.engine,
             part=part,
             finalize=arguments.finalize,
+            strict=arguments.strict,
             progress=progress,
             note=progress.note,
         )

@@ -54,6 +54,8 @@ class Manifest:
     signals: Mapping[str, str] = field(default_factory=dict)  # "digest" of the record of all, or the "fault" they have
     signals_files: Mapping[str, Any] = field(default_factory=dict)  # bytes and sha256 of each; filled in when written
     streams: Sequence[Mapping[str, Any]] = ()  # of the recordings: how each was joined, and what that left
+    steps: Sequence[Mapping[str, Any]] = ()  # points after each step, over all samples: see step_statistics
+    alarms: Sequence[Mapping[str, Any]] = ()  # steps that drop too much, and captures that are outliers of the rest
     schema: str = SCHEMA
 
     def __post_init__(self) -> None:
@@ -130,7 +132,7 @@ class Manifest:
                 )
             samples = SampleIndex.read(Path(folder), content.pop("index"), content.pop("num_samples"))
             listed: dict[str, Any] = {"samples": samples}
-            for name in ("imports", "streams"):
+            for name in ("imports", "streams", "steps", "alarms"):
                 if isinstance(content.get(name), list):
                     listed[name] = tuple(content.pop(name))
             if "episodes" in content:
@@ -196,8 +198,10 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"signals must have a digest or a fault, got {manifest.signals!r:.100}")
     if not all(isinstance(told, dict) and set(told) == {"bytes", "sha256"} for told in manifest.signals_files.values()):
         raise CacheError(f"signals_files must give bytes and sha256 of each, got {manifest.signals_files!r:.100}")
-    if not isinstance(manifest.streams, tuple) or not all(isinstance(one, dict) for one in manifest.streams):
-        raise CacheError(f"streams must list objects, got {manifest.streams!r:.100}")
+    for name in ("streams", "steps", "alarms"):
+        entries = getattr(manifest, name)
+        if not isinstance(entries, tuple) or not all(isinstance(one, dict) for one in entries):
+            raise CacheError(f"{name} must list objects, got {entries!r:.100}")
 
 
 def _is_import(entry: Any) -> bool:
