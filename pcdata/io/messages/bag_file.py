@@ -5,25 +5,21 @@ Source: http://wiki.ros.org/Bags/Format/2.0
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import BinaryIO
 
 import numpy as np
 
 from pcdata.errors import CaptureError
 from pcdata.io.messages.byte_fields import Fields
-from pcdata.io.messages.log_file import MAX_MESSAGE, Index, LogFile, Place, Read, by_topic
-from pcdata.io.messages.mcap_file import type_name
-from pcdata.io.messages.packing import UNPACKED, check_packing, unpacked
+from pcdata.io.messages.chunked_file import IN_FILE, ChunkedFile
+from pcdata.io.messages.log_file import MAX_MESSAGE, Index, Place, by_topic, type_name
+from pcdata.io.messages.packing import check_packing, unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MAX_HEADER = 1 << 20  # bytes of names and values before a record's data
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _ENTRY = np.dtype([("seconds", "<u4"), ("nanoseconds", "<u4"), ("offset", "<u4")])
-_IN_FILE = -1  # the second number of a place: the first is from the start of the file, not of a packed chunk
 
 _TOPIC = re.compile(rb"topic=([/\w. -]+)")
 _SEARCHED = 1 << 20  # bytes of a bag without an index
@@ -31,45 +27,32 @@ _SEARCHED = 1 << 20  # bytes of a bag without an index
 Rows = dict[str, list[tuple[int, int, int]]]
 
 
-class BagFile(LogFile):
-    """One .bag file; a place is (byte, -1), or (byte of a packed chunk, byte within)."""
+class BagFile(ChunkedFile):
+    """One .bag file."""
 
     suffix = ".bag"
     container = "ROS 1 bag"
+    magic = MAGIC
+    begins_as = "a ROS 1 bag of version 2.0"
 
-    @classmethod
-    def _begins_so(cls, stream: BinaryIO) -> bool:
-        return stream.read(len(MAGIC)) == MAGIC
+    def _indexed(self, stream: BinaryIO, size: int) -> Index:
+        return _Indexer(stream, size).index()
 
-    def index(self) -> Index:
-        """Return what the file holds: by its index, or read through where that is missing."""
-        with self._stream() as (stream, size):
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise CaptureError(f"{self.path}: does not start as a ROS 1 bag of version 2.0 does")
-            return _Indexer(stream, size).index()
+    def _seek_message(self, stream: BinaryIO, start: int, size: int) -> int:
+        length = _Record(stream, start, size).check(_MESSAGE).length
+        if length > MAX_MESSAGE:
+            raise CaptureError(f"{self.path}: a message claims {length} bytes, the limit is {MAX_MESSAGE}")
+        return length
 
-    @contextmanager
-    def opened(self) -> Iterator[Read]:
-        """Open the file."""
-        with self._stream() as (stream, size):
+    def _unpacked_chunk(self, stream: BinaryIO, start: int, size: int) -> bytes:
+        return _unpacked_chunk(stream, _Record(stream, start, size).check(_CHUNK))
 
-            def read(place: Place, most: int | None = None) -> bytes:
-                start, offset = place
-                if offset == _IN_FILE:
-                    length = _Record(stream, start, size).check(_MESSAGE).length
-                    if length > MAX_MESSAGE:
-                        raise CaptureError(f"{self.path}: a message claims {length} bytes, the limit is {MAX_MESSAGE}")
-                    return stream.read(length if most is None else min(most, length))
-                key = (str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start)
-                content = UNPACKED.get(key, lambda: _unpacked_chunk(stream, _Record(stream, start, size).check(_CHUNK)))
-                chunk = Fields(content, offset)
-                header_fields(chunk.take(chunk.number("I")), _MESSAGE)
-                length = chunk.number("I")
-                if length > chunk.left:
-                    raise CaptureError(f"{self.path}: a message leads out of its chunk at byte {start}; it is damaged")
-                return chunk.take(length if most is None else min(most, length))
-
-            yield read
+    def _skip_to_message(self, chunk: Fields, start: int) -> int:
+        header_fields(chunk.take(chunk.number("I")), _MESSAGE)
+        length = chunk.number("I")
+        if length > chunk.left:
+            raise CaptureError(f"{self.path}: a message leads out of its chunk at byte {start}; it is damaged")
+        return length
 
 
 def bag_topics(stream: BinaryIO, size: int) -> list[str]:
@@ -243,7 +226,7 @@ class _Indexer:
                 raise CaptureError(f"the index of the chunk at byte {start} leads out of it; the bag is damaged")
             places = np.empty((len(rows), 2), np.int64)
             places[:, 0] = chunk.begin + rows["offset"].astype(np.int64) if plain else start
-            places[:, 1] = _IN_FILE if plain else rows["offset"]
+            places[:, 1] = IN_FILE if plain else rows["offset"]
             times = rows["seconds"].astype(np.int64) * 10**9 + rows["nanoseconds"]
             self._index.add(topic, times, places)
             place = record.end
@@ -280,7 +263,7 @@ class _Indexer:
                 if record.kind == _CONNECTION:
                     self._declare(record.fields, self._stream.read(record.length))
                 elif record.kind == _MESSAGE:
-                    self._note(record.fields, (place, _IN_FILE), found)
+                    self._note(record.fields, (place, IN_FILE), found)
                 place = record.end
             return
         if chunk.end > self._size:

@@ -146,3 +146,9 @@ def by_topic(messages: dict[str, list[tuple[int, int, int]]], index: Index) -> N
     for name, rows in messages.items():
         table = np.array(rows, np.int64).reshape(-1, 3)
         index.add(name, table[:, 0], table[:, 1:])
+
+
+def type_name(name: str) -> str:
+    """Return a type as ROS 2 writes it: ROS 1 leaves out the middle."""
+    package, slash, message = name.partition("/")
+    return f"{package}/msg/{message}" if slash and "/" not in message else name

@@ -6,16 +6,15 @@ Source: https://mcap.dev/spec
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import BinaryIO
 
 import numpy as np
 
 from pcdata.errors import CaptureError
 from pcdata.io.messages.byte_fields import Fields
-from pcdata.io.messages.log_file import LATEST, MAX_MESSAGE, Index, LogFile, Place, Read, by_topic
-from pcdata.io.messages.packing import UNPACKED, unpacked
+from pcdata.io.messages.chunked_file import IN_FILE, ChunkedFile
+from pcdata.io.messages.log_file import LATEST, MAX_MESSAGE, Index, Place, by_topic, type_name
+from pcdata.io.messages.packing import unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
@@ -24,50 +23,35 @@ _RECORD = 9  # bytes of a record before its content: what it is, and its length
 _MESSAGE_START = 22  # bytes of a message before its data
 _PACKINGS = {"": "none", "none": "none", "lz4": "lz4", "zstd": "zstd"}
 _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
-_IN_FILE = -1  # the second number of a place: the first is from the start of the file, not of a packed chunk
 
 
-class McapFile(LogFile):
-    """One .mcap file; a place is (byte, -1), or (byte of a packed chunk, byte within)."""
+class McapFile(ChunkedFile):
+    """One .mcap file."""
 
     suffix = ".mcap"
     container = "MCAP file"
+    magic = MAGIC
+    begins_as = "an MCAP file"
 
-    @classmethod
-    def _begins_so(cls, stream: BinaryIO) -> bool:
-        return stream.read(len(MAGIC)) == MAGIC
+    def _indexed(self, stream: BinaryIO, size: int) -> Index:
+        return _Indexer(stream, size).index()
 
-    def index(self) -> Index:
-        """Return what the file holds: by its summary, or read through where that is missing."""
-        with self._stream() as (stream, size):
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise CaptureError(f"{self.path}: does not start as an MCAP file does")
-            return _Indexer(stream, size).index()
+    def _seek_message(self, stream: BinaryIO, start: int, size: int) -> int:
+        kind, length = _record(stream, start, size)
+        if kind != _MESSAGE or not _MESSAGE_START <= length <= MAX_MESSAGE:
+            raise CaptureError(f"{self.path}: no message stands at byte {start}; the file is damaged")
+        stream.seek(_MESSAGE_START, os.SEEK_CUR)
+        return length - _MESSAGE_START
 
-    @contextmanager
-    def opened(self) -> Iterator[Read]:
-        """Open the file."""
-        with self._stream() as (stream, size):
+    def _unpacked_chunk(self, stream: BinaryIO, start: int, size: int) -> bytes:
+        return _unpacked_chunk(stream, start, size)
 
-            def read(place: Place, most: int | None = None) -> bytes:
-                start, offset = place
-                if offset == _IN_FILE:
-                    kind, length = _record(stream, start, size)
-                    if kind != _MESSAGE or not _MESSAGE_START <= length <= MAX_MESSAGE:
-                        raise CaptureError(f"{self.path}: no message stands at byte {start}; the file is damaged")
-                    stream.seek(_MESSAGE_START, os.SEEK_CUR)
-                    wanted = length - _MESSAGE_START
-                    return stream.read(wanted if most is None else min(most, wanted))
-                key = (str(self.path), os.fstat(stream.fileno()).st_mtime_ns, start)
-                chunk = Fields(UNPACKED.get(key, lambda: _unpacked_chunk(stream, start, size)), offset)
-                kind, length = chunk.number("B"), chunk.number("Q")
-                if kind != _MESSAGE or not _MESSAGE_START <= length <= chunk.left:
-                    raise CaptureError(f"{self.path}: no message stands in the chunk at byte {start}; it is damaged")
-                chunk.take(_MESSAGE_START)
-                wanted = length - _MESSAGE_START
-                return chunk.take(wanted if most is None else min(most, wanted))
-
-            yield read
+    def _skip_to_message(self, chunk: Fields, start: int) -> int:
+        kind, length = chunk.number("B"), chunk.number("Q")
+        if kind != _MESSAGE or not _MESSAGE_START <= length <= chunk.left:
+            raise CaptureError(f"{self.path}: no message stands in the chunk at byte {start}; it is damaged")
+        chunk.take(_MESSAGE_START)
+        return length - _MESSAGE_START
 
 
 def _unpacked_chunk(stream: BinaryIO, start: int, size: int) -> bytes:
@@ -217,7 +201,7 @@ class _Indexer:
             places = np.empty((len(rows), 2), np.int64)
             plain = packing == "none"
             places[:, 0] = begin + rows["offset"].astype(np.int64) if plain else start
-            places[:, 1] = _IN_FILE if plain else rows["offset"]
+            places[:, 1] = IN_FILE if plain else rows["offset"]
             self._index.add(topic, rows["time"].astype(np.int64), places)
 
     # -- without an index ----------------------------------------------------------------------------------------------
@@ -240,7 +224,7 @@ class _Indexer:
                 if kind in (_SCHEMA, _CHANNEL):
                     self._declare(kind, Fields(_exactly(self._stream, _at_most(length))))
                 elif kind == _MESSAGE:
-                    self._scan_message(Fields(_exactly(self._stream, _MESSAGE_START)), (place, _IN_FILE), found)
+                    self._scan_message(Fields(_exactly(self._stream, _MESSAGE_START)), (place, IN_FILE), found)
                 elif kind == 0 or (kind > _DATA_END and kind < 0x80):
                     raise CaptureError(f"no record is of the kind {kind}")
                 place += _RECORD + length
@@ -269,7 +253,7 @@ class _Indexer:
                     self._declare(kind, Fields(_exactly(self._stream, _at_most(inner))))
                 elif kind == _MESSAGE:
                     head = Fields(_exactly(self._stream, _MESSAGE_START))
-                    self._scan_message(head, (begin + place, _IN_FILE), messages)
+                    self._scan_message(head, (begin + place, IN_FILE), messages)
                 place += _RECORD + inner
         else:
             content = Fields(_unpacked_chunk(self._stream, start, end))
@@ -291,12 +275,6 @@ class _Indexer:
         if time > LATEST:
             raise CaptureError(f"a message of {topic!r:.100} is of the time {time}; the file is damaged")
         found.setdefault(topic, []).append((time, *place))
-
-
-def type_name(name: str) -> str:
-    """Return a type as ROS 2 writes it: ROS 1 leaves out the middle."""
-    package, slash, message = name.partition("/")
-    return f"{package}/msg/{message}" if slash and "/" not in message else name
 
 
 def _at_most(length: int) -> int:

@@ -16,8 +16,7 @@ import numpy as np
 
 from pcdata.errors import CaptureError
 from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file
-from pcdata.io.messages.log_file import LATEST, MAX_MESSAGE, Index, LogFile, Place, Read, said_of
-from pcdata.io.messages.mcap_file import type_name
+from pcdata.io.messages.log_file import LATEST, MAX_MESSAGE, Index, LogFile, Place, Read, said_of, type_name
 
 _MAGIC = b"SQLite format 3\0"
 _TABLES = {

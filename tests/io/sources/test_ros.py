@@ -19,7 +19,7 @@ from pcdata.errors import CaptureError, ConfigError, FrameError, IntrinsicsError
 from pcdata.files.recent import Recent
 from pcdata.geometry import rigid
 from pcdata.io import refused_captures
-from pcdata.io.messages import bag_file, mcap_file
+from pcdata.io.messages import bag_file, chunked_file, mcap_file
 from pcdata.io.store.manifest import Manifest
 from tests.ros_recordings import (
     EPOCH,
@@ -610,7 +610,7 @@ def test_packed_chunks_are_unpacked_once_for_all_topics(
         return original(content, *others)
 
     monkeypatch.setattr(module, "unpacked", counted)
-    monkeypatch.setattr(module, "UNPACKED", Recent(10_000))  # far less than the recording
+    monkeypatch.setattr(chunked_file, "UNPACKED", Recent(10_000))  # far less than the recording
     assert len(open_source(path, frame_id="base")) == 100
     chunks = len(set(unpacked))
     assert chunks > 80
