@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pcdata.contracts.lengths import check_metres_per_unit, ways
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
+from pcdata.errors import CaptureError, PcdataError
 from pcdata.files.handles import Handles
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, name_some
-from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
 from pcdata.io.arrays.parquet import ParquetColumns
 from pcdata.io.sources.episode_file import EPISODES
 from pcdata.io.sources.joined_views import join_views
@@ -34,22 +31,21 @@ from pcdata.io.sources.lerobot_choice import (
     unit_of_clouds,
 )
 from pcdata.io.sources.lerobot_clouds import CloudColumns, cloud_columns
+from pcdata.io.sources.lerobot_episodes import episodes_of
 from pcdata.io.sources.lerobot_facts import FACTS, IMAGES, facts_of_json
 from pcdata.io.sources.lerobot_files import INDEX_COLUMNS, INFO, dataset_of, is_dataset, read_json
 from pcdata.io.sources.lerobot_index import RecordedEpisode, read_index
 from pcdata.io.sources.lerobot_pictures import Pictures
-from pcdata.io.sources.lerobot_sidecars import intrinsics_beside
 from pcdata.io.sources.lerobot_signals import signal_columns, signals_of
-from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
+from pcdata.io.sources.lerobot_stated import lens_of, pose_of, unsaid_of, with_unit
+from pcdata.io.sources.lerobot_views import View
 from pcdata.io.sources.listed import checked_folder
 from pcdata.io.sources.listing import LinkTargets, absolute, has_file, link_targets
-from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_pinhole, check_switch
+from pcdata.io.sources.option_checks import check_invalid_values, check_name, check_switch
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.source import Source
 from pcdata.io.sources.stated_kinds import stated_kinds
 from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
-
-_NAMED = 0.001  # probability above which a unit is worth a mention
 
 
 @register_layout
@@ -104,7 +100,7 @@ class _LeRobotSource(Source):
         check_inside(where, path, [given, *link_targets(links_to)])
         self._inside = [path, *link_targets(links_to)]
         self._invalid = check_invalid_values(where, invalid_values)
-        self._direction = check_direction(where, extrinsics)
+        direction = check_direction(where, extrinsics)
         stated = stated_kinds(where, signals)
         self._index = read_index(where, path, self._inside)
         said = read_json(where, path, FACTS, self._inside)
@@ -115,7 +111,7 @@ class _LeRobotSource(Source):
         self._pictures = Pictures(where, path, self._inside)
         self._rows = Handles(4)
         frame = check_name(where, "frame_id", frame_id)
-        self._views: list[tuple[DepthStream, Lens, Pose | None]] = []
+        self._views: list[View] = []
         self._cloud: CloudColumns | None = None
         self._told: list[str] = []
         found = all_depth(where, path, self._inside, self._index, self._facts)
@@ -135,8 +131,10 @@ class _LeRobotSource(Source):
             chosen = chosen_cameras(where, camera, found)
             self._told += [f"depth of camera {one.camera}" for one in found if one not in chosen]
             for stream in chosen:
-                self._views.append(self._view(where, path, stream, metres_per_unit, intrinsics, len(found)))
-            check_sizes(where, [stream for stream, _, _ in self._views])
+                self._views.append(
+                    self._view(where, stream, metres_per_unit, intrinsics, direction, is_only=len(found) == 1)
+                )
+            check_sizes(where, [view.stream for view in self._views])
         self._signals = signal_columns(where, self._index, self._facts, self._used(), stated)
         ids = [f"{one.number:06d}-{step:06d}" for one in self._index.episodes for step in range(one.length)]
         super().__init__(path, ids, links_to)
@@ -149,74 +147,19 @@ class _LeRobotSource(Source):
     # -- what is there ---------------------------------------------------------------------------------------------
 
     def _view(
-        self, where: str, path: Path, stream: DepthStream, units: Any, intrinsics: Any, count: int
-    ) -> tuple[DepthStream, Lens, Pose | None]:
-        unit = units.get(stream.camera) if isinstance(units, Mapping) else units
-        if unit is not None:
-            unit = check_metres_per_unit(where, unit)
-            if stream.quantized is not None or stream.metres_per_unit not in (None, unit):
-                raise UnitError(
-                    f"{where}: the dataset states the unit of camera {stream.camera!r}; leave out metres_per_unit"
-                )
-            stream = replace(stream, metres_per_unit=unit)
-        if stream.metres_per_unit is None and stream.quantized is None:
-            raise self._no_unit(where, stream)
-        if stream.quantized is not None and not stream.facts.get("codec_is_lossless"):
-            self._told.append(
-                f"what its codec took of the depth of camera {stream.camera!r}: the dataset does not say that it was "
-                "coded without loss, so its error has no bound"
-            )
-        return stream, self._lens(where, path, stream, intrinsics, count), self._pose(stream)
+        self, where: str, stream: DepthStream, units: Any, intrinsics: Any, direction: str | None, *, is_only: bool
+    ) -> View:
+        stream = with_unit(where, stream, units, lambda: self._first_image(stream))
+        lens = lens_of(where, self._inside[0], self._inside, self._index, stream, intrinsics, is_only=is_only)
+        self._told += unsaid_of(stream, direction)
+        return View(stream, lens, pose_of(stream, direction))
 
-    def _no_unit(self, where: str, stream: DepthStream) -> UnitError:
-        """Name the units that the first image fits."""
-        stored = self._pictures.stored(stream, self._index.episodes[0], 0, self._row)
-        fits = [fit for fit in unit_fits(stored) if fit.probability >= _NAMED][:4]
-        told = f"by its numbers it may be {units_in_words(fits)}" if fits else ways(float(stored.max(initial=0)))
-        example = f"{fits[0].unit.metres:.10g}" if fits else "0.001"
-        return UnitError(
-            f"{where}: nothing states the unit of depth of camera {stream.camera!r} ({stream.key}); {told}. Say "
-            f"metres_per_unit={example} (--metres-per-unit {example}), of one camera alone "
-            f"metres_per_unit={{{stream.camera!r}: {example}}}"
-        )
-
-    def _lens(self, where: str, path: Path, stream: DepthStream, intrinsics: Any, count: int) -> Lens:
-        given = intrinsics
-        if isinstance(intrinsics, Mapping):
-            given = intrinsics.get(stream.camera)
-        elif intrinsics is not None and count > 1:
-            raise ConfigError(
-                f"{where}: intrinsics must say of which camera they are, such as "
-                f"intrinsics={{{stream.camera!r}: (fx, fy, cx, cy)}}"
-            )
-        if given is not None:
-            return lens_of_numbers(check_pinhole(where, given))
-        if stream.intrinsics is not None:
-            return lens_of_column(stream, self._index.features[stream.intrinsics])
-        beside = intrinsics_beside(where, path, self._inside, stream)
-        if beside is not None:
-            return lens_of_numbers(*beside)
-        raise IntrinsicsError(
-            f"{where}: nothing states the intrinsics of camera {stream.camera!r}; say intrinsics={{{stream.camera!r}: "
-            f"(fx, fy, cx, cy)}} in pixels"
-            + (" (--intrinsics FX FY CX CY)" if count == 1 else " (--option intrinsics=...)")
-        )
-
-    def _pose(self, stream: DepthStream) -> Pose | None:
-        if stream.extrinsics is None:
-            return None
-        direction = stream.direction or self._direction
-        if direction is None:
-            self._told.append(
-                f"column {stream.extrinsics}, whose name does not say where it leads; extrinsics=camera_to_frame or "
-                "frame_to_camera (--extrinsics) reads it"
-            )
-            return None
-        return Pose(stream.extrinsics, direction == "frame_to_camera")
+    def _first_image(self, stream: DepthStream) -> NDArray[Any]:
+        return self._pictures.stored(stream, self._index.episodes[0], 0, self._row)
 
     def _used(self) -> set[str]:
         """Return the columns that images, clouds and cameras are read from."""
-        used = {name for view in self._views for name in _columns_of(*view)}
+        used = {name for view in self._views for name in view.columns}
         return used | set(self._cloud.columns if self._cloud is not None else ())
 
     # -- what a sample is ------------------------------------------------------------------------------------------
@@ -249,7 +192,7 @@ class _LeRobotSource(Source):
         """Return files by role, from the folder."""
         episode, _ = self._place(sample_id)
         found = {"rows": episode.file}
-        for stream, _, _ in self._views:
+        for stream in (view.stream for view in self._views):
             for role, key in (("depth", stream.key), ("color", stream.color)):
                 file = None if key is None else self._pictures.file_of(stream, key, episode)
                 if file is not None:
@@ -287,34 +230,7 @@ class _LeRobotSource(Source):
     def _read_episodes(self) -> list[Episode]:
         if has_file(self.path / EPISODES):  # what is said beside a capture goes before what it says
             return super()._read_episodes()
-        found, first = [], 0
-        times = self._own_times()
-        names = self._column_names()
-        for place, one in enumerate(self._index.episodes):
-            facts = None
-            if self._facts is not None:
-                if one.number >= len(self._facts.episodes):
-                    raise CaptureError(f"{self}: {FACTS} does not know episode {one.number}")
-                facts = self._facts.episodes[one.number]
-            if facts is None:
-                tasks = list(dict.fromkeys(one.tasks))
-                attributes = {"tasks": tasks, "fps": self._index.fps, "episode_index": one.number}
-                robot = self._index.info.get("robot_type")
-                attributes |= {"robot_type": robot} if isinstance(robot, str) else {}
-                attributes |= {"names": names} if names else {}
-                found.append(Episode(f"episode_{one.number:06d}", first, one.length, one.seconds, attributes))
-            elif facts.is_episode:
-                own = times[place] if times is not None else ()
-                found.append(Episode(facts.id, first, one.length, own, facts.attributes))
-            first += one.length
-        return found
-
-    def _column_names(self) -> dict[str, Any]:
-        """Return what the numbers of each signal are called, where the dataset says so."""
-        features = self._index.features
-        columns = {name: one.column for name, one in self._signals.items() if one.column is not None}
-        said = {name: features[column].get("names") for name, column in columns.items()}
-        return {name: names for name, names in said.items() if isinstance(names, (list, dict)) and names}
+        return episodes_of(str(self), self._index, self._facts, self._signals, self._own_times())
 
     def _own_times(self) -> list[list[float]] | None:
         """Return the seconds of every step as they were recorded, where the dataset keeps them."""
@@ -351,7 +267,7 @@ class _LeRobotSource(Source):
     def _load(self, sample_id: str) -> DepthFrame | PointCloud:
         episode, step = self._place(sample_id)
         columns = [one.column for one in self._signals.values() if one.column is not None]
-        columns += [name for _, lens, pose in self._views for name in (*lens.columns, *([pose.column] if pose else []))]
+        columns += [name for view in self._views for name in view.numbers]
         row = self._row(episode, step, list(dict.fromkeys(columns)))
         signals = signals_of(str(self), self._signals, episode, step, row)
         facts = {
@@ -366,7 +282,7 @@ class _LeRobotSource(Source):
                 cloud = cloud.with_signal(name, signal.values, signal.kind, signal.frame)
             return cloud
         index = self._first_of[episode.number] + step
-        facts["cameras"] = [stream.camera for stream, _, _ in self._views]
+        facts["cameras"] = [view.stream.camera for view in self._views]
         first = self._frame(sample_id, index, self._views[0], episode, step, row, facts, signals)
         if len(self._views) == 1:
             return first
@@ -377,18 +293,18 @@ class _LeRobotSource(Source):
         self,
         sample_id: str,
         index: int,
-        view: tuple[DepthStream, Lens, Pose | None],
+        view: View,
         episode: RecordedEpisode,
         step: int,
         row: Mapping[str, Any],
         facts: Mapping[str, Any],
         signals: Mapping[str, Signal],
     ) -> DepthFrame:
-        stream, lens, pose = view
+        stream = view.stream
         where = f"{self}: camera {stream.camera!r}"
         depth, about = self._pictures.depth(stream, episode, step, self._row, self._invalid)
         size = (depth.shape[0], depth.shape[1])
-        camera, turn = lens.camera(where, size, row)
+        camera, turn = view.lens.camera(where, size, row)
         colors = None
         if stream.color is not None:
             color = self._pictures.color(stream.color, episode, step, self._row)
@@ -403,7 +319,7 @@ class _LeRobotSource(Source):
             for role, key in stream.images.items()
         }
         labels, mask, levels = (beside.get(role) for role in IMAGES)
-        world = None if pose is None else (pose.matrix(where, row) @ turn)[None]
+        world = None if view.pose is None else (view.pose.matrix(where, row) @ turn)[None]
         return DepthFrame(
             depth=torch.from_numpy(depth)[None],
             camera=camera,
@@ -418,15 +334,6 @@ class _LeRobotSource(Source):
             provenance={**facts, **about},
             recorded_signals=signals,
         )
-
-
-def _columns_of(stream: DepthStream, lens: Lens, pose: Pose | None) -> list[str]:
-    return [
-        stream.key,
-        *([stream.color] if stream.color else []),
-        *lens.columns,
-        *([pose.column] if pose else []),
-    ]
 
 
 def _shared(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The intrinsics and the pose of a camera of a LeRobot dataset, at one step."""
+"""A camera of a LeRobot dataset as a view: its depth, and its intrinsics and its pose at one step."""
 
 from __future__ import annotations
 
@@ -91,6 +91,25 @@ class Pose:
             raise CaptureError(f"{where}: column {self.column} must hold 12 or 16 numbers, got {values.size}")
         matrix = matrix_of(f"{where}: column {self.column}", values.tolist())
         return rigid.invert_rigid(matrix) if self.is_inverse else matrix
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera: its depth, its intrinsics, and where it is; a pose of None = not known."""
+
+    stream: DepthStream
+    lens: Lens
+    pose: Pose | None
+
+    @property
+    def numbers(self) -> list[str]:
+        """The columns with the intrinsics and the pose of every step."""
+        return [*self.lens.columns, *([self.pose.column] if self.pose else [])]
+
+    @property
+    def columns(self) -> list[str]:
+        """All columns that are read, those of the images included."""
+        return [self.stream.key, *([self.stream.color] if self.stream.color else []), *self.numbers]
 
 
 def lens_of_numbers(numbers: tuple[float, float, float, float], of_size: Size | None = None) -> Lens:
