@@ -1,39 +1,59 @@
-"""How fast batches come from a built dataset, beside a plain loop over files and beside copying the bytes.
+"""How fast batches come from a built dataset, beside other ways to keep clouds and beside copying the bytes.
 
-    python benchmarks/loading.py     # a minute; writes results/loading.json
+    python benchmarks/loading.py     # some minutes on a quiet machine; writes results/loading.json
 
-Clouds of 4096 points with colors, without signals, as they are stored and then turned, scaled and jittered; 64 a batch
-by one process, shuffled, collated to (B, N, 3). Beside each store stand per-sample ``.npz`` files of the two arrays
-alone, read by ``numpy.load`` and put together by torch's ``default_collate``, as most training code does, and a copy of
-the same bytes out of one array in memory. In turns, the medians of CPU time kept. "First" is the pass that compares
-every record of a packed store with its digest; the other stores do so in every pass.
+Clouds of 4096 points with colors, 96 KB each, 64 a batch, shuffled, by a DataLoader with two workers that has run for a
+while: the median rate of several stretches, all ways in turns, so that a load from elsewhere meets each of them. Nobody
+looks at the batches.
+
+What the rates stand beside:
+
+- ``memcpy``: a loop in one process that copies the same bytes, sample by sample in the same order, out of one array
+  into one batch that is used again.
+- ``torch's ceiling``: a Dataset whose ``__getitems__`` gives one tensor that is in shared memory already, so that
+  nothing is read, copied or allocated; ``fresh tensor``: a new tensor of that size for every batch, which torch moves
+  to shared memory.
+- ``npz and default_collate``, ``hdf5 group per sample``: what most training code does.
+- WebDataset, LitData, Zarr and Lance, each as its documentation shows, where they are installed.
+
+"augmented" is RandomRotation, RandomScale, RandomJitter and RandomPointDropout on every sample. CPU time of all
+processes per batch says what a rate is made of.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
+import os
+import platform
 import statistics
+import tarfile
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
-from pcdata import CachedCloudDataset, PointCloud, collate_fixed
+from pcdata import CachedCloudDataset, PointCloud, collate_fixed, collate_packed
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.rng import seeded
 
 RESULTS = Path(__file__).parent / "results"
 BATCH, POINTS = 64, 4096
-STORES = ("packed", "hdf5", "npz", "pt")
-AUGMENT = (
-    "augment: [RandomRotation: {degrees: 180}, RandomScale: {low: 0.9, high: 1.1}, RandomJitter: {sigma: 0.001}]\n"
-)
+BYTES = POINTS * 6 * 4  # of a sample
+SUFFIXES = {
+    "rotate, scale, jitter": "[RandomRotation: {degrees: 180}, RandomScale: {low: 0.9, high: 1.1}, RandomJitter: "
+    "{sigma: 0.001}]",
+    "rotate, scale, jitter, dropout": "[RandomRotation: {degrees: 180}, RandomScale: {low: 0.9, high: 1.1}, "
+    "RandomJitter: {sigma: 0.001}, RandomPointDropout]",
+}
 
 
 class _Clouds:
@@ -71,69 +91,271 @@ class _PlainFiles(Dataset):
             return {"points": stored["points"], "colors": stored["colors"]}
 
 
-class _Copied(Dataset):
-    """The bytes in memory."""
+class _Groups(Dataset):
+    """What a script does that keeps one HDF5 group for every sample."""
 
-    def __init__(self, clouds: _Clouds) -> None:
-        self.points = torch.stack([clouds.load(sample_id).points for sample_id in clouds.ids])
-        self.colors = self.points.flip(1).contiguous()
+    def __init__(self, path: Path, clouds: _Clouds) -> None:
+        self.path, self.ids, self.file = path, clouds.ids, None
+        with h5py.File(path, "w") as file:
+            for sample_id in clouds.ids:
+                cloud = clouds.load(sample_id)
+                file[f"{sample_id}/points"], file[f"{sample_id}/colors"] = cloud.points.numpy(), cloud.colors.numpy()
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.ids)
 
-    def __getitems__(self, indices: Sequence[int]) -> dict[str, Any]:
-        return {"points": self.points[indices], "colors": self.colors[indices]}
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        self.file = self.file or h5py.File(self.path)
+        group = self.file[self.ids[index]]
+        return {"points": group["points"][()], "colors": group["colors"][()]}
 
 
-def seconds(data: Any, collate: Callable[..., Any]) -> float:
-    """CPU seconds of one pass."""
-    order = torch.randperm(len(data), generator=seeded(0)).tolist()
-    loader = DataLoader(data, batch_size=BATCH, sampler=order, collate_fn=collate)
-    if hasattr(data, "set_epoch"):
-        data.set_epoch(data.epoch + 1)
-    begun = time.process_time()
-    for _ in loader:
+class _Ready(Dataset):
+    """A batch that lies in shared memory; or, as ``fresh``, in memory of its own each time."""
+
+    def __init__(self, size: int, *, fresh: bool) -> None:
+        self.size, self.fresh = size, fresh
+        self.batch = torch.ones(BATCH, POINTS, 6).share_memory_()
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitems__(self, indices: Sequence[int]) -> torch.Tensor:
+        return self.batch.clone() if self.fresh else self.batch
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch
+
+
+class _Loaded:
+    """A way to load: batches from a loader that is begun again when it ends."""
+
+    def __init__(self, loader: Callable[[int], Any]) -> None:
+        self._loader, self._pass = loader, 0
+        self._batches: Iterator[Any] = iter(())
+
+    def batches(self, count: int) -> Iterator[Any]:
+        while count:
+            batch = next(self._batches, None)
+            if batch is None:
+                self._batches = iter(self._loader(self._pass))
+                self._pass += 1
+                continue
+            yield batch
+            count -= 1
+
+
+def loader_of(data: Dataset, collate: Callable[..., Any], workers: int, passes: int) -> _Loaded:
+    """Batches of many passes over a dataset: workers begin once."""
+
+    def begin(number: int) -> DataLoader:
+        generator = seeded(number)
+        order = torch.cat([torch.randperm(len(data), generator=generator) for _ in range(passes)]).tolist()
+        if hasattr(data, "set_epoch"):
+            data.set_epoch(number)
+        return DataLoader(data, batch_size=BATCH, sampler=order, num_workers=workers, collate_fn=collate)
+
+    return _Loaded(begin)
+
+
+def copied(clouds: _Clouds) -> _Loaded:
+    """The loop of memcpy, of bytes that lie in memory."""
+    samples = np.stack([np.concatenate([cloud.points, cloud.colors], axis=1) for cloud in map(clouds.load, clouds.ids)])
+    batch = np.empty((BATCH, POINTS, 6), np.float32)
+
+    def begin(number: int) -> Iterator[Any]:
+        order = np.random.default_rng(number).permutation(len(samples))
+        for first in range(0, len(order) - BATCH + 1, BATCH):
+            for place, sample in enumerate(order[first : first + BATCH].tolist()):
+                batch[place] = samples[sample]
+            yield batch
+
+    return _Loaded(begin)
+
+
+def peers(folder: Path, clouds: _Clouds, workers: int, passes: int) -> dict[str, _Loaded | str]:
+    """Other libraries' ways, or why there is none."""
+    found: dict[str, _Loaded | str] = {}
+    for name, make in (("WebDataset", _webdataset), ("LitData", _litdata), ("Zarr", _zarr), ("Lance", _lance)):
+        try:
+            found[name] = make(folder, clouds, workers, passes)
+        except Exception as error:  # not installed, or another interface than the one written for
+            found[name] = f"{type(error).__name__}: {error}"[:200]
+    return found
+
+
+def _arrays(clouds: _Clouds, sample_id: str) -> np.ndarray:
+    cloud = clouds.load(sample_id)
+    return np.concatenate([cloud.points.numpy(), cloud.colors.numpy()], axis=1)
+
+
+def _webdataset(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
+    import webdataset
+
+    for shard in range(4):
+        with tarfile.open(folder / f"{shard}.tar", "w") as tar:
+            for sample_id in clouds.ids[shard::4]:
+                content = io.BytesIO()
+                np.save(content, _arrays(clouds, sample_id))
+                entry = tarfile.TarInfo(f"{sample_id}.npy")
+                entry.size = len(content.getvalue())
+                tar.addfile(entry, io.BytesIO(content.getvalue()))
+    urls = [str(folder / f"{shard}.tar") for shard in range(4)]
+
+    def begin(number: int) -> Any:
+        data = webdataset.WebDataset(urls * passes, shardshuffle=100, seed=number).shuffle(256).decode().to_tuple("npy")
+        return DataLoader(data.batched(BATCH), batch_size=None, num_workers=workers)
+
+    return _Loaded(begin)
+
+
+def _litdata(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
+    from litdata import StreamingDataLoader, StreamingDataset
+    from litdata.streaming import BinaryWriter
+
+    target = folder / "litdata"
+    target.mkdir()
+    writer = BinaryWriter(str(target), chunk_bytes="64MB")
+    for number, sample_id in enumerate(clouds.ids):
+        writer[number] = {"cloud": torch.from_numpy(_arrays(clouds, sample_id))}
+    writer.done()
+    writer.merge()
+    data = StreamingDataset(str(target), shuffle=True)
+    return _Loaded(lambda number: StreamingDataLoader(data, batch_size=BATCH, num_workers=workers))
+
+
+class _ZarrSamples(Dataset):
+    def __init__(self, path: str, size: int) -> None:
+        self.path, self.size, self.array = path, size, None
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, index: int) -> Any:
+        import zarr
+
+        if self.array is None:
+            self.array = zarr.open_array(self.path, mode="r")
+        return self.array[index]
+
+
+def _zarr(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
+    import zarr
+
+    path = str(folder / "samples.zarr")
+    shape = (len(clouds), POINTS, 6)
+    array = zarr.create_array(path, shape=shape, chunks=(1, POINTS, 6), dtype="float32", compressors=None)
+    for number, sample_id in enumerate(clouds.ids):
+        array[number] = _arrays(clouds, sample_id)
+    return loader_of(_ZarrSamples(path, len(clouds)), default_collate, workers, passes)
+
+
+class _LanceSamples(Dataset):
+    def __init__(self, path: str, size: int) -> None:
+        self.path, self.size, self.data = path, size, None
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitems__(self, indices: Sequence[int]) -> Any:
+        import lance
+
+        self.data = self.data or lance.dataset(self.path)
+        taken = self.data.take(list(indices), columns=["cloud"])["cloud"].combine_chunks()
+        return torch.from_numpy(taken.flatten().to_numpy().reshape(len(indices), POINTS, 6).copy())
+
+
+def _lance(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
+    import lance
+    import pyarrow
+
+    flat = np.concatenate([_arrays(clouds, sample_id).reshape(-1) for sample_id in clouds.ids])
+    table = pyarrow.table({"cloud": pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(flat), POINTS * 6)})
+    lance.write_dataset(table, str(folder / "samples.lance"))
+    return loader_of(_LanceSamples(str(folder / "samples.lance"), len(clouds)), _as_it_is, workers, passes)
+
+
+def rate(way: _Loaded, batches: int) -> float:
+    """Samples a second over so many batches."""
+    begun = time.perf_counter()
+    for _ in way.batches(batches):
         pass
-    return time.process_time() - begun
+    return batches * BATCH / (time.perf_counter() - begun)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--samples", type=int, default=256)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--samples", type=int, default=1024)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--batches", type=int, default=96, help="of a stretch; slow ways have a sixteenth")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=RESULTS / "loading.json")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    warnings.simplefilter("ignore", UserWarning)  # a second pass in one epoch: the order is of many passes
     clouds = _Clouds(arguments.samples)
-    with tempfile.TemporaryDirectory() as folder:
-        read: dict[str, tuple[Any, Callable[..., Any]]] = {
-            "copy in memory": (_Copied(clouds), lambda batch: batch),
-            "npz and default_collate": (_PlainFiles(Path(folder) / "plain", clouds), default_collate),
+    passes = max(1, 64 * BATCH * arguments.repeats // arguments.samples)
+
+    def loaded(data: Dataset, collate: Callable[..., Any]) -> _Loaded:
+        return loader_of(data, collate, arguments.workers, passes)
+
+    with tempfile.TemporaryDirectory() as named:
+        folder = Path(named)
+        ways: dict[str, Any] = {
+            "memcpy": copied(clouds),
+            "torch's ceiling": loaded(_Ready(arguments.samples, fresh=False), _as_it_is),
+            "fresh tensor": loaded(_Ready(arguments.samples, fresh=True), _as_it_is),
+            "npz and default_collate": loaded(_PlainFiles(folder / "plain", clouds), default_collate),
+            "hdf5 group per sample": loaded(_Groups(folder / "groups.h5", clouds), default_collate),
         }
-        for form in STORES:
-            config = config_from_yaml(f"cloud: [Center]\n{AUGMENT}output: {{format: {form}}}\n")
-            build_dataset(config, clouds, Path(folder) / form)
-            read[form] = CachedCloudDataset(Path(folder) / form, augment=None), collate_fixed
-            read[f"{form}, augmented"] = CachedCloudDataset(Path(folder) / form), collate_fixed
-        found: dict[str, list[float]] = {name: [] for name in read}
-        for _ in range(arguments.repeats + 1):  # in turns: a load from elsewhere meets all of them
-            for name, (dataset, collate) in read.items():
-                found[name].append(1e6 * seconds(dataset, collate) / arguments.samples)
-    row = {name: round(statistics.median(times[1:]), 1) for name, times in found.items()}
-    plain = row["npz and default_collate"]
+        for number, (name, steps) in enumerate(SUFFIXES.items()):
+            built = folder / f"packed{number}"
+            config = config_from_yaml(f"cloud: [Center]\naugment: {steps}\noutput: {{format: packed}}\n")
+            build_dataset(config, clouds, built)
+            if number == 0:
+                ways["packed"] = loaded(CachedCloudDataset(built, augment=None), collate_fixed)
+            ways[f"packed, {name}"] = loaded(CachedCloudDataset(built), collate_packed)
+        skipped = {}
+        for name, way in peers(folder, clouds, arguments.workers, passes).items():
+            (skipped if isinstance(way, str) else ways)[name] = way
+        rates: dict[str, list[float]] = {name: [] for name in ways}
+        for number in range(arguments.repeats + 1):  # the first stretch begins workers and fills caches
+            for name, way in list(ways.items()):
+                is_ours = name in ("memcpy", "torch's ceiling") or name.startswith("packed")
+                count = arguments.batches if is_ours else max(4, arguments.batches // 16)
+                try:
+                    found = rate(way, count)
+                except Exception as error:  # a peer whose interface changed
+                    skipped[name] = f"{type(error).__name__}: {error}"[:200]
+                    del ways[name], rates[name]
+                    continue
+                if number:
+                    rates[name].append(found)
+        del ways
+    per_second = {name: round(statistics.median(found)) for name, found in rates.items()}
+    packed = per_second["packed"]
     document = {
         "benchmark": "loading",
         "samples": arguments.samples,
         "points": POINTS,
+        "bytes_per_sample": BYTES,
         "batch": BATCH,
-        "repeats": arguments.repeats,
-        "microseconds_per_sample": row,
-        "first_pass_of_packed": round(found["packed"][0], 1),
-        "speed_over_npz_and_default_collate": {name: round(plain / row[name], 2) for name in row},
-        "share_of_the_rate_of_a_copy": {name: round(row["copy in memory"] / row[name], 3) for name in row},
+        "workers": arguments.workers,
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "torch": torch.__version__,
+        "samples_per_second": per_second,
+        "quartiles": {name: [round(part) for part in np.percentile(found, [25, 75])] for name, found in rates.items()},
+        "gigabytes_per_second": {name: round(found * BYTES / 1e9, 2) for name, found in per_second.items()},
+        "packed_over": {name: round(packed / found, 2) for name, found in per_second.items() if name != "packed"},
+        "share_of_memcpy": {name: round(found / per_second["memcpy"], 3) for name, found in per_second.items()},
+        "rate_lost_to_augmentation": {name: round(1 - per_second[f"packed, {name}"] / packed, 3) for name in SUFFIXES},
+        "not_measured": skipped,
     }
     print(json.dumps(document, indent=1))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "loading.json").write_text(json.dumps(document, indent=1) + "\n")
+    arguments.out.parent.mkdir(exist_ok=True)
+    arguments.out.write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -100,6 +100,7 @@ _HOMES = {
         "CachedCloudDataset",
         "CloudDataset",
         "CountedSampler",
+        "DevicePipeline",
         "EpisodeWindows",
         "collate_fixed",
         "collate_packed",

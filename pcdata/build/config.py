@@ -82,6 +82,7 @@ class Loader(BaseModel):
     batch_size: Annotated[int, Ge(1)] = 8
     num_workers: Annotated[int, Ge(0)] = 2
     collate: Collate = "packed"  # of windows: "windows"
+    buckets: tuple[Annotated[int, Ge(1)], ...] = ()  # lengths that padded batches are rounded up to; none = any
     seed: int = 0
     split: str | None = None  # which samples, as "pcdata split" draws them; None = all
     windows: Windows | None = None  # of clouds and actions, where the source has episodes; None = single clouds
@@ -94,6 +95,10 @@ class Loader(BaseModel):
 
     @model_validator(mode="after")
     def _have_windows(self) -> Loader:
+        if self.buckets and self.collate != "padded":
+            raise ValueError(f"buckets are lengths of padded batches; write collate: padded, not {self.collate}")
+        if list(self.buckets) != sorted({*self.buckets}):
+            raise ValueError(f"buckets must rise, as in [1024, 2048, 4096], got {list(self.buckets)}")
         if self.collate == "windows" and self.windows is None:
             raise ValueError("collate: windows stacks windows; say which: windows: {num_obs: 2, horizon: 16}")
         return self

@@ -11,7 +11,7 @@ from pcdata.models import Preset
 
 _TEMPLATE = '''"""Load this dataset, batch by batch: python load.py{usage}"""
 
-{argparse}from pathlib import Path
+{argparse}{functools}from pathlib import Path
 
 from torch.utils.data import DataLoader
 
@@ -54,9 +54,9 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         made: the preset of the model that the dataset was built for: batches are the model's tensors.
         imports: names of the files that define steps of the dataset: the script asks for their paths.
     """
-    settings = loader.model_dump(exclude={"collate", "windows"})
+    settings = loader.model_dump(exclude={"collate", "buckets", "windows"})
     settings["split"] = "" if loader.split is None else f", split={loader.split!r}"
-    settings |= {"usage": "", "argparse": "", "imports": "", "samples": "dataset"}
+    settings |= {"usage": "", "argparse": "", "functools": "", "imports": "", "samples": "dataset"}
     if imports:
         files = ", ".join(imports)
         missing = f"this dataset has steps of its own; say where they are: --import FILE.py, for {files}"
@@ -66,6 +66,9 @@ def loading_script(loader: Loader, made: Preset | None = None, imports: Sequence
         name = collate = COLLATES[loader.collate].__name__
         if not hasattr(pcdata.datasets, name):  # one of the user's own
             name, collate = "COLLATES", f"COLLATES[{loader.collate!r}]"
+        if loader.buckets:
+            settings["functools"] = "from functools import partial\n"
+            collate = f"partial({collate}, buckets={loader.buckets!r})"
         shapes = ", points {tuple(batch.points.shape)}"
         line, names = "", [name]
         if loader.windows is not None:

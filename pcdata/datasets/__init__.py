@@ -1,6 +1,5 @@
 """Datasets of clouds and the collate functions that feed a DataLoader."""
 
-import pcdata.datasets.batch_transport  # noqa: F401 - how batches are pickled is known once it is imported
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.datasets.clouds import CloudDataset
 from pcdata.datasets.collate import (
@@ -12,6 +11,7 @@ from pcdata.datasets.collate import (
     register_collate,
 )
 from pcdata.datasets.copies import CountedSampler
+from pcdata.datasets.device_pipeline import DevicePipeline
 from pcdata.datasets.epoch_setting import set_epoch
 from pcdata.datasets.normalizers import LinearNormalizer, fit_normalizers
 from pcdata.datasets.passes import RepeatedEpochWarning
@@ -26,6 +26,7 @@ __all__ = [
     "CachedCloudDataset",
     "CloudDataset",
     "CountedSampler",
+    "DevicePipeline",
     "EpisodeWindows",
     "LinearNormalizer",
     "RepeatedEpochWarning",

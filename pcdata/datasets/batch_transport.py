@@ -20,17 +20,18 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
-from pcdata.datasets.window_batch import WindowBatch
 from pcdata.errors import CacheError
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.structure import Structure, derived, with_tensors
+
+S = TypeVar("S", bound=Structure)
 
 _ALIGNED = 64  # bytes: a line of the processor's cache
 _HEAD = 4096  # bytes before the tensors: who holds the block, and its name
@@ -38,6 +39,7 @@ _NAME = slice(16, 32)
 _WORKER, _RECEIVER = 0, 1  # bytes of the head, 1 = holds it
 _MOST_BLOCKS = 32  # of one worker; a receiver that keeps more batches gets the others as torch sends them
 _MOST_FREE = 8  # that wait to be used again
+_SPARE = 1 << 16  # bytes
 
 
 class _Place(NamedTuple):
@@ -71,18 +73,28 @@ class _Block:
             os.close(self.file)
             raise
         self.content[_NAME] = self.name
-        self.begin = 0  # its address, while a tensor of it lives
+        self.begin = self.used = 0  # its address, while a tensor of it lives, and how many bytes were taken
 
     @property
     def is_free(self) -> bool:
         return self.content[_WORKER] == self.content[_RECEIVER] == 0
 
-    def take(self) -> Tensor:
-        """Return the memory, held until nothing uses it."""
+    def take(self, size: int) -> Tensor:
+        """Return so many bytes of the memory, which is held until nothing uses it."""
         self.content[_WORKER] = 1
         memory = _memory(self.content, _WORKER)
-        self.begin = memory.data_ptr()
-        return memory
+        self.begin, self.used = memory.data_ptr(), size
+        return memory[:size]
+
+    def holds(self, tensor: Tensor) -> bool:
+        begin = tensor.data_ptr() - self.begin
+        return begin >= 0 and begin + tensor.nbytes <= self.used and tensor.is_contiguous()
+
+    def rest(self) -> Tensor:
+        """Return the memory behind what was taken, while that is held."""
+        return torch.from_numpy(np.frombuffer(self.content, np.uint8, offset=_HEAD))[
+            self.used + -self.used % _ALIGNED :
+        ]
 
     def drop(self) -> None:
         """Forget the memory; the receiver may still have it."""
@@ -106,26 +118,25 @@ class _Blocks:
             free = [block for block in self._blocks if block.is_free]
             fitting = [block for block in free if size <= block.size]
             if fitting:
-                return min(fitting, key=lambda block: block.size).take()
+                return min(fitting, key=lambda block: block.size).take(size)
             for block in free if len(free) >= _MOST_FREE else free[:1]:  # too small: make room for a larger one
                 self._blocks.remove(block)
                 block.drop()
             if len(self._blocks) >= _MOST_BLOCKS:
                 return None
             try:
-                block = _Block(size + (size >> 3))  # batches of other lengths differ a little
+                block = _Block(size + (size >> 3) + _SPARE)  # batches differ a little, and masks are added
             except OSError:  # no memory, or no files: torch says so, if it has none either
                 return None
             self._blocks.append(block)
-            return block.take()
+            return block.take(size)
 
-    def holding(self, tensors: list[Tensor]) -> _Block | None:
-        """Return the block that all these tensors lie in."""
-        begins = [(tensor.data_ptr(), tensor.data_ptr() + tensor.nbytes) for tensor in tensors]
+    def holding(self, tensor: Tensor) -> _Block | None:
+        """Return the block that a tensor lies in, unless it was sent already."""
         with self._lock:
             for block in self._blocks:
                 is_own = block.begin and block.content[_WORKER] and not block.content[_RECEIVER]
-                if is_own and all(block.begin <= begin and end <= block.begin + block.size for begin, end in begins):
+                if is_own and block.holds(tensor):
                     return block
         return None
 
@@ -172,6 +183,12 @@ def _let_go(content: mmap.mmap, holder: int, process: int) -> None:
             _forget_the_dead()
 
 
+def sent_together(kind: type[S]) -> type[S]:
+    """Let the tensors of a kind of batch travel in one block; a decorator."""
+    ForkingPickler.register(kind, _reduced)
+    return kind
+
+
 # -- sending ----------------------------------------------------------------------------------------------------------
 
 
@@ -199,29 +216,39 @@ def _is_plain(tensor: Tensor) -> bool:
 
 
 def _sent(structure: Structure, tensors: list[Tensor]) -> Any:
-    block = _BLOCKS.holding(tensors) if all(tensor.is_contiguous() for tensor in tensors) else None
-    if block is None:
-        memory = _BLOCKS.take(sum(tensor.nbytes + -tensor.nbytes % _ALIGNED for tensor in tensors))
-        block = None if memory is None else _BLOCKS.holding([memory])
+    block = _BLOCKS.holding(max(tensors, key=lambda tensor: tensor.nbytes))
+    rest = None
+    if block is not None:  # what else there is goes behind it, such as a mask
+        others = [tensor for tensor in tensors if not block.holds(tensor)]
+        rest = block.rest()
+    if block is None or rest is None or _size(others) > len(rest):
+        memory = _BLOCKS.take(_size(tensors))
+        block = None if memory is None else _BLOCKS.holding(memory)
         if memory is None or block is None:
             return None
-        places = iter(_laid(tensors, memory))
-    else:
-        begin = block.begin
-        places = iter([_Place(one.data_ptr() - begin, one.dtype, tuple(one.shape)) for one in tensors])
-    state = {name: with_tensors(value, lambda tensor: next(places)) for name, value in vars(structure).items()}
+        others, rest = tensors, memory
+    begin, free = block.begin, rest.data_ptr() - block.begin
+    laid = {id(tensor) for tensor in others}
+    places = []
+    for tensor in tensors:
+        if id(tensor) not in laid:
+            places.append(_Place(tensor.data_ptr() - begin, tensor.dtype, tuple(tensor.shape)))
+            continue
+        places.append(_Place(free, tensor.dtype, tuple(tensor.shape)))
+        _at(rest, places[-1]._replace(begin=free + begin - rest.data_ptr())).copy_(tensor)
+        free += _aligned(tensor.nbytes)
+    swap = iter(places)
+    state = {name: with_tensors(value, lambda tensor: next(swap)) for name, value in vars(structure).items()}
     block.content[_RECEIVER] = 1
     return _received, (type(structure), state, _Sent(os.getpid(), block.file, block.size, block.name))
 
 
-def _laid(tensors: list[Tensor], memory: Tensor) -> list[_Place]:
-    """Copy tensors one after another; return where each is."""
-    places, begin = [], 0
-    for tensor in tensors:
-        places.append(_Place(begin, tensor.dtype, tuple(tensor.shape)))
-        _at(memory, places[-1]).copy_(tensor)
-        begin += tensor.nbytes + -tensor.nbytes % _ALIGNED
-    return places
+def _size(tensors: list[Tensor]) -> int:
+    return sum(_aligned(tensor.nbytes) for tensor in tensors)
+
+
+def _aligned(size: int) -> int:
+    return size + -size % _ALIGNED
 
 
 def _at(memory: Tensor, place: _Place) -> Tensor:
@@ -283,5 +310,5 @@ def _forget_the_dead() -> None:
             continue
 
 
-for _kind in (PointCloud, PaddedClouds, WindowBatch):
-    ForkingPickler.register(_kind, _reduced)
+for _kind in (PointCloud, PaddedClouds):
+    sent_together(_kind)

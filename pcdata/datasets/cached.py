@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
+from pcdata.datasets.batch_transport import batch_memory
 from pcdata.datasets.passes import shared
 from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.datasets.splits import FILE_NAME as SPLITS
@@ -20,7 +21,7 @@ from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.sample_index import SampleIndex
 from pcdata.io.store.shards import SIGNALS_KEY, Shards, shard_folder
-from pcdata.rng import child_seed, seeded
+from pcdata.rng import Streams
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.episodes import kept_episodes
 from pcdata.structures.unbatched import Unbatched
@@ -205,7 +206,7 @@ class CachedCloudDataset(SampleDataset):
     def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
         """Return the clouds of some samples as one batch; None where that of one by one would be another."""
         rows = [self._rows[number] for number in numbers]
-        record = self._shards.read_joined(rows) if self._compared(rows) else None
+        record = self._shards.read_joined(rows, batch_memory) if self._compared(rows) else None
         if record is None:
             single = [self._load(number) for number in numbers]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
@@ -217,7 +218,7 @@ class CachedCloudDataset(SampleDataset):
         wanted = self.manifest.index.num_points[rows].tolist()
         return clouds if clouds.num_clouds == len(numbers) and clouds.counts.tolist() == wanted else None
 
-    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
         if not runs_on_batches(self.transform):
             return None
         batches = []
@@ -225,8 +226,11 @@ class CachedCloudDataset(SampleDataset):
             clouds = self._load_at_once(numbers[part])
             if clouds is None:
                 return None
-            streams = None if generators is None else [seeded(child_seed(one)) for one in generators[part]]
-            batches.append(self._transformed(clouds, streams))
+            own = None if streams is None else streams.part(part)
+            if type(self.transform) is Compose and len(self.transform):  # the clouds were read for this batch alone
+                batches.append(self.transform.consume(clouds, generator=own))
+            else:
+                batches.append(self._transformed(clouds, own))
         return Unbatched(batches)
 
     def _parts(self, numbers: Sequence[int], each: int = 1) -> Iterator[slice]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from pcdata.contracts.numbers import whole_number
 from pcdata.datasets.window_batch import WindowBatch, window_batch
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.registry import Registry
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.unbatched import Unbatched
 
-Collate = Callable[[Sequence[PointCloud]], Any]
+Collate = Callable[..., Any]  # of a sequence of clouds
 
 COLLATES: Registry[Collate] = Registry("collate function")
 
@@ -39,10 +42,37 @@ def collate_packed(clouds: Sequence[PointCloud]) -> PointCloud:
 
 
 @register_collate
-def collate_padded(clouds: Sequence[PointCloud]) -> PaddedClouds:
-    """Pad clouds to the longest of the batch; ``mask`` says which rows are real."""
-    _check("collate_padded", clouds)
-    return PointCloud.cat_padded(clouds)
+def collate_padded(clouds: Sequence[PointCloud], *, buckets: Sequence[int] = ()) -> PaddedClouds:
+    """Pad clouds to the longest of the batch; ``mask`` says which rows are real.
+
+    Args:
+        clouds: the samples.
+        buckets: the lengths that batches may have, rising: the longest cloud is rounded up to one of them, so that
+            ``torch.compile`` compiles a network once for each and not for every batch. For a loader,
+            ``functools.partial(collate_padded, buckets=(1024, 2048, 4096))``; () = any length.
+
+    Raises:
+        ShapeError: a cloud is longer than the last bucket.
+        ConfigError: the buckets do not rise from 1 or more.
+    """
+    where = "collate_padded"
+    _check(where, clouds)
+    if not buckets:
+        return PointCloud.cat_padded(clouds)
+    lengths = [whole_number(where, "a bucket", bucket) for bucket in buckets]
+    if lengths[0] < 1 or any(one >= other for one, other in itertools.pairwise(lengths)):
+        raise ConfigError(
+            f"{where}: buckets must be lengths that rise, such as (1024, 2048, 4096), got {buckets!r:.100}"
+        )
+    batches = clouds.batches if isinstance(clouds, Unbatched) else clouds
+    longest = max((int(one.counts.max()) for one in batches), default=0)
+    place = bisect.bisect_left(lengths, longest)
+    if place == len(lengths):
+        raise ShapeError(
+            f"{where}: a cloud has {longest} points, more than the last bucket {lengths[-1]}; add a bucket that holds "
+            "it, or end the pipeline with RandomSample or FarthestPointSample"
+        )
+    return PointCloud.cat_padded(clouds, lengths[place])
 
 
 @register_collate

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Generator
 from torch.utils.data import Dataset, get_worker_info
 
 from pcdata.contracts.dispatch import warn_if_slow
@@ -17,10 +17,12 @@ from pcdata.datasets.split_drawing import split_episodes
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.io.store.sample_index import SampleIds
-from pcdata.rng import generator_for
+from pcdata.rng import GeneratorLike, Streams, sample_key
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Transform
+
+DRAWS = "stream"  # in the meta of a cloud: the key of its random draws
 
 
 class _Asked(NamedTuple):
@@ -60,6 +62,7 @@ class SampleDataset(Dataset[PointCloud]):
         self.repeats = repeats
         self.transform = transform
         self.seed = seed
+        self.notes_draws = False  # whether samples say in their meta which stream is theirs: see DevicePipeline
         self._epoch = shared(torch.zeros((), dtype=torch.int64, device="cpu"))
         self._passes = PassWatch(len(self))
 
@@ -124,12 +127,10 @@ class SampleDataset(Dataset[PointCloud]):
         asked = self._asked(index)
         sample_id = self.ids[asked.number]
         try:
-            generator = None
-            if self.transform is not None:
-                if self.transform.is_random and not asked.again:
-                    self._passes.note(asked.place, repr(self))
-                generator = self._generator(asked)
-            return self._made(asked.number, generator)
+            if self.transform is not None and self.transform.is_random and not asked.again:
+                self._passes.note(asked.place, repr(self))
+            made = self._made(asked.number, self._streams([asked]))
+            return _noted(made, self._keys_of(made, self._streams([asked]))) if self.notes_draws else made
         except Exception as error:
             add_note(error, f"sample {sample_id!r} of {self!r}", sample_id=sample_id)
             if get_worker_info() is not None:
@@ -153,19 +154,35 @@ class SampleDataset(Dataset[PointCloud]):
 
         Stored clouds are read at once and go through the steps as one batch, each with its own draws.
         """
-        asked = [self._asked(index) for index in indices]
+        asked = self._all_asked(indices)
         is_random = self.transform is not None and self.transform.is_random
         try:
-            made = self._made_at_once(
-                [one.number for one in asked], [self._generator(one) for one in asked] if is_random else None
-            )
+            made = self._made_at_once([one.number for one in asked], self._streams(asked) if is_random else None)
         except Exception:  # a sample is at fault: read by itself, it is named
             made = None
         if made is None:
             return [self[index] for index in indices]
         if is_random and (places := [one.place for one in asked if not one.again]):
             self._passes.note_all(places, repr(self))
+        if self.notes_draws:  # clouds of one sample that is made at once share its draws
+            keys = [key for key in self._streams(asked).keys for _ in range(made.each)]
+            ends = [0, *itertools.accumulate(batch.num_clouds for batch in made.batches)]
+            cut = [keys[begin:end] for begin, end in itertools.pairwise(ends)]
+            return Unbatched([_noted(one, own) for one, own in zip(made.batches, cut, strict=True)], made.each)
         return made
+
+    def _all_asked(self, indices: Sequence[int | tuple[int, int]]) -> list[_Asked]:
+        """Return what indices mean; most are plain numbers, of which a batch has many."""
+        count = len(self.ids)
+        size = count * self.repeats
+        asked = []
+        for index in indices:
+            if type(index) is int and 0 <= index < size:
+                copy, number = divmod(index, count)
+                asked.append(_Asked(index, number, copy, 0))
+            else:
+                asked.append(self._asked(index))
+        return asked
 
     def _asked(self, index: int | tuple[int, int]) -> _Asked:
         given, again = index if isinstance(index, tuple) else (index, 0)
@@ -173,18 +190,24 @@ class SampleDataset(Dataset[PointCloud]):
         copy, number = divmod(place, len(self.ids))
         return _Asked(place, number, copy + again * self.repeats, again)
 
-    def _generator(self, asked: _Asked) -> Generator:
-        return generator_for(self.seed, self.epoch, self.ids[asked.number], copy=asked.copy)
+    def _streams(self, asked: Sequence[_Asked]) -> Streams:
+        """Return the stream of each sample."""
+        seed, epoch = self.seed, self.epoch
+        return Streams([sample_key(seed, epoch, self.ids[one.number], copy=one.copy) for one in asked])
 
-    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+    def _keys_of(self, made: PointCloud, streams: Streams) -> list[int]:
+        """Return the key of the stream that random steps would draw from for each cloud of a sample."""
+        return Streams.of(streams, made.num_clouds).keys
+
+    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
         """Return what :meth:`_made` does for each, or None where that must be done; None = nothing is drawn."""
         return None
 
-    def _made(self, number: int, generator: Generator | None) -> PointCloud:
+    def _made(self, number: int, streams: Streams) -> PointCloud:
         """Load a sample and run the transform on it."""
-        return self._transformed(self._load(number), generator)
+        return self._transformed(self._load(number), streams)
 
-    def _transformed(self, data: Any, generator: Generator | Sequence[Generator] | None) -> PointCloud:
+    def _transformed(self, data: Any, generator: GeneratorLike | None) -> PointCloud:
         if self.transform is not None:
             data = self.transform(data, generator=generator)
         if not isinstance(data, self.gives):
@@ -204,6 +227,11 @@ class SampleDataset(Dataset[PointCloud]):
     def _load(self, index: int) -> Any:
         """Load the sample before the transform."""
         raise NotImplementedError
+
+
+def _noted(made: PointCloud, keys: Sequence[int]) -> PointCloud:
+    """Note in every cloud's meta the key of its stream."""
+    return made.with_meta([{DRAWS: key} for key in keys])
 
 
 def runs_on_batches(transform: Transform | None) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.datasets.batch_transport import sent_together
 from pcdata.datasets.windows import WINDOW
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.structures import PaddedClouds, PointCloud
@@ -17,6 +18,7 @@ from pcdata.structures.structure import Structure
 from pcdata.structures.unbatched import Unbatched
 
 
+@sent_together
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WindowBatch(Structure):
     """B windows of T clouds, oldest first, and what belongs to them; ``to(device)`` moves all of it.

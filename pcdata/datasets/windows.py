@@ -9,13 +9,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Generator, Tensor
+from torch import Tensor
 
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.datasets.window_places import window_places, window_steps
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataWarning, ShapeError, near_matches
-from pcdata.rng import child_seed, seeded
+from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, Episode, PointCloud, Signal
 from pcdata.structures.episodes import checked_episodes
 from pcdata.structures.signals import is_frame_of_camera
@@ -146,15 +146,15 @@ class EpisodeWindows(SampleDataset):
     def _load(self, index: int) -> PointCloud:
         raise DTypeError("EpisodeWindows: a window is no single sample; give the dataset that it is cut from")
 
-    def _made(self, number: int, generator: Generator | None) -> PointCloud:
+    def _made(self, number: int, streams: Streams) -> PointCloud:
         steps = self.steps(number)
         shown, again = np.unique(steps[: self.num_obs], return_inverse=True)
-        clouds = self._clouds(shown.tolist(), generator)
+        clouds = self._clouds(shown.tolist(), streams)
         if len(shown) < self.num_obs:
             clouds = PointCloud.cat([clouds[int(place)] for place in again.tolist()])
         return self._with_actions(clouds, [number], steps[None])
 
-    def _made_at_once(self, numbers: Sequence[int], generators: Sequence[Generator] | None) -> Unbatched | None:
+    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
         if not isinstance(self.dataset, CachedCloudDataset) or not runs_on_batches(self.transform):
             return None
         steps = self._steps(numbers)
@@ -165,25 +165,21 @@ class EpisodeWindows(SampleDataset):
             if clouds is None:
                 return None
             windows = slice(part.start // self.num_obs, part.stop // self.num_obs)
-            streams = None
-            if generators is not None:  # the clouds of a window get the same draws
-                streams = [one for given in generators[windows] for one in [seeded(child_seed(given))] * self.num_obs]
-            made = self._transformed(clouds, streams)
+            # The clouds of a window get the same draws.
+            made = self._transformed(clouds, None if streams is None else streams.part(windows, self.num_obs))
             batches.append(self._with_actions(made, numbers[windows], steps[windows]))
         return Unbatched(batches, self.num_obs)
 
-    def _clouds(self, shown: Sequence[int], generator: Generator | None) -> PointCloud:
+    def _keys_of(self, made: PointCloud, streams: Streams) -> list[int]:
+        return streams.keys * made.num_clouds
+
+    def _clouds(self, shown: Sequence[int], streams: Streams) -> PointCloud:
         """Return one cloud for each of these samples, all with the same draws."""
-        seed = None if generator is None else child_seed(generator)
-
-        def streams(count: int) -> list[Generator] | None:
-            return None if seed is None else [seeded(seed)] * count
-
         data = [self.dataset._load(place) for place in shown]
         if all(isinstance(one, PointCloud) and one.num_clouds == 1 for one in data):
-            made = [self._transformed(PointCloud.cat(data), streams(len(data)))]
+            made = [self._transformed(PointCloud.cat(data), streams.part(slice(1), len(data)))]
         else:  # captures: each has views and a size of its own
-            made = [self._transformed(one, streams(1)) for one in data]
+            made = [self._transformed(one, streams.part(slice(1))) for one in data]
         counts = [one.num_clouds for one in made]
         if sum(counts) != len(shown) or len({*counts}) > 1:
             raise ShapeError(
@@ -240,7 +236,7 @@ class EpisodeWindows(SampleDataset):
         episode = self._episodes[number]
         if number not in self._poses:
             some = sorted({episode.first, episode.first + episode.length // 2, episode.first + episode.length - 1})
-            first, *others = [self._clouds([place], seeded(0)).frames for place in some]
+            first, *others = [self._clouds([place], Streams([0])).frames for place in some]
             self._poses[number] = first if all(_all_at(first, one) for one in others) else None
         # One that comes back shows only in the windows between, and each step is shown by one.
         where = self._poses[number]

@@ -23,7 +23,7 @@ from pcdata.io import open_source
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids
 from pcdata.io.sources.listing import absolute
 from pcdata.io.store.manifest import FILE_NAME
-from pcdata.rng import generator_for
+from pcdata.rng import Streams, sample_key
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.transforms import Compose, SpatialTransform, Transform
 
@@ -155,7 +155,7 @@ class DrawnClouds:
         before = data.source_from_cloud if isinstance(data, PointCloud) else None
         if transform is not None:
             key = self._key.get(number, self._dataset.ids[number])
-            data = transform(data, generator=generator_for(self.seed, self.epoch, key, copy=copy))
+            data = transform(data, generator=Streams([sample_key(self.seed, self.epoch, key, copy=copy)]))
         if not isinstance(data, PointCloud):
             raise DTypeError(f"{self!r}: gives a {type(data).__name__}; clouds are exported, so end in Deproject")
         self.moved = self._may_move if before is None else not torch.equal(before, data.source_from_cloud)

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
@@ -62,6 +63,23 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask."""
     index = torch.nonzero(rows).squeeze(1) if rows.dtype is torch.bool else rows
     return {name: field[index] for name, field in fields.items()}
+
+
+@inner
+def copy_blocks(
+    into: Tensor,  # (bytes,) uint8
+    begins: NDArray[np.int64],  # (...) where each block goes
+    sources: Sequence[NDArray[np.uint8]],
+    which: NDArray[np.int64],  # (...) the source of each block
+    starts: NDArray[np.int64],  # (...) where it begins there
+    sizes: NDArray[np.int64],  # (...) bytes
+) -> None:
+    """Copy blocks of bytes out of arrays in memory, or of mapped files, that hold them; all numbers broadcast."""
+    held = into.numpy()
+    for begin, source, start, size in zip(
+        *(one.ravel().tolist() for one in np.broadcast_arrays(begins, which, starts, sizes))
+    ):
+        held[begin : begin + size] = sources[source][start : start + size]
 
 
 @inner

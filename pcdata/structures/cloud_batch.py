@@ -17,7 +17,7 @@ from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
 from pcdata.structures.pose_layouts import motion_by
 from pcdata.structures.signal_joining import joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, attached, refuse_mirror, signals_now
-from pcdata.structures.stored_steps import Step, StoredSteps
+from pcdata.structures.stored_steps import Histories, Step
 from pcdata.structures.structure import Structure, derived
 
 Clouds = TypeVar("Clouds", bound="CloudBatch")
@@ -26,16 +26,15 @@ Clouds = TypeVar("Clouds", bound="CloudBatch")
 class _Histories:
     """The attribute ``history`` of clouds: a tuple of the steps of each, as everybody sees it.
 
-    ``vars(clouds)["history"]`` is what they hold: steps that nobody has read yet may be :class:`StoredSteps`.
+    ``vars(clouds)["history"]`` is what they hold: :class:`Histories` where nobody has read them yet.
     """
 
     def __get__(self, clouds: Any, owner: type) -> Sequence[Sequence[Step]]:
         if clouds is None:
             return ()  # the default, as dataclasses ask for it
-        held: Sequence[Any] = vars(clouds)["history"]
-        if any(isinstance(one, StoredSteps) for one in held):
-            held = tuple([one.read() if isinstance(one, StoredSteps) else one for one in held])
-            vars(clouds)["history"] = held
+        held: Any = vars(clouds)["history"]
+        if isinstance(held, Histories):
+            held = vars(clouds)["history"] = tuple(held)
         return held
 
     def __set__(self, clouds: Any, value: Sequence[Any]) -> None:
@@ -229,7 +228,7 @@ def joined_facts(clouds: Sequence[CloudBatch]) -> dict[str, Any]:
         "source_from_cloud": torch.cat([cloud.source_from_cloud for cloud in clouds]),
         "frames": {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in shared},
         "meta": tuple(entry for cloud in clouds for entry in cloud.meta),
-        "history": tuple(steps for cloud in clouds for steps in vars(cloud)["history"]),
+        "history": Histories(vars(cloud)["history"] for cloud in clouds),
         "recorded_signals": joined_signals([cloud.recorded_signals for cloud in clouds])
         if clouds[0].recorded_signals
         else {},

@@ -23,7 +23,7 @@ from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, f
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
 from pcdata.structures.signals import told_signals
-from pcdata.structures.stored_steps import Step, StoredSteps
+from pcdata.structures.stored_steps import Histories, OfClouds, Step, StoredSteps
 from pcdata.structures.structure import checked_copy, derived
 from pcdata.structures.unbatched import Unbatched
 
@@ -78,8 +78,10 @@ class PointCloud(CloudBatch):
             )
         fill(self, "source_frame", self.source_frame or self.frame_id)
         fill(self, "meta", tuple(self.meta) or tuple([{} for _ in range(num_clouds)]))
-        told = tuple([one if isinstance(one, StoredSteps) else tuple(one) for one in given["history"]])
-        fill(self, "history", told or ((),) * num_clouds)
+        if isinstance(given["history"], StoredSteps):
+            fill(self, "history", Histories([given["history"]]))
+        elif not isinstance(given["history"], Histories):
+            fill(self, "history", tuple(map(tuple, given["history"])) or ((),) * num_clouds)
         fill(self, "kinds", dict(zip(self.kinds, map(Kind, self.kinds.values()))))
 
     @classmethod
@@ -190,13 +192,12 @@ class PointCloud(CloudBatch):
         """Merge one mapping of JSON-able findings into the meta of each cloud."""
         return derived(self, meta=tuple([{**old, **new} for old, new in zip(self.meta, entries, strict=True)]))
 
-    def with_steps(self, steps: Sequence[Step]) -> PointCloud:
+    def with_steps(self, steps: Sequence[Step] | OfClouds) -> PointCloud:
         """Add one JSON-able step to the history of each cloud."""
-        longer = [
-            old.then(new) if isinstance(old, StoredSteps) else (*old, new)
-            for old, new in zip(vars(self)["history"], steps, strict=True)
-        ]
-        return derived(self, history=tuple(longer))
+        held = vars(self)["history"]
+        if len(steps) != len(held):
+            raise ShapeError(f"PointCloud.with_steps: takes a step of each of {len(held)} clouds, got {len(steps)}")
+        return derived(self, history=(held if isinstance(held, Histories) else Histories([held])).then(steps))
 
     def select(self, index: Tensor, ptr: Tensor) -> PointCloud:
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
@@ -245,6 +246,14 @@ class PointCloud(CloudBatch):
             raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
         rows = moved(self.fields(), self.kinds, self.ptr, matrix)
         return self._with_rows(rows, **self._facts_moved(matrix, frame_id, unit))
+
+    def with_facts_moved(self, matrix: Tensor) -> PointCloud:
+        """Do what :meth:`transformed` does, but for the points, which are left to the caller."""
+        matrix = matrix.to(dtype=torch.float64, device=self.device)
+        fields = self.fields()
+        points = fields.pop("points")
+        rows = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
+        return self._with_rows({"points": points, **rows}, **self._facts_moved(matrix, None, None))
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""

@@ -10,15 +10,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
-from torch import Generator, Tensor, nn
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from typing_extensions import dataclass_transform
 
 from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note
 from pcdata.registry import Registry
-from pcdata.rng import Streams
+from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.kinds import FIELDS
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
@@ -26,7 +27,6 @@ from pcdata.transforms.field_checks import field_names, length_fields, validated
 
 Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
-GeneratorLike = Generator | Sequence[Generator]
 
 REGISTRY: Registry[type[Transform]] = Registry("transform")
 
@@ -117,7 +117,7 @@ class Transform(nn.Module):
 
         Args:
             data: a ``DepthFrame`` or ``PointCloud``, as the step takes.
-            generator: required by random steps: one CPU generator, or one per cloud.
+            generator: required by random steps: one CPU generator, one per cloud, or streams.
         """
         try:
             self.check_input(data)
@@ -186,7 +186,8 @@ class Transform(nn.Module):
     def recorded(self, data: Any, result: Any, params: Params) -> Any:
         """Return the result of this step on the data with the step in its history."""
         if isinstance(result, DepthFrame):
-            steps = [*result.provenance.get("history", ()), {**self._steps(1)[0], "params": {}}]
+            note = self._note()
+            steps = [*result.provenance.get("history", ()), {**note, "fields": _anew(note["fields"]), "params": {}}]
             return result.with_provenance({"history": steps})
         before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
         return self.recorded_counts(result, before, result.counts.tolist(), params)
@@ -213,24 +214,54 @@ class Transform(nn.Module):
                 f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
                 "before left none (masks, ranges, crops); leave the capture out, or widen those"
             )
-        steps = self._steps(len(after))
-        for step, own, had, count in zip(steps, _small(params, len(after)), earlier, after):
-            step["params"] = own
-            if keeps:
-                step["points_before"] = had
-            step["points"] = count
-        return result.with_steps(steps)
+        return result.with_steps(
+            _NotedSteps(self._note(), _small(params, len(after)), before if keeps else None, after)
+        )
 
-    def _steps(self, count: int) -> list[dict[str, Any]]:
-        """The beginnings of entries in histories; each may be changed there, so lists are given anew."""
+    def _note(self) -> dict[str, Any]:
+        """The beginning of an entry in a history; not to be changed."""
         own = self.__dict__
         given = tuple(map(own.get, field_names(type(self))))
-        before, told = own.get("_told", (None, {}))
+        before, note = own.get("_told", (None, {}))
         if before != given or self._modules:  # a field was set since, or may have been in a step within
             (told,) = self.to_config().values()
-            own["_told"] = given, told
-        name, version = type(self).__name__, self.version
-        return [{"step": name, "version": version, "fields": _anew(told)} for _ in range(count)]
+            note = {"step": type(self).__name__, "version": self.version, "fields": told}
+            own["_told"] = given, note
+        return note
+
+
+class _NotedSteps:
+    """What a step did to each cloud of a batch, as entries of histories that are made when they are read."""
+
+    __slots__ = ("_after", "_before", "_note", "_params")
+
+    def __init__(
+        self,
+        note: dict[str, Any],
+        params: dict[str, NDArray[Any]],  # (B, ...) each
+        before: list[int] | None,  # points of each cloud; None = other clouds
+        after: list[int],
+    ) -> None:
+        self._note, self._params, self._before, self._after = note, params, before, after
+
+    def __len__(self) -> int:
+        return len(self._after)
+
+    def __getitem__(self, clouds: slice) -> _NotedSteps:
+        params = {name: value[clouds] for name, value in self._params.items()}
+        before = None if self._before is None else self._before[clouds]
+        return _NotedSteps(self._note, params, before, self._after[clouds])
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        listed = {name: value.tolist() for name, value in self._params.items()}
+        for b, count in enumerate(self._after):
+            # Each entry may be changed where it is read, so lists are given anew.
+            entry = {**self._note, "fields": _anew(self._note["fields"])}
+            entry["params"] = {name: values[b] for name, values in listed.items()}
+            if self._before is not None:
+                entry["points_before"] = self._before[b]
+            entry["points"] = count
+            yield entry
 
 
 def _anew(fields: dict[str, Any]) -> dict[str, Any]:
@@ -290,13 +321,12 @@ def sha256_of(identity: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _small(params: Params, num: int) -> list[dict[str, Any]]:
+def _small(params: Params, num: int) -> dict[str, NDArray[Any]]:
     """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise."""
-    kept: list[dict[str, Any]] = [{} for _ in range(num)]
+    kept: dict[str, NDArray[Any]] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
         is_per_cloud = name not in ("index", "ptr", *FIELDS)
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
-            for own, numbers in zip(kept, value.tolist(), strict=True):
-                own[name] = numbers
+            kept[name] = value.detach().cpu().numpy()
     return kept

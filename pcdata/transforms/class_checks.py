@@ -99,9 +99,8 @@ class _UndeclaredStreams(Streams):
     def __init__(self, cls: type[nn.Module]) -> None:
         self._cls = cls
 
-    @property
-    def generators(self) -> list[Generator]:  # type: ignore[override]
-        """Every method of :class:`Streams` draws from these."""
+    def _next(self, count: int) -> NoReturn:
+        """Every method of :class:`Streams` draws by this one."""
         _refuse(self._cls, "draws from its streams but does not say that it is random")
 
 
@@ -126,7 +125,8 @@ def watched(forward: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def _only_declared_draws(step: nn.Module, generator: Any) -> Iterator[None]:
-    given = [generator] if isinstance(generator, Generator) else list(generator or ())
+    given = [] if isinstance(generator, Streams) else [generator] if isinstance(generator, Generator) else generator
+    given = list(given or ())
     offered = [] if step.is_random else [one.get_state() for one in given if isinstance(one, Generator)]
     # Another thread may draw from these meanwhile, which nobody can tell from the step's own draws.
     # Not by TorchDispatchMode, which would see every draw: the first one in a process loads torch's compiler.

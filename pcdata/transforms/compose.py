@@ -12,13 +12,14 @@ from torch import Generator, nn
 
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
-from pcdata.rng import Streams
+from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Data, GeneratorLike, Transform, num_clouds, sha256_of
+from pcdata.transforms.base import Data, Transform, num_clouds, sha256_of
 from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
 from pcdata.transforms.chain_rules import check_chain, warn_of_order
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
+from pcdata.transforms.fused_motions import motions_from, run_motions
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -87,6 +88,13 @@ class Compose(Transform):
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
         """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
+        return self._run(data, generator)
+
+    def consume(self, data: PointCloud, *, generator: GeneratorLike | None = None) -> Any:
+        """Run every step on clouds that nobody else holds: their memory may be used for the result."""
+        return self._run(data, generator, is_own=not data.points.requires_grad)
+
+    def _run(self, data: Data, generator: GeneratorLike | None, *, is_own: bool = False) -> Any:
         position, generator = self._enter(data, generator)
         steps = list(self.steps)
         beginning = self._beginning
@@ -97,8 +105,19 @@ class Compose(Transform):
             position = beginning.start
             if cloud is not None:
                 data, position = cloud, beginning.stop
-        for step in steps[position:]:
-            data, generator = _step(step, data, generator)
+        while position < len(steps):
+            together = motions_from(steps, position)
+            if together > 1 - is_own and isinstance(data, PointCloud):
+                assert generator is not None
+                generator = Streams.of(generator, num_clouds(data))
+                cloud = run_motions(steps[position : position + together], data, generator, in_place=is_own)
+                if cloud is not None:
+                    data, position = cloud, position + together
+                    continue
+            # What a step gives may share its memory with what it got, or with its params.
+            is_own = False
+            data, generator = _step(steps[position], data, generator)
+            position += 1
         return data
 
     def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
@@ -115,8 +134,8 @@ class Compose(Transform):
         if self._last_random < position:
             return position, None
         generator = self._generator(generator)
-        if not isinstance(generator, Generator):
-            generator = Streams.of(generator, num_clouds(data)).generators
+        if not isinstance(generator, Generator | Streams):
+            generator = Streams.of(generator, num_clouds(data))
         return position, generator
 
     # -- what may be stored ----------------------------------------------------------------------------------------
@@ -221,15 +240,6 @@ def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple
         return step(data, generator=None), generator
     # One stream per cloud, split off once: random steps in a row draw from the same streams, so that running only the
     # random suffix on a stored prefix gives the same draws.
-    generator = _streams_for(generator, num_clouds(data))
-    return step(data, generator=generator), generator
-
-
-def _streams_for(generator: GeneratorLike | None, count: int) -> Sequence[Generator]:
     assert generator is not None
-    if isinstance(generator, Generator):
-        return Streams.of(generator, count).generators
-    if len(generator) == count:
-        return generator
-    # Views were merged or split: the first stream carries on.
-    return generator[:1] if count == 1 else Streams.of(generator[0], count).generators
+    generator = Streams.of(generator, num_clouds(data))
+    return step(data, generator=generator), generator

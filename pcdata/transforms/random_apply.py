@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pcdata.errors import ConfigError
-from pcdata.rng import Streams, seeded
+from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.field_types import Fraction
@@ -37,5 +37,5 @@ class RandomApply(Transform):
         clouds = data.unbatch()
         for b, (chosen, seed) in enumerate(zip(params["chosen"].tolist(), params["seed"].tolist(), strict=True)):
             if chosen:
-                clouds[b] = self.step(clouds[b], generator=[seeded(seed)])
+                clouds[b] = self.step(clouds[b], generator=Streams([seed]))
         return PointCloud.cat(clouds)

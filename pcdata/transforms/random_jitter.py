@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError
-from pcdata.functional.rows import ptr_after_mask
-from pcdata.rng import Streams, seeded
+from pcdata.functional.noise import PointStep, move_points, random_rows
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import SelectTransform
@@ -35,13 +36,11 @@ class RandomJitter(Transform):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Add the noise that belongs to the seeds."""
-        noise = torch.empty((data.num_points, 3), dtype=torch.float32, device="cpu")
-        for rows, seed in zip(noise.split(data.counts.tolist()), params["seed"].tolist(), strict=True):
-            torch.randn(rows.shape, generator=seeded(seed), out=rows, dtype=torch.float32, device="cpu")
-        noise *= self.sigma
-        if self.clip is not None:
-            noise.clamp_(-self.clip, self.clip)
-        return data.with_fields(points=noise.to(data.device).add_(data.points))
+        return data.with_fields(points=move_points(data.points, data.ptr, [self.point_step(params)]))
+
+    def point_step(self, params: Params) -> PointStep:
+        """Return the noise that belongs to the seeds."""
+        return params["seed"], self.sigma, self.clip
 
 
 class RandomPointDropout(SelectTransform):
@@ -64,14 +63,10 @@ class RandomPointDropout(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw the fraction, then which points."""
-        fractions, seeds = streams.uniform(self.low, self.high).tolist(), streams.seeds().tolist()
-        keep = torch.zeros(cloud.num_points, dtype=torch.bool, device="cpu")
-        counts = cloud.counts.tolist()
-        for rows, fraction, seed in zip(keep.split(counts), fractions, seeds, strict=True):
-            num_kept = max(len(rows) - round(len(rows) * fraction), min(len(rows), 1))
-            rows.index_fill_(0, torch.randperm(len(rows), generator=seeded(seed), device="cpu")[:num_kept], True)
-        keep = keep.to(cloud.device)
-        return keep, ptr_after_mask(keep, cloud.ptr)
+        fractions, counts = streams.uniform(self.low, self.high), cloud.counts.cpu()
+        kept = torch.maximum(counts - (counts * fractions).round().long(), counts.clamp(max=1))
+        keep = random_rows(counts, kept, streams.seeds())
+        return keep.to(cloud.device), ptr_from_counts(kept, cloud.device)
 
 
 class RandomColorJitter(Transform):

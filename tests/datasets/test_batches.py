@@ -27,7 +27,7 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.datasets import RepeatedEpochWarning, cached
 from pcdata.errors import CacheError
 from pcdata.io.store.shards import Shards
-from pcdata.structures.stored_steps import StoredSteps
+from pcdata.structures.stored_steps import Histories, StoredSteps
 from pcdata.structures.unbatched import Unbatched
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import RandomJitter, RandomPointDropout, RandomRotation
@@ -157,9 +157,9 @@ def test_workers_give_the_batches_of_single_samples(stores, start):
 
 def test_a_history_that_nobody_read_crosses_to_another_process_and_is_read_there(stores):
     cloud, singly = CachedCloudDataset(stores["packed"])[0], CachedCloudDataset(stores["npz"])[0]
-    assert isinstance(vars(cloud)["history"][0], StoredSteps)
+    assert isinstance(vars(cloud)["history"], Histories)
     there = pickle.loads(pickle.dumps(cloud))
-    assert isinstance(vars(there)["history"][0], StoredSteps)
+    assert isinstance(vars(there)["history"], Histories)
     assert there.history == cloud.history == singly.history
     assert json.dumps(there.history) == json.dumps(singly.history)
     assert [step["step"] for step in there.history[0][-2:]] == ["RandomJitter", "RandomPointDropout"]
@@ -167,7 +167,7 @@ def test_a_history_that_nobody_read_crosses_to_another_process_and_is_read_there
 
 def test_a_history_that_is_none_is_told_when_it_is_read():
     for text in (b"{", b"{}", b"[1e999]"):
-        cloud = PointCloud(points=torch.zeros(1, 3), frame_id="base", history=[StoredSteps(text)])
+        cloud = PointCloud(points=torch.zeros(1, 3), frame_id="base", history=StoredSteps([text]))
         with pytest.raises(CacheError, match="history"):
             cloud.history  # noqa: B018
 

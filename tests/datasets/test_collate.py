@@ -105,3 +105,19 @@ def test_a_collate_function_is_known_by_its_name_and_none_takes_that_of_another(
 
     with pytest.raises(ConfigError, match="a collate function called packed is registered already"):
         register_collate(collate_packed)
+
+
+@pytest.mark.parametrize(("longest", "width"), [(1, 4), (4, 4), (5, 8), (16, 16)])
+def test_padded_lengths_are_rounded_up_to_a_bucket(longest, width):
+    batch = collate_padded([cloud(longest), cloud(1)], buckets=(4, 8, 16))
+    assert batch.points.shape == (2, width, 3)
+    assert batch.counts.tolist() == [longest, 1]
+    assert not bool(batch.points[~batch.mask].any())
+
+
+def test_a_cloud_longer_than_the_last_bucket_and_buckets_that_fall_are_refused():
+    with pytest.raises(ShapeError, match="add a bucket"):
+        collate_padded([cloud(9)], buckets=(4, 8))
+    for wrong in ((8, 4), (0, 4), (4, 4)):
+        with pytest.raises(ConfigError, match="rise"):
+            collate_padded([cloud(3)], buckets=wrong)

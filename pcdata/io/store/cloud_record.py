@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote, unquote
@@ -33,6 +33,10 @@ _CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
 _BFLOAT16 = "bfloat16"
 EXTRA, _FRAMES, _SIGNALS = "extra.", "frames.", "signals."
 DERIVED = ("intrinsics", "extrinsics")  # repeat the facts, for other tools
+
+
+# Memory of so many bytes, (bytes,) uint8, for the arrays of a record; None where there is none.
+Room = Callable[[int], Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -208,10 +212,12 @@ def _check_info(info: Mapping[str, Any]) -> None:
             raise CacheError(f"{name} must be a text, got {info.get(name)!r:.100}")
     if not isinstance(info.get("kinds"), dict):
         raise CacheError(f"kinds must be an object, got {info.get('kinds')!r:.100}")
-    for name, kinds in (("meta", (dict,)), ("history", (list, StoredSteps))):
+    for name, kind in (("meta", dict), ("history", list)):
         entries = info.get(name)
-        if not isinstance(entries, list) or not all(isinstance(entry, kinds) for entry in entries):
-            raise CacheError(f"{name} must be a list with one {kinds[0].__name__} per cloud, got {entries!r:.100}")
+        if isinstance(entries, StoredSteps) and name == "history":
+            continue
+        if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
+            raise CacheError(f"{name} must be a list with one {kind.__name__} per cloud, got {entries!r:.100}")
 
 
 def _signal_arrays(signals: Mapping[str, Signal]) -> dict[str, np.ndarray]:

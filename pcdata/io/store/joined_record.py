@@ -126,17 +126,19 @@ def _joined_ptr(
 
 def _joined_own(owns: Sequence[Any], histories: Sequence[bytes]) -> dict[str, Any] | None:
     """Return the facts of all samples' own in a row."""
-    joined: dict[str, list[Any]] = {"meta": [], "history": []}
+    joined: dict[str, Any] = {"meta": []}
     texts: list[Any] = []
-    for own, history in zip(owns, histories, strict=True):
-        if not isinstance(own, dict) or own.keys() != {"meta", "texts"} or not all(map(_is_list, own.values())):
+    for own in owns:
+        if type(own) is not dict or len(own) != 2:
+            return None
+        if type(own.get("meta")) is not list or type(own.get("texts")) is not list:
             return None
         joined["meta"] += own["meta"]
-        if len(own["meta"]) == 1:
-            joined["history"].append(StoredSteps(history[1:-1]))  # the list of one list, without its own brackets
-        else:
-            joined["history"] += json.loads(history)
         texts.append(own["texts"])
+    if len(joined["meta"]) == len(owns):
+        joined["history"] = StoredSteps([text[1:-1] for text in histories])  # lists of one list, without their brackets
+    else:
+        joined["history"] = [*itertools.chain.from_iterable(map(json.loads, histories))]
     if any(any(each) for each in texts):
         told = [[*of_signal] for of_signal in zip(*texts, strict=True)]
         if not all(all(map(_is_list, each)) or not any(each) for each in told):

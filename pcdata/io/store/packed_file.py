@@ -25,11 +25,14 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
 from pcdata.files.mapping import map_file
 from pcdata.files.strict_json import json_object
+from pcdata.functional.rows import copy_blocks
+from pcdata.io.store.cloud_record import Room
 
 SCHEMA = "pcdata.packed/1"
 
@@ -153,6 +156,7 @@ class _Column:
     """One array of all records of a group: (rows, ...), and which rows are whose."""
 
     values: NDArray[Any]
+    begin: int  # where they begin in the file
     each: int | None  # rows of every record, where all have as many
     pointers: NDArray[np.int64] | None  # (records + 1,) otherwise
     is_scalar: bool
@@ -160,39 +164,45 @@ class _Column:
     @property
     def form(self) -> tuple[Any, ...]:
         """What must be the same in records that are joined."""
-        return self.values.dtype, self.values.shape[1:], self.is_scalar
+        return self.values.dtype.str, self.values.shape[1:], self.is_scalar
 
-    def rows(self, first: int, stop: int) -> slice:
-        """Return the rows of some records in a row."""
+    def rows(self, record: int) -> slice:
+        """Return the rows of a record."""
         if self.pointers is None:
             assert self.each is not None
-            return slice(first * self.each, stop * self.each)
-        return slice(int(self.pointers[first]), int(self.pointers[stop]))
-
-    def counts(self, first: int, stop: int) -> NDArray[np.int64]:
-        """Return how many rows each of some records in a row has."""
-        if self.pointers is None:
-            return np.full(stop - first, self.each, dtype=np.int64)
-        return np.diff(self.pointers[first : stop + 1])
+            return slice(record * self.each, (record + 1) * self.each)
+        return slice(int(self.pointers[record]), int(self.pointers[record + 1]))
 
 
-@dataclass(frozen=True)
 class _Group:
-    """Records with the same arrays and the same facts."""
+    """Records with the same arrays and the same facts, of one mapped file."""
 
-    keys: list[str]
-    facts: dict[str, Any]
-    columns: dict[str, _Column]
+    def __init__(
+        self, content: NDArray[np.uint8], keys: list[str], facts: dict[str, Any], columns: dict[str, _Column]
+    ) -> None:
+        self.content = content  # of the whole file
+        self.keys = keys
+        self.facts = facts
+        self.columns = columns
+        self._kinds: dict[Collection[str], tuple[Any, ...]] = {}
+        self._tables: dict[Collection[str], NDArray[np.int64]] = {}
 
-    def joins(self, other: _Group, names: Sequence[str], leave_out: Collection[str]) -> bool:
-        """Whether records of both can be read as one."""
-        if self is other:
-            return True
-        return (
-            self.facts == other.facts
-            and other.columns.keys() - leave_out == {*names}
-            and all(self.columns[name].form == other.columns[name].form for name in names)
-        )
+    def kind(self, leave_out: Collection[str]) -> tuple[Any, ...]:
+        """Return what is the same in groups whose records can be read as one: their facts, and what the arrays are."""
+        known = self._kinds.get(leave_out)
+        if known is None:
+            forms = {name: column.form for name, column in self.columns.items() if name not in leave_out}
+            known = self._kinds[leave_out] = json.dumps(self.facts, sort_keys=True), tuple(forms.items())
+        return known
+
+    def table(self, leave_out: Collection[str]) -> NDArray[np.int64]:
+        """Return where each array begins in the file, and the rows of every record, -1 where these differ: (2, C)."""
+        known = self._tables.get(leave_out)
+        if known is None:
+            columns = [column for name, column in self.columns.items() if name not in leave_out]
+            each = [-1 if column.each is None else column.each for column in columns]
+            known = self._tables[leave_out] = np.array([[column.begin for column in columns], each], dtype=np.int64)
+        return known
 
 
 class PackedFile:
@@ -232,44 +242,57 @@ class Place(NamedTuple):
         """Return the arrays of the record, read-only, as they lie in the file."""
         arrays = {}
         for name, column in self.group.columns.items():
-            values = column.values[column.rows(self.row, self.row + 1)]
+            values = column.values[column.rows(self.row)]
             arrays[name] = values.reshape(()) if column.is_scalar else values
         return arrays
 
 
 def join_rows(
-    places: Sequence[Place], leave_out: Collection[str]
+    places: Sequence[Place], leave_out: Collection[str], room: Room | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[np.int64]]] | None:
     """Return each array of some records with its rows one after another, and how many rows are of each record.
 
-    None where their facts differ, or their arrays in name, dtype or shape of a row, but for those that are left out.
+    All arrays are laid into memory of ``room``, if that has any. None where the records' facts differ, or their arrays
+    in name, dtype or shape of a row, but for those that are left out.
     """
-    runs = _runs(places)
-    first = runs[0][0]
-    names = [name for name in first.columns if name not in leave_out]
-    if not all(first.joins(other, names, leave_out) for other, _, _ in runs):
+    first, kind = places[0].group, places[0].group.kind(leave_out)
+    numbers = {group: number for number, group in enumerate(dict.fromkeys(place.group for place in places))}
+    if any(other.kind(leave_out) != kind for other in numbers):
         return None
-    arrays, counts = {}, {}
-    for name in names:
-        cuts = [(own.columns[name], begin, stop) for own, begin, stop in runs]
-        arrays[name] = np.concatenate([one.values[one.rows(begin, stop)] for one, begin, stop in cuts])
-        each = {one.each for one, _, _ in cuts}
-        if len(each) == 1 and None not in each:
-            counts[name] = np.full(len(places), each.pop(), dtype=np.int64)
-        else:
-            counts[name] = np.concatenate([one.counts(begin, stop) for one, begin, stop in cuts])
-    return arrays, counts
+    forms = [(name, column.values) for name, column in first.columns.items() if name not in leave_out]
+    row_bytes = np.array([one.dtype.itemsize * math.prod(one.shape[1:]) for _, one in forms], dtype=np.int64)
+    first_rows, counts = _rows_of(places, [name for name, _ in forms], leave_out)
+    sizes = counts * row_bytes
+    totals = sizes.sum(axis=0)
+    begins = np.concatenate([np.zeros(1, np.int64), (totals + -totals % _ALIGNED).cumsum()])
+    memory = None if room is None else room(int(begins[-1]))
+    if memory is None:
+        memory = torch.empty(int(begins[-1]), dtype=torch.uint8, device="cpu")
+    copy_blocks(
+        memory,
+        begins[:-1] + sizes.cumsum(axis=0) - sizes,
+        [group.content for group in numbers],
+        np.array([numbers[place.group] for place in places])[:, None],
+        np.stack([place.group.table(leave_out)[0] for place in places]) + first_rows * row_bytes,
+        sizes,
+    )
+    held, arrays = memory.numpy(), {}
+    for (name, one), begin, size, rows in zip(forms, begins.tolist(), totals.tolist(), counts.sum(axis=0).tolist()):
+        arrays[name] = held[begin : begin + size].view(one.dtype).reshape(rows, *one.shape[1:])
+    return arrays, {name: rows for (name, _), rows in zip(forms, counts.T)}
 
 
-def _runs(places: Sequence[Place]) -> list[tuple[_Group, int, int]]:
-    """Return group, first and stop of records that lie one after another."""
-    runs: list[tuple[_Group, int, int]] = []
-    for group, row in places:
-        if runs and runs[-1][0] is group and runs[-1][2] == row:
-            runs[-1] = (group, runs[-1][1], row + 1)
-        else:
-            runs.append((group, row, row + 1))
-    return runs
+def _rows_of(
+    places: Sequence[Place], names: Sequence[str], leave_out: Collection[str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first row and the number of rows of each record (R, C), of all arrays."""
+    each = np.stack([place.group.table(leave_out)[1] for place in places])
+    first = each * np.array([place.row for place in places])[:, None]
+    for column in np.flatnonzero((each < 0).any(axis=0)).tolist():
+        rows = [place.group.columns[names[column]].rows(place.row) for place in places]
+        first[:, column] = [one.start for one in rows]
+        each[:, column] = [one.stop - one.start for one in rows]
+    return first, each
 
 
 def open_packed(file: BinaryIO) -> PackedFile:
@@ -308,6 +331,7 @@ class _Reader:
 
     def __init__(self, content: memoryview, begin: int, end: int, stop: int) -> None:
         self._content = content
+        self._bytes = np.frombuffer(content, np.uint8)
         self._block, self._end = begin, end  # where the next block may begin, and where blocks end
         self._table, self._stop = end, stop  # the same of tables
 
@@ -331,7 +355,7 @@ class _Reader:
             if not isinstance(name, str) or name in found:
                 raise CacheError(f"the arrays of a group must have a name each, got {name!r:.100}")
             found[name] = self._column(name, column, records, pointers)
-        return _Group(keys, facts, found)
+        return _Group(self._bytes, keys, facts, found)
 
     def _column(self, name: str, told: Any, records: int, pointers: Sequence[NDArray[np.int64]]) -> _Column:
         dtype, row, rows, begin = (_entry(told, entry) for entry in ("dtype", "row", "rows", "begin"))
@@ -356,7 +380,7 @@ class _Reader:
             raise CacheError(f"array {name!r:.100} claims {size} bytes at {begin!r:.100}, where they cannot lie")
         self._block = begin + size
         values = np.ndarray((total, *shape), dtype, self._content, begin) if size else np.empty((total, *shape), dtype)
-        return _Column(values, None if own is not None else each, own, row is None)
+        return _Column(values, begin, None if own is not None else each, own, row is None)
 
     def _pointers(self, table: Any, records: int) -> NDArray[np.int64]:
         content = self._taken_table(table)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
-from pcdata.io.store.cloud_record import DERIVED, Record
+from pcdata.io.store.cloud_record import DERIVED, Record, Room
 from pcdata.io.store.joined_record import joined_record, merged_info, own_info, split_info
 from pcdata.io.store.packed_file import PackedFile, PackedWriter, Place, join_rows, open_packed
 from pcdata.io.store.store import INFO, Compression, Store, damage_named, register_store, writing
@@ -72,15 +72,19 @@ class _PackedStore(Store):
             return _as_it_lies(file.place_of(key)).digest()
 
     @classmethod
-    def read_joined(cls, records: Sequence[tuple[Store, str]]) -> Record | None:
+    def read_joined(cls, records: Sequence[tuple[Store, str]], room: Room | None = None) -> Record | None:
         """Read records, of one file or several, as one; every array is copied once."""
-        places = []
-        for store, key in records:
-            assert isinstance(store, _PackedStore)
-            with damage_named(store.path):
-                places.append(store._mapped().place_of(key))
+        places: list[Place] = []
+        store: Store | None = None
+        try:
+            for store, key in records:
+                assert isinstance(store, _PackedStore)
+                places.append((store._opened_file or store._mapped()).place_of(key))
+        except Exception:
+            with damage_named(records[len(places)][0].path_of("")):
+                raise
         with damage_named(records[0][0].path_of("")):
-            joined = join_rows(places, DERIVED)
+            joined = join_rows(places, DERIVED, room)
             if joined is None:
                 return None
             arrays, rows = joined

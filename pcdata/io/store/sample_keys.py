@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from urllib.parse import quote
 
 from pcdata.errors import CacheError
 
 _MAX_KEY = 200  # file names end at 255 bytes
+_PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,199}")
 
 
 def key_of(sample_id: str) -> str:
@@ -19,6 +21,8 @@ def key_of(sample_id: str) -> str:
     Raises:
         CacheError: the id is empty, or no text in one line.
     """
+    if isinstance(sample_id, str) and _PLAIN.fullmatch(sample_id):  # most are, and each is asked for in every epoch
+        return sample_id
     if not isinstance(sample_id, str) or sample_id.splitlines() != [sample_id]:
         raise CacheError(f"a sample id must be a text in one line that is not empty, got {sample_id!r:.100}")
     # surrogatepass: file names that are not UTF-8 reach Python as lone surrogates.

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from pcdata.errors import CacheError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input, read_bytes
-from pcdata.io.store.cloud_record import Record
+from pcdata.io.store.cloud_record import Record, Room
 from pcdata.io.store.sample_index import SampleIndex
 from pcdata.io.store.sample_keys import key_of
 from pcdata.io.store.stores import STORES, Store
@@ -168,15 +168,17 @@ class Shards:
         """
         return self.store(int(self._index.shards[number])).digest(key_of(self._index.ids[number]))
 
-    def read_joined(self, numbers: Sequence[int]) -> Record | None:
+    def read_joined(self, numbers: Sequence[int], room: Room | None = None) -> Record | None:
         """Read the records of some samples as one, in this order; None where the store, or these records, cannot.
+
+        ``room`` gives memory for the arrays, (bytes,) uint8, or None; a store may leave it unasked.
 
         Raises:
             CacheError: as for :meth:`read`.
         """
         shards = self._index.shards[numbers].tolist()
         records = [(self.store(shard), key_of(self._index.ids[number])) for shard, number in zip(shards, numbers)]
-        return STORES[self._form].read_joined(records)
+        return STORES[self._form].read_joined(records, room)
 
     def identities(self, numbers: Sequence[int]) -> dict[int, tuple[int, ...]] | None:
         """Return what tells the files of the shards of some samples from others of their names, by shard.

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, ClassVar, Literal
 from pcdata.errors import CacheError, ConfigError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.files.zip_archive import ZipArchive
-from pcdata.io.store.cloud_record import Record
+from pcdata.io.store.cloud_record import Record, Room
 from pcdata.registry import Registry
 
 Compression = Literal["none", "lzf", "gzip"]
@@ -68,7 +68,7 @@ class Store:
         return self.read(key).digest()
 
     @classmethod
-    def read_joined(cls, records: Sequence[tuple[Store, str]]) -> Record | None:
+    def read_joined(cls, records: Sequence[tuple[Store, str]], room: Room | None = None) -> Record | None:
         """Read some records as one, that of their clouds in a row; None where such stores, or these records, cannot.
 
         Each is told by its store, one of this class, and its key.

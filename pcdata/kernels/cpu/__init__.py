@@ -6,6 +6,7 @@ from pcdata.kernels.cpu import depth_to_color as cpu_registration
 from pcdata.kernels.cpu import fusion as cpu_fusion
 from pcdata.kernels.cpu import images as cpu_images
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
+from pcdata.kernels.cpu import noise as cpu_noise
 from pcdata.kernels.cpu import rows as cpu_rows
 from pcdata.kernels.cpu import sampling as cpu_sampling
 from pcdata.kernels.cpu.native import unavailable
@@ -14,6 +15,7 @@ __all__ = [
     "cpu_fusion",
     "cpu_images",
     "cpu_neighbors",
+    "cpu_noise",
     "cpu_registration",
     "cpu_rows",
     "cpu_sampling",

@@ -95,6 +95,12 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
                                 const int64_t* starts, int64_t num_fields, const int64_t* sources,
                                 const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks);
 
+// Copy blocks of rows from addresses to addresses that do not overlap. Of rows (blocks,) each, all, or, where the
+// address of a mask (blocks,) is not 0, those that are true in it.
+PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
+                                 const int64_t* rows, const int64_t* row_bytes, const int64_t* masks,
+                                 const int64_t* destinations);
+
 // moved (N, 3) = matrix (clouds, 4, 4) of each point's cloud @ point, in float64, rounded once.
 PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* points, const int64_t* ptr,
                                       int64_t num_clouds, const double* matrices, float* moved);
@@ -103,6 +109,18 @@ PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* po
 // that is larger), rounded once.
 PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float* directions, const int64_t* ptr,
                                           int64_t num_clouds, const double* linear, float* turned);
+
+// moved (N, 3) = the points after num_steps steps, rounded to float after each; points and moved may be the same. Step
+// s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum with normal
+// numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size.
+PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                                 int64_t num_steps, const int64_t* is_noise, const double* matrices,
+                                 const int64_t* seeds, const double* sigma, const double* clip, float* moved);
+
+// mask (sum of counts,): of each cloud's counts (clouds,) rows the wanted (clouds,) become 1 that its seed chooses, the
+// others 0.
+PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
+                                 const int64_t* wanted, const int64_t* seeds, uint8_t* mask);
 
 // inside (N,) becomes 1 where lower <= point <= upper on every axis; *finite 0 if a coordinate is not.
 PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, int64_t rows, const float* lower,

@@ -141,3 +141,30 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
     });
   });
 }
+
+PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
+                                 const int64_t* rows, const int64_t* row_bytes, const int64_t* masks,
+                                 const int64_t* destinations) {
+  using namespace pc;
+  using namespace pc::rows;
+  constexpr int64_t kBlocksPerPiece = 8;
+  return guarded([&] {
+    parallel_for(*context, num_blocks, kBlocksPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t block = first; block < last; ++block) {
+        const char* source = reinterpret_cast<const char*>(sources[block]);
+        char* to = reinterpret_cast<char*>(destinations[block]);
+        const uint8_t* mask = reinterpret_cast<const uint8_t*>(masks[block]);
+        if (mask == nullptr) {
+          if (rows[block] > 0) std::memcpy(to, source, static_cast<size_t>(rows[block] * row_bytes[block]));
+          continue;
+        }
+        for (int64_t row = 0; row < rows[block]; row += kRowsPerPiece) {
+          Run runs[kRowsPerPiece / 2];
+          const int64_t num_runs = find_runs(mask, row, std::min(row + kRowsPerPiece, rows[block]), runs);
+          with_row_size(row_bytes[block], [&](auto bytes) { copy_runs(source, bytes, runs, num_runs, to); });
+          for (int64_t r = 0; r < num_runs; ++r) to += runs[r].length * row_bytes[block];
+        }
+      }
+    });
+  });
+}

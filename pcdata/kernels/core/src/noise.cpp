@@ -1,0 +1,109 @@
+// Points that are moved and jittered, and rows chosen at random.
+#include "pc/math/affine.hpp"
+#include "pc/noise/normal.hpp"
+#include "pc/threads.hpp"
+
+namespace pc::noise {
+namespace {
+
+constexpr int kBlock = 2 * kPairs / 3;  // points that are worked on at once: 64
+constexpr int64_t kPointsPerPiece = 64 * kBlock;
+
+// Points of a block, axis by axis: so no step has to shuffle them.
+struct Block {
+  float axis[3][kBlock];
+
+  void load(const float* points, int64_t count) {
+    if (count < kBlock) std::memset(axis, 0, sizeof axis);
+    for (int64_t i = 0; i < count; ++i)
+      for (int a = 0; a < 3; ++a) axis[a][i] = points[3 * i + a];
+  }
+  void store(float* points, int64_t count) const {
+    for (int64_t i = 0; i < count; ++i)
+      for (int a = 0; a < 3; ++a) points[3 * i + a] = axis[a][i];
+  }
+  void move(const double* matrix) {
+    const math::Affine affine(matrix);
+    for (int i = 0; i < kBlock; ++i) {
+      const math::Point p = affine({axis[0][i], axis[1][i], axis[2][i]});
+      axis[0][i] = p.x;
+      axis[1][i] = p.y;
+      axis[2][i] = p.z;
+    }
+  }
+  // Of the words of a block, each axis has a third; both halves of the block have one number of each.
+  void jitter(uint64_t seed, int64_t number, float sigma, float clip) {
+    float pairs[2][kPairs];
+    normal_pairs(seed, static_cast<uint64_t>(number) * kPairs, pairs[0], pairs[1]);
+    constexpr int kHalf = kBlock / 2;
+    for (int a = 0; a < 3; ++a)
+      for (int half = 0; half < 2; ++half)
+        for (int i = 0; i < kHalf; ++i) {
+          float change = pairs[half][a * kHalf + i] * sigma;
+          change = change > clip ? clip : change;
+          change = change < -clip ? -clip : change;
+          axis[a][half * kHalf + i] += change;
+        }
+  }
+};
+
+}  // namespace
+}  // namespace pc::noise
+
+PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                                 int64_t num_steps, const int64_t* is_noise, const double* matrices,
+                                 const int64_t* seeds, const double* sigma, const double* clip, float* moved) {
+  using namespace pc;
+  using namespace pc::noise;
+  return guarded([&] {
+    // A piece is a part of the rows of all clouds; blocks begin at a cloud's first row, so that noise keeps its pairs.
+    parallel_for(*context, ptr[num_clouds], kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      int64_t cloud = std::upper_bound(ptr, ptr + num_clouds + 1, first) - ptr - 1;
+      for (; cloud < num_clouds && ptr[cloud] < last; ++cloud) {
+        const int64_t begin = ptr[cloud], end = ptr[cloud + 1];
+        // Blocks that begin in this piece.
+        int64_t row = first <= begin ? begin : begin + (first - begin + kBlock - 1) / kBlock * kBlock;
+        for (; row < std::min(last, end); row += kBlock) {
+          const int64_t count = std::min<int64_t>(kBlock, end - row);
+          Block block;
+          block.load(points + 3 * row, count);
+          for (int64_t step = 0; step < num_steps; ++step) {
+            const int64_t at = step * num_clouds + cloud;
+            if (is_noise[step])
+              block.jitter(static_cast<uint64_t>(seeds[at]), (row - begin) / kBlock, static_cast<float>(sigma[step]),
+                           static_cast<float>(clip[step]));
+            else
+              block.move(matrices + 16 * at);
+          }
+          block.store(moved + 3 * row, count);
+        }
+      }
+    });
+  });
+}
+
+PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
+                                 const int64_t* wanted, const int64_t* seeds, uint8_t* mask) {
+  using namespace pc;
+  using namespace pc::noise;
+  (void)context;
+  return guarded([&] {
+    for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
+      const int64_t count = counts[cloud], few = std::min(wanted[cloud], count - wanted[cloud]);
+      const uint8_t chosen = few == wanted[cloud];
+      std::memset(mask, 1 - chosen, static_cast<size_t>(count));
+      int64_t left = few;
+      for (uint64_t number = 0; left > 0; ++number) {
+        const uint64_t mixed = word(static_cast<uint64_t>(seeds[cloud]), number);
+        for (const uint64_t half : {mixed & 0xFFFFFFFFu, mixed >> 32}) {
+          uint8_t& place = mask[(half * static_cast<uint64_t>(count)) >> 32];
+          if (left > 0 && place != chosen) {
+            place = chosen;
+            --left;
+          }
+        }
+      }
+      mask += count;
+    }
+  });
+}

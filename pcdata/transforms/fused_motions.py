@@ -1,0 +1,74 @@
+"""Motions and jitter in a row as one pass over the points.
+
+Each step by itself would read all points from memory and fill as much memory anew. What is decided without a look at
+the points can be decided for all these steps first; :class:`Compose` then takes every point through them at once,
+rounded after each step as the single steps round. The clouds and their histories are those of the single steps, bit for
+bit; and whatever they would refuse is left to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pcdata.errors import PcdataError
+from pcdata.functional.noise import PointStep, move_points
+from pcdata.rng import Streams
+from pcdata.structures import PointCloud
+from pcdata.structures.structure import derived
+from pcdata.transforms.base import Transform
+from pcdata.transforms.families import SpatialTransform
+from pcdata.transforms.random_jitter import RandomJitter
+from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+
+
+def motions_from(steps: Sequence[Transform], position: int) -> int:
+    """Return how many steps, from one on, can run as one."""
+    count = 0
+    for step in steps[position:]:
+        if not _is_blind(step):
+            break
+        count += 1
+    return count
+
+
+def _is_blind(step: Transform) -> bool:
+    """Whether a step moves points, or adds noise, without having looked at them."""
+    if step._forward_hooks or step._forward_pre_hooks:  # somebody watches it
+        return False
+    # Exact types: a subclass may do something else.
+    if type(step) in (RandomRotation, RandomScale, RandomFlip):
+        return vars(step)["about"] == "origin"
+    return type(step) in (RandomTranslation, RandomJitter)
+
+
+def run_motions(
+    steps: Sequence[Transform], cloud: PointCloud, streams: Streams, *, in_place: bool = False
+) -> PointCloud | None:
+    """Run steps that :func:`motions_from` found; None where they must be run one by one, with the same draws.
+
+    ``in_place``: the points are nobody else's, and their memory takes the result.
+    """
+    before = streams.place
+    try:
+        return _run(steps, cloud, streams, in_place)
+    except PcdataError:
+        streams.place = before
+        return None  # the step that refuses says why
+
+
+def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool) -> PointCloud:
+    points, layout = cloud.points, cloud.layout
+    done: list[PointStep] = []
+    for step in steps:
+        step.check_input(cloud)
+        params = step.make_params(cloud, streams)
+        if isinstance(step, SpatialTransform):
+            moved = cloud.with_facts_moved(params["matrix"])
+            layout = layout and moved.layout
+            done.append(params["matrix"])
+        else:
+            assert isinstance(step, RandomJitter)
+            moved, layout = cloud, None
+            done.append(step.point_step(params))
+        cloud = step.recorded(cloud, moved, params)
+    return derived(cloud, points=move_points(points, cloud.ptr, done, in_place=in_place), layout=layout)

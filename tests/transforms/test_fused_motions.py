@@ -1,0 +1,66 @@
+"""Motions in a row run as one pass, and nobody can tell."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pcdata.errors import PoseError
+from pcdata.rng import Streams
+from pcdata.transforms import (
+    Compose,
+    RandomFlip,
+    RandomJitter,
+    RandomPointDropout,
+    RandomRotation,
+    RandomScale,
+    RandomTranslation,
+)
+from pcdata.transforms.fused_motions import motions_from
+from tests.factories import assert_same, cloud_in_base
+
+CHAIN = [
+    RandomRotation(),
+    RandomScale(per_axis=True),
+    RandomJitter(sigma=0.02, clip=0.03),
+    RandomTranslation(),
+    RandomFlip(),
+    RandomPointDropout(),
+    RandomScale(about="centroid"),
+    RandomJitter(),
+    RandomRotation(axis=None),
+]
+
+
+@pytest.mark.parametrize("counts", [(17,), (400, 0, 3, 65)])
+def test_a_chain_gives_what_its_steps_give_one_after_another(counts):
+    chain, cloud = Compose(CHAIN), cloud_in_base(counts)
+    together = chain(cloud, generator=Streams(range(len(counts))))
+    *_, (_, one_by_one) = chain.step_through(cloud, generator=Streams(range(len(counts))))
+    assert_same(together, one_by_one)
+    assert together.history == one_by_one.history
+    assert together.layout is None
+
+
+def test_clouds_of_ones_own_come_out_the_same_in_their_memory():
+    chain, cloud = Compose([RandomRotation(), RandomJitter()]), cloud_in_base((70, 5))
+    wanted = chain(cloud, generator=Streams([1, 2]))
+    made = chain.consume(cloud, generator=Streams([1, 2]))
+    assert_same(made, wanted)
+    assert made.points.data_ptr() == cloud.points.data_ptr()
+
+
+def test_only_steps_that_do_not_look_at_the_points_run_together():
+    steps = Compose(CHAIN).steps
+    assert [motions_from(steps, position) for position in range(len(steps))] == [5, 4, 3, 2, 1, 0, 0, 2, 1]
+    watched = RandomScale()
+    watched.register_forward_hook(lambda *_: None)
+    assert motions_from([RandomRotation(), watched, RandomScale()], 0) == 1
+
+
+def test_a_step_that_refuses_says_so_as_it_would_alone():
+    cloud = cloud_in_base((5,)).with_signal("grasp", torch.eye(4)[None], "pose matrix", "base")
+    chain = Compose([RandomRotation(), RandomFlip(probability=(1.0, 0.0, 0.0))])
+    with pytest.raises(PoseError) as told:
+        chain(cloud, generator=Streams([3]))
+    assert any("in RandomFlip(" in note for note in told.value.__notes__)
