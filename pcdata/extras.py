@@ -38,6 +38,7 @@ EXTRAS = {
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
         _Extra("av", "av", "recordings of an Azure Kinect (.mkv) and videos of LeRobot datasets"),
         _Extra("pyarrow", "lerobot", "LeRobot datasets"),
+        _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
         _Extra("open3d", "open3d", "viewing and comparing with Open3D"),
         _Extra(

@@ -28,8 +28,8 @@ from pcdata.progress import Progress
 from pcdata.structures import PointCloud
 from pcdata.validation.step_losses import judge_step_losses
 
-Engine = Literal["pool"]
-ENGINES: tuple[Engine, ...] = ("pool",)
+Engine = Literal["pool", "ray"]
+ENGINES: tuple[Engine, ...] = ("pool", "ray")
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,11 @@ def build_dataset(
 def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:
     if not shards:
         return
-    if workers:
+    if engine == "ray":
+        from pcdata.build.engines.on_ray import work_on_ray
+
+        work_on_ray(job, shards, tally, tasks=workers, timeout=timeout)
+    elif workers:
         from pcdata.build.engines.pool import work_in_pool
 
         work_in_pool(job, shards, tally, workers=workers, timeout=timeout)

@@ -148,21 +148,20 @@ class BuildingFolder:
             number, _, suffix = name.partition(".")
             if suffix != "json" or not number.isdecimal() or int(number) >= plan.num_shards:
                 continue
-            with suppress(CacheError):
-                record = ShardRecord.read(self._record_path(int(number)), plan, int(number))
-                if self.place_of(record) is not None:
-                    found[int(number)] = record
+            if (record := self.record(plan, int(number))) is not None:
+                found[int(number)] = record
         return found
 
     def forget(self, shard: int) -> None:
         """Take the record of a shard back: it is to be done again."""
         self._record_path(shard).unlink(missing_ok=True)
 
-    def is_finished(self, plan: Plan, shard: int) -> bool:
-        """Say whether a shard has a record and its files; it does not ask whether its captures are still the same."""
+    def record(self, plan: Plan, shard: int) -> ShardRecord | None:
+        """Return the record of a finished shard; it does not ask whether the captures are still the same."""
         with suppress(CacheError):
-            return self.place_of(ShardRecord.read(self._record_path(shard), plan, shard)) is not None
-        return False
+            record = ShardRecord.read(self._record_path(shard), plan, shard)
+            return record if self.place_of(record) is not None else None
+        return None
 
     def _record_path(self, shard: int) -> Path:
         return self.path / _RECORDS / f"{shard:05d}.json"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pcdata import errors
 from pcdata.build.plan import Plan
 from pcdata.build.records import ShardRecord
-from pcdata.errors import CaptureError, ConfigError, PcdataError, locate
+from pcdata.errors import CaptureError, ConfigError, PcdataError, add_note, locate
 from pcdata.progress import Progress
 
 _FIRST = 8  # captures: where all of them fail, the configuration is at fault
@@ -114,6 +114,21 @@ def all_failed(failed: Mapping[str, str], num_samples: int) -> PcdataError:
     )
     step = re.match(r"\w+ in (\w+)", reason)  # as shard_work.error_in_words writes it
     locate(error, step=step[1] if step else None, sample_id=sample_id)
+    return error
+
+
+def stop_in_words(error: Exception) -> tuple[str, str, list[str]]:
+    """Return what stops a build, as it travels from a worker: its type, its message, its notes."""
+    kind = type(error).__name__
+    message = str(error) if isinstance(error, PcdataError) else f"{kind}: {error}"
+    return kind, message, [str(note) for note in getattr(error, "__notes__", [])]
+
+
+def stopped(kind: str, message: str, notes: list[str]) -> PcdataError:
+    """Return the error of :func:`stop_in_words`."""
+    error = told_error(kind, message)
+    for note in notes:
+        add_note(error, note)
     return error
 
 

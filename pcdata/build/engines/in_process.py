@@ -28,6 +28,6 @@ def work_here(job: Job, shards: Iterable[int], tally: Tally) -> None:
         PcdataError: the build must stop; what is committed stays.
     """
     for shard in shards:
-        if job.folder.is_finished(job.plan, shard):  # by another process, meanwhile
+        if job.folder.record(job.plan, shard) is not None:  # by another process, meanwhile
             continue
         tally.committed(job.do(shard, {}, _Watch(tally, shard)))

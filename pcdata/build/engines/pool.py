@@ -22,8 +22,8 @@ import torch
 from pcdata.build.records import ShardRecord
 from pcdata.build.schedule import Schedule, Task
 from pcdata.build.shard_work import Job
-from pcdata.build.tally import Tally, told_error
-from pcdata.errors import CacheError, ConfigError, PcdataError, add_note
+from pcdata.build.tally import Tally, stop_in_words, stopped
+from pcdata.errors import CacheError, ConfigError
 from pcdata.files.interrupts import deaf_children, shielded
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -83,7 +83,7 @@ def _hand_out(job: Job, schedule: Schedule, pool: list[_Worker], most: int, tall
         task = schedule.next(running)
         if task is None:
             return
-        if task.sample_id is None and not task.given_up and job.folder.is_finished(job.plan, task.shard):
+        if task.sample_id is None and not task.given_up and job.folder.record(job.plan, task.shard):
             continue  # by another process, meanwhile
         worker = next((one for one in pool if one.task is None), None)
         if worker is None:
@@ -114,11 +114,7 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
         worker.taken()
         tally.committed(ShardRecord.from_text(*told))
     else:
-        reason, message, notes = told
-        error = told_error(reason, message)
-        for note in notes:
-            add_note(error, note)
-        raise error
+        raise stopped(*told)
 
 
 def _bury(worker: _Worker, schedule: Schedule) -> None:
@@ -242,9 +238,7 @@ def _serve(pipe: Connection, job: Job) -> None:
         except BrokenPipeError:
             return
         except Exception as error:
-            kind = type(error).__name__
-            message = str(error) if isinstance(error, PcdataError) else f"{kind}: {error}"
-            pipe.send(("stops", kind, message, [str(note) for note in getattr(error, "__notes__", [])]))
+            pipe.send(("stops", *stop_in_words(error)))
 
 
 def _end_with_parent() -> None:

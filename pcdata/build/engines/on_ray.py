@@ -1,0 +1,170 @@
+"""Shards done as tasks of a Ray cluster, one that runs or one of this machine: only ids and statuses travel.
+
+Every machine of the cluster must have pcdata, and see the captures and the folder of the dataset under the same paths.
+A task says in a small file which capture it works on, since nothing else is left of one whose process ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import Any
+
+from pcdata import extras
+from pcdata.build.schedule import Schedule, Task
+from pcdata.build.shard_work import Job
+from pcdata.build.tally import Tally, stop_in_words, stopped
+from pcdata.errors import CacheError, write_fault
+from pcdata.files.interrupts import shielded
+from pcdata.files.opening import read_bytes
+from pcdata.files.strict_json import json_object
+
+_MOST_MARK = 1 << 20  # bytes
+_WAIT = 1.0  # seconds between two looks at signals
+
+
+def work_on_ray(job: Job, shards: Iterable[int], tally: Tally, *, tasks: int, timeout: float | None) -> None:
+    """Do the shards as tasks of a Ray cluster: that of ``RAY_ADDRESS``, the one of this machine, or a new one.
+
+    Args:
+        job: what is done.
+        shards: those to be done.
+        tally: told of every capture when its shard is finished.
+        tasks: how many run at once; 0 = one per core of the cluster.
+        timeout: seconds that one capture may take; None = any time.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        PcdataError: the build must stop; what is committed stays.
+    """
+    ray: Any = extras.require("ray")
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        ray.init(log_to_driver=False, logging_level="warning")
+    running: dict[Any, Task] = {}
+    try:
+        most = tasks or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        shared, schedule = ray.put(job), Schedule(shards)
+        run = ray.remote(_run).options(num_cpus=1, max_retries=0)
+        while True:
+            while len(running) < most and (task := schedule.next(len(running))) is not None:
+                if task.sample_id is None and not task.given_up and job.folder.record(job.plan, task.shard):
+                    continue  # by another process, meanwhile
+                _mark(job, task.shard)
+                running[run.remote(shared, task, timeout)] = task
+            if not running:
+                return
+            for done in ray.wait([*running], timeout=_WAIT)[0]:
+                _take(ray, done, running.pop(done), job, schedule, tally)
+    finally:
+        with shielded():
+            for task_running in running:
+                with suppress(Exception):  # it ends anyway with the job
+                    ray.cancel(task_running, force=True)
+            if is_ours:
+                ray.shutdown()
+
+
+def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: Tally) -> None:
+    """Take what became of a task."""
+    try:
+        kind, *told = ray.get(done)
+    except ray.exceptions.RayError as error:
+        sample_id, what = _marked(job, task.shard)
+        reason = what or f"ProcessEnded: {type(error).__name__} of Ray"
+        schedule.ended(task, sample_id, reason, was_killed=not what)
+        return
+    if kind == "tried":
+        schedule.tried(task, *told)
+    elif kind == "committed":
+        record = job.folder.record(job.plan, task.shard)
+        if record is None:
+            raise CacheError(
+                f"{job.folder.path}: a finished shard does not show here; do all machines see this folder, under this "
+                "path?"
+            )
+        for sample_id, error in told[0].items():
+            tally.captured(task.shard, sample_id, error)
+        tally.committed(record)
+    else:
+        raise stopped(*told)
+
+
+def _mark(job: Job, shard: int, sample_id: str | None = None, what: str = "") -> None:
+    """Say which capture of a shard is worked on, and what happened to it; None = none is.
+
+    Raises:
+        CacheError: it cannot be written.
+    """
+    folder = job.folder.path / "marks"
+    try:
+        folder.mkdir(exist_ok=True)
+        with open(folder / f"{shard:05d}.json", "w", encoding="utf-8") as file:
+            json.dump({"sample_id": sample_id, "what": what}, file)
+    except OSError as error:
+        raise CacheError(f"{job.folder.target}: cannot be written: {write_fault(error)}") from error
+
+
+def _marked(job: Job, shard: int) -> tuple[str | None, str]:
+    """Return which capture of a shard was worked on last, and what happened to it."""
+    path = job.folder.path / "marks" / f"{shard:05d}.json"
+    try:
+        text = read_bytes("build", path, max_bytes=_MOST_MARK, error=CacheError)
+        told = json_object(str(path), text, error=CacheError)
+    except CacheError:  # cut short by the end of its process
+        return None, ""
+    return told.get("sample_id"), str(told.get("what", ""))
+
+
+# -- in a task ---------------------------------------------------------------------------------------------------------
+
+
+def _run(job: Job, task: Task, timeout: float | None) -> tuple[Any, ...]:
+    """Do one task; whatever stops the build is returned in words, since its class may not travel."""
+    import torch
+
+    torch.set_num_threads(1)
+    watch = _Marker(job, task.shard, timeout)
+    try:
+        if task.sample_id is not None:
+            return "tried", job.try_alone(task.sample_id, watch)
+        job.do(task.shard, task.given_up, watch)
+        return "committed", watch.outcomes
+    except Exception as error:
+        return "stops", *stop_in_words(error)
+    finally:
+        watch.close()
+
+
+class _Marker:
+    """Says in a file which capture is worked on, and ends the process when that takes too long."""
+
+    def __init__(self, job: Job, shard: int, timeout: float | None) -> None:
+        self.job, self.shard, self.timeout = job, shard, timeout
+        self.outcomes: dict[str, str | None] = {}
+        self._timer: threading.Timer | None = None
+
+    def begins(self, sample_id: str) -> None:
+        self.close()
+        _mark(self.job, self.shard, sample_id)
+        if self.timeout is not None:
+            self._timer = threading.Timer(self.timeout, self._end, [sample_id])
+            self._timer.daemon = True
+            self._timer.start()
+
+    def ends(self, sample_id: str, error: str | None) -> None:
+        self.close()
+        _mark(self.job, self.shard)
+        self.outcomes[sample_id] = error
+
+    def close(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _end(self, sample_id: str) -> None:
+        _mark(self.job, self.shard, sample_id, f"TimeoutError: took longer than {self.timeout:g} s")
+        os._exit(1)
