@@ -164,9 +164,12 @@ def _finished(job: Job, shards: range, note: Note) -> dict[int, ShardRecord]:
         for shard in shards
         if shard in done and captures_digest(source, plan.ids_of(shard)) != done[shard].captures
     ]
-    for shard in changed:
+    doubtful = [shard for shard in shards if shard in done and done[shard].is_doubtful]
+    for shard in {*changed, *doubtful}:
         del done[shard]
         job.folder.forget(shard)
+    if doubtful:
+        note(f"{len(doubtful)} finished shards are built anew, since captures of them ran out of memory or time")
     if changed:
         note(f"{len(changed)} finished shards are built anew, since a file of their captures has changed")
     if mine := [shard for shard in shards if shard in done]:

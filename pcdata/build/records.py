@@ -89,6 +89,11 @@ class ShardRecord:
             raise CacheError(f"{path}: is damaged, or the record of another build")
         return record
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a capture was quarantined for what may be the machine's fault: memory, time, a killed process."""
+        return any(why.startswith(("MemoryError", "TimeoutError", "ProcessEnded")) for why in self.quarantined.values())
+
     def is_whole(self, folder: Path) -> bool:
         """Say whether the files of the record lie in a folder: their list by its content, they by their sizes."""
         try:

@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from pcdata import errors
 from pcdata.build.plan import Plan
 from pcdata.build.records import ShardRecord
-from pcdata.errors import CaptureError, ConfigError, PcdataError, add_note, locate
+from pcdata.errors import CacheError, CaptureError, ConfigError, PcdataError, add_note, locate
 from pcdata.progress import Progress
 
+_STARVED = 3  # captures in shards one after another that lack memory: the machine is at fault, not they
 _FIRST = 8  # captures: where all of them fail, the configuration is at fault
 
 
@@ -57,6 +58,7 @@ class Tally:
         self._num_done = sum(len(plan.ids_of(shard)) for shard in shards if shard in finished)
         self._any_stored = any(record.samples for record in finished.values())
         self._quarantined = {name: why for one in finished.values() for name, why in one.quarantined.items()}
+        self._num_starved = 0
         self._first: dict[str, str] = {}  # the captures that failed before any was stored
         self._open: dict[int, set[str]] = {}  # captures that are done, of shards that are not
         self._check()
@@ -81,12 +83,20 @@ class Tally:
 
         Raises:
             CaptureError: more captures are quarantined than may be.
+            CacheError: the machine lacks memory.
         """
         self._open.pop(record.shard, None)
         self._any_stored |= bool(record.samples)
         self._num_done += len(record.samples) + len(record.quarantined)
         self._quarantined.update(record.quarantined)
         self._check()
+        starved = [name for name, why in record.quarantined.items() if why.startswith(MemoryError.__name__)]
+        self._num_starved = self._num_starved + len(starved) if starved else 0
+        if self._num_starved >= _STARVED:
+            raise CacheError(
+                f"build_dataset: the memory does not suffice for {starved[-1]!r} and others before it; what is "
+                "finished is kept, and the same command, perhaps with fewer --workers, goes on and tries them again"
+            )
 
     def _check(self) -> None:
         if self._limit is not None and len(self._quarantined) > self._limit:

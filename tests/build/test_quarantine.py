@@ -13,7 +13,7 @@ import torch
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.build.tally import most_bad
-from pcdata.errors import CaptureError, ConfigError, FrameError, PcdataError, TooFewPointsError
+from pcdata.errors import CacheError, CaptureError, ConfigError, FrameError, PcdataError, TooFewPointsError
 from pcdata.io.store.manifest import Manifest
 from tests.build.test_builder import FORMATS, Clouds, cloud, tree
 
@@ -193,3 +193,22 @@ def test_errors_of_every_kind_keep_it(tmp_path, moody):
     source = moody(**{f"c{n}": [KeyError("x")] for n in range(10)})
     with pytest.raises(PcdataError, match="'c0': KeyError: 'x'"):
         build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out")
+
+
+def test_three_captures_that_lack_memory_stop_the_build_and_are_tried_again(tmp_path, moody):
+    config, ids = config_from_yaml(CONFIG), [f"c{n}" for n in range(10)]
+    build_dataset(config, moody(), tmp_path / "calm")
+    source = moody(**{name: [MemoryError(), MemoryError(), ""] for name in ids[5:9]})
+    for file in source.folder.iterdir():
+        file.unlink()
+    with pytest.raises(CacheError, match="memory does not suffice for 'c8'"):
+        build_dataset(config, source, tmp_path / "out")
+    report = build_dataset(config, source, tmp_path / "out")
+    assert not report.quarantined
+    assert any("built anew, since captures of them ran out of memory" in note for note in report.notes)
+    assert tree(tmp_path / "out") == tree(tmp_path / "calm")
+
+
+def test_one_capture_that_lacks_memory_is_quarantined(tmp_path, moody):
+    report = build_dataset(config_from_yaml(CONFIG), moody(c4=[MemoryError()]), tmp_path / "out")
+    assert report.quarantined == {"c4": "MemoryError"}
