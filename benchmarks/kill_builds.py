@@ -27,11 +27,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.build.engines import pool
 from pcdata.files.scratch import living_claims
+from pcdata.structures import DepthFrame
 from pcdata.synthetic import SyntheticSource
 
 RESULTS = Path(__file__).parent / "results"
@@ -43,7 +45,7 @@ output: {format: packed, shard_size: 4}
 CAPTURES = 200
 WAYS = ("worker", "parent of workers", "parent", "disk", "exception", "memory")
 WORKERS = {"worker": 2, "parent of workers": 2, "parent": 0, "disk": 2, "exception": 0, "memory": 0}
-SPARE = 1 << 20  # bytes of memory that are left, fewer than a capture takes
+LOADED, SPARE = 1 << 26, 1 << 22  # bytes of memory that a capture takes while it is loaded, and that are left
 
 
 def main() -> None:
@@ -54,22 +56,22 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     pool.START = arguments.start
-    draw = random.Random(arguments.seed)
+    draw, source = random.Random(arguments.seed), Rendered(CAPTURES)
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        seconds = {way: undisturbed(work, way) for way in WAYS[:3]}
+        seconds = {way: undisturbed(source, work, way) for way in WAYS[:3]}
         whole = tree(work / "whole")
         assert all(tree(work / f"whole {way}") == whole for way in WAYS[:3])
         for number in range(arguments.stops):
             way = WAYS[number % len(WAYS)]
             usual = seconds["parent" if not WORKERS[way] else "worker"]
-            rows.append(stop(work, way, draw.uniform(0.05, 0.6) * usual, draw))
+            rows.append(stop(source, work, way, draw.uniform(0.05, 0.6) * usual, draw))
             print(f"{number:3} {rows[-1]}", flush=True)
             if rows[-1]["outcome"] == "done":
                 rows[-1]["same"] = tree(work / "out") == whole
                 shutil.rmtree(work / "out")
-        pid = started(work, "parent", draw, with_fault=False)
+        pid = started(source, work, "parent", draw, with_fault=False)
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0, (work / "said").read_text()
         last = tree(work / "out") == whole
         left = sorted(path.name for path in work.iterdir() if path.name.startswith(".out"))
@@ -89,23 +91,36 @@ def main() -> None:
     sys.exit(bool(result["different"] or left))
 
 
-def undisturbed(work: Path, way: str) -> float:
+def undisturbed(source: Rendered, work: Path, way: str) -> float:
     """Build without a fault, as a way does; return the seconds."""
     begun = time.perf_counter()
-    build_dataset(config_from_yaml(CONFIG), source(), work / f"whole {way}", workers=WORKERS[way])
+    build_dataset(config_from_yaml(CONFIG), source, work / f"whole {way}", workers=WORKERS[way])
     if way == "parent":
         shutil.copytree(work / f"whole {way}", work / "whole")
     return time.perf_counter() - begun
 
 
-def source() -> SyntheticSource:
-    return SyntheticSource(num_scenes=CAPTURES, num_objects=1, size=(24, 32))
+class Rendered:
+    """Synthetic captures that are rendered once; each takes a while to load, and memory."""
+
+    def __init__(self, captures: int) -> None:
+        scenes = SyntheticSource(num_scenes=captures, num_objects=1, size=(24, 32))
+        self.ids = scenes.ids
+        self.frames = {sample_id: scenes.load(sample_id) for sample_id in scenes.ids}
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def load(self, sample_id: str) -> DepthFrame:
+        """Return one capture."""
+        np.empty(LOADED, np.uint8)
+        return self.frames[sample_id]
 
 
-def stop(work: Path, way: str, delay: float, draw: random.Random) -> dict[str, Any]:
+def stop(source: Rendered, work: Path, way: str, delay: float, draw: random.Random) -> dict[str, Any]:
     """Let a build begin or go on, disturb it, and say what came of it."""
     before = records(work)
-    pid = started(work, way, draw)
+    pid = started(source, work, way, draw)
     time.sleep(delay)
     with suppress(ProcessLookupError, IndexError, FileNotFoundError):  # it has ended, or has no worker now
         disturb(pid, way, draw)
@@ -133,7 +148,7 @@ def disturb(pid: int, way: str, draw: random.Random) -> None:
         resource.prlimit(pid, resource.RLIMIT_AS, (pages * resource.getpagesize() + SPARE, resource.RLIM_INFINITY))
 
 
-def started(work: Path, way: str, draw: random.Random, *, with_fault: bool = True) -> int:
+def started(source: Rendered, work: Path, way: str, draw: random.Random, *, with_fault: bool = True) -> int:
     """Start a build of its own process."""
     raises_at = draw.randrange(1, CAPTURES)
     pid = os.fork()
@@ -147,9 +162,7 @@ def started(work: Path, way: str, draw: random.Random, *, with_fault: bool = Tru
             if with_fault and way == "exception" and done >= raises_at:
                 raise RuntimeError("stopped")
 
-        report = build_dataset(
-            config_from_yaml(CONFIG), source(), work / "out", workers=WORKERS[way], progress=progress
-        )
+        report = build_dataset(config_from_yaml(CONFIG), source, work / "out", workers=WORKERS[way], progress=progress)
         code = 3 if report.quarantined else 0
     except BaseException as error:
         os.write(2, f"{type(error).__name__}: {error}\n".encode())

@@ -86,8 +86,8 @@ def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: 
                 f"{job.folder.path}: a finished shard does not show here; do all machines see this folder, under this "
                 "path?"
             )
-        for sample_id, error in told[0].items():
-            tally.captured(task.shard, sample_id, error)
+        for sample_id, why in told[0].items():
+            tally.captured(task.shard, sample_id, why)
         tally.committed(record)
     else:
         raise stopped(*told)
