@@ -1,0 +1,85 @@
+"""The samples of an epoch are the same whoever reads them: another process later, or several ranks at once."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterable
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, DistributedSampler
+
+from pcdata import CachedCloudDataset, CountedSampler, PointCloud, collate_packed
+
+ORDER = [5, 2, 0, 7, 3, 1, 6, 4]
+
+
+def by_id(batches: Iterable[PointCloud]) -> list[tuple[str, list]]:
+    return [(cloud.meta[0]["sample_id"], cloud.points.tolist()) for batch in batches for cloud in batch]
+
+
+def loader(dataset, sampler, workers: int = 0) -> DataLoader:
+    return DataLoader(dataset, batch_size=2, sampler=sampler, num_workers=workers, collate_fn=collate_packed)
+
+
+@pytest.fixture
+def dataset(caches) -> CachedCloudDataset:
+    made = CachedCloudDataset(caches["packed"], seed=3)
+    made.set_epoch(4)
+    return made
+
+
+def test_an_epoch_that_was_stopped_goes_on_in_another_process_with_the_same_samples(dataset):
+    whole = by_id(loader(dataset, ORDER))
+    dataset.set_epoch(4)
+    first = iter(loader(dataset, ORDER, workers=1))
+    begun = by_id([next(first), next(first)])
+    resumed = pickle.loads(pickle.dumps(dataset))  # as a checkpoint keeps it
+    assert begun + by_id(loader(resumed, ORDER[4:], workers=2)) == whole
+
+
+def test_samples_that_come_twice_keep_their_draws_where_the_count_goes_on(dataset):
+    asked = list(CountedSampler([0, 1, 0, 2, 0, 1]))
+    whole = by_id(loader(dataset, asked))
+    assert by_id(loader(dataset, asked[:2])) + by_id(loader(dataset, asked[2:])) == whole
+    assert len({str(points) for _, points in whole}) == 6
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_two_ranks_read_together_what_one_reads(dataset, workers):
+    def of(ranks: int, rank: int) -> list[tuple[str, list]]:
+        sampler = DistributedSampler(dataset, num_replicas=ranks, rank=rank, seed=1)
+        sampler.set_epoch(4)
+        dataset.set_epoch(4)
+        return by_id(loader(dataset, sampler, workers))
+
+    alone = of(1, 0)
+    assert sorted(of(2, 0) + of(2, 1)) == sorted(alone)
+    assert len({name for name, _ in alone}) == len(dataset)
+
+
+def test_a_stateful_loader_goes_on_where_it_was(dataset):
+    stateful = pytest.importorskip("torchdata.stateful_dataloader", reason="pip install torchdata")
+
+    def begin():
+        return stateful.StatefulDataLoader(dataset, batch_size=2, num_workers=1, collate_fn=collate_packed)
+
+    whole = by_id(begin())
+    stopped = begin()
+    batches = iter(stopped)
+    begun = by_id([next(batches)])
+    resumed = begin()
+    resumed.load_state_dict(stopped.state_dict())
+    assert begun + by_id(resumed) == whole
+
+
+def test_other_epochs_seeds_and_samples_have_other_draws(caches, dataset):
+    def points(**changes) -> torch.Tensor:
+        made = CachedCloudDataset(caches["packed"], **{"seed": 3, **changes.get("made", {})})
+        made.set_epoch(changes.get("epoch", 4))
+        return made[0].points
+
+    assert torch.equal(points(), dataset[0].points)
+    for change in ({"epoch": 5}, {"made": {"seed": 4}}):
+        other = points(**change)
+        assert other.shape != points().shape or not torch.equal(other, points())
