@@ -16,8 +16,7 @@ What the rates stand beside:
 - ``npz and default_collate``, ``hdf5 group per sample``: what most training code does.
 - WebDataset, LitData, Zarr and Lance, each as its documentation shows, where they are installed.
 
-"augmented" is RandomRotation, RandomScale, RandomJitter and RandomPointDropout on every sample. CPU time of all
-processes per batch says what a rate is made of.
+Augmented are every sample by RandomRotation, RandomScale and RandomJitter, and also by RandomPointDropout.
 """
 
 from __future__ import annotations
@@ -276,8 +275,10 @@ def _lance(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
     return loader_of(_LanceSamples(str(folder / "samples.lance"), len(clouds)), _as_it_is, workers, passes)
 
 
-def rate(way: _Loaded, batches: int) -> float:
-    """Samples a second over so many batches."""
+def rate(way: _Loaded, batches: int, waiting: int) -> float:
+    """Samples a second over so many batches, after those that workers made while others were measured."""
+    for _ in way.batches(waiting):
+        pass
     begun = time.perf_counter()
     for _ in way.batches(batches):
         pass
@@ -288,7 +289,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--samples", type=int, default=1024)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--batches", type=int, default=96, help="of a stretch; slow ways have a sixteenth")
+    parser.add_argument("--batches", type=int, default=96, help="of a stretch; slow ways have an eighth")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--out", type=Path, default=RESULTS / "loading.json")
     arguments = parser.parse_args()
@@ -323,9 +324,9 @@ def main() -> None:
         for number in range(arguments.repeats + 1):  # the first stretch begins workers and fills caches
             for name, way in list(ways.items()):
                 is_ours = name in ("memcpy", "torch's ceiling") or name.startswith("packed")
-                count = arguments.batches if is_ours else max(4, arguments.batches // 16)
+                count = arguments.batches if is_ours else max(8, arguments.batches // 8)
                 try:
-                    found = rate(way, count)
+                    found = rate(way, count, 4 * arguments.workers)
                 except Exception as error:  # a peer whose interface changed
                     skipped[name] = f"{type(error).__name__}: {error}"[:200]
                     del ways[name], rates[name]

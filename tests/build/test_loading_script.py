@@ -47,6 +47,18 @@ def test_the_settings_arrive_in_the_script():
         assert part in text
 
 
+def test_buckets_arrive_in_the_script_where_batches_are_padded():
+    loader = config_from_yaml("loader: {collate: padded, buckets: [64, 128]}\n").loader
+    text = loading_script(loader)
+    compile(text, "load.py", "exec")
+    assert "collate_fn=partial(collate_padded, buckets=(64, 128))" in text
+    assert "from functools import partial\n" in text
+    assert "functools" not in loading_script(Loader(collate="padded"))
+    for wrong in ("{buckets: [64]}", "{collate: padded, buckets: [64, 32]}", "{collate: padded, buckets: [0]}"):
+        with pytest.raises(ConfigError, match="buckets"):
+            config_from_yaml(f"loader: {wrong}\n")
+
+
 WINDOWS = "{num_obs: 2, horizon: 4, stride: 2, pad: drop, actions: [action]}"
 
 
