@@ -61,9 +61,10 @@ class Sample:
 class SampleIds(Sequence[str]):
     """The ids of an index, which are unique; each is decoded when it is asked for."""
 
-    def __init__(self, index: SampleIndex, letters: NDArray[np.uint8], ends: NDArray[np.int64]) -> None:
-        self._index = index
-        self._letters, self._ends = letters, ends
+    def __init__(self, index: SampleIndex) -> None:
+        self._index = index  # which does not hold this: a circle would keep the mapped files
+        self._letters: NDArray[np.uint8] = index.arrays[_LETTERS]
+        self._ends: NDArray[np.int64] = index.arrays[_ENDS]
         self._sorted: tuple[NDArray[np.uint64], NDArray[np.int64]] | None = None  # hashes, and whose each is
 
     def __len__(self) -> int:
@@ -254,14 +255,13 @@ class SampleIndex(Sequence[Sample]):
         )
 
     def _take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self._arrays = arrays
+        self.arrays = arrays  # by file name
         self.num_points: NDArray[np.int64] = arrays[_COUNTS]  # (S,)
         self.shards: NDArray[np.int32] = arrays[_SHARDS]  # (S,) never falling
         self.tables: NDArray[np.uint8] = arrays[_TABLES]  # (shards, 32) SHA-256; of none before it is written
-        self.ids = SampleIds(self, arrays[_LETTERS], arrays[_ENDS])
 
     def _check(self) -> None:
-        arrays = self._arrays
+        arrays = self.arrays
         size = len(arrays[_ENDS])
         if any(len(arrays[name]) != size for name in (_COUNTS, _DIGESTS, _SHARDS)):
             counts = {name: len(arrays[name]) for name in FILES if name != _LETTERS}
@@ -281,6 +281,11 @@ class SampleIndex(Sequence[Sample]):
         if len(self.tables) and int(self.shards[-1]) >= len(self.tables):
             raise CacheError(f"a sample lies in shard {int(self.shards[-1])}, but there are {len(self.tables)}")
         self.ids.check()
+
+    @property
+    def ids(self) -> SampleIds:
+        """The ids of all samples."""
+        return SampleIds(self)
 
     @property
     def num_shards(self) -> int:
@@ -309,7 +314,7 @@ class SampleIndex(Sequence[Sample]):
 
     def digest(self, number: int) -> str:
         """Return the digest of the record of one sample."""
-        return self._arrays[_DIGESTS][number].tobytes().hex()
+        return self.arrays[_DIGESTS][number].tobytes().hex()
 
     def of_shard(self, shard: int) -> range:
         """Return which samples lie in a shard."""
@@ -318,7 +323,7 @@ class SampleIndex(Sequence[Sample]):
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, SampleIndex):
-            return all(np.array_equal(self._arrays[name], other._arrays[name]) for name in FILES if name != _TABLES)
+            return all(np.array_equal(self.arrays[name], other.arrays[name]) for name in FILES if name != _TABLES)
         if isinstance(other, (list, tuple)):
             return len(self) == len(other) and all(mine == one for mine, one in zip(self, other))
         return NotImplemented
@@ -345,7 +350,7 @@ class SampleIndex(Sequence[Sample]):
             raise CacheError(f"a sample lies in shard {int(self.shards[-1])}, but there are {len(tables)}")
         told = {}
         (folder / FOLDER).mkdir()
-        given = {**self._arrays, _TABLES: np.frombuffer(b"".join(tables), np.uint8).reshape(-1, 32)}
+        given = {**self.arrays, _TABLES: np.frombuffer(b"".join(tables), np.uint8).reshape(-1, 32)}
         for name, (dtype, row) in FILES.items():
             content = npy_bytes(np.ascontiguousarray(given[name], dtype).reshape(-1, *row))
             with open(folder / FOLDER / name, "xb") as file:
@@ -382,7 +387,7 @@ class SampleIndex(Sequence[Sample]):
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is not None:  # mapped again, wherever it is needed: no worker gets a copy
             return _read_again, (*self._source, len(self))
-        return _of_arrays, ({name: np.asarray(array) for name, array in self._arrays.items()},)
+        return _of_arrays, ({name: np.asarray(array) for name, array in self.arrays.items()},)
 
 
 def _read_again(folder: str, told: Mapping[str, Any], num_samples: int) -> SampleIndex:
