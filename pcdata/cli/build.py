@@ -7,9 +7,10 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
+from pcdata.cli.argument_types import positive
 from pcdata.cli.choices import add_model_options, given_preset
 from pcdata.cli.known_names import FORMATS
-from pcdata.cli.options import add_capture_options, given_options, positive, skip_list
+from pcdata.cli.options import add_capture_options, given_options, skip_list
 from pcdata.cli.progress_bar import ProgressBar
 
 if TYPE_CHECKING:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcdata.cli import calib_droid, calib_rig
+from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import SENSORS
-from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.options import add_capture_options, open_captures
 
 if TYPE_CHECKING:
     from pcdata.calibration import Board, Calibration, PlaneResult

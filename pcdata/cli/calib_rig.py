@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import REFINERS
 from pcdata.cli.options import (
     RIG_OPTIONS,
@@ -14,7 +15,6 @@ from pcdata.cli.options import (
     add_layout_options,
     add_skip_options,
     given_options,
-    positive,
     skip_list,
     tell_skipped,
 )  # fmt: skip

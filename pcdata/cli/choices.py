@@ -6,8 +6,8 @@ import argparse
 import shlex
 from typing import TYPE_CHECKING, Any
 
+from pcdata.cli.argument_types import name_and_value, value_of
 from pcdata.cli.known_names import CHOICES, MODELS
-from pcdata.cli.options import name_and_value, value_of
 
 if TYPE_CHECKING:
     from pcdata.models import Preset

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from pcdata.cli.argument_types import name_and_value, positive, value_of
 from pcdata.cli.known_names import WRITERS
-from pcdata.cli.options import add_capture_options, name_and_value, open_captures, positive, value_of
+from pcdata.cli.options import add_capture_options, open_captures
 from pcdata.cli.progress_bar import ProgressBar
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pcdata.cli.options import add_capture_options, open_captures, positive, said_again
+from pcdata.cli.argument_types import positive
+from pcdata.cli.options import add_capture_options, open_captures, said_again
 from pcdata.cli.progress_bar import ProgressBar
 
 

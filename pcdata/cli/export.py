@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from pcdata.cli.argument_types import name_and_value, positive
 from pcdata.cli.choices import given_preset
 from pcdata.cli.known_names import MODELS, TARGETS
-from pcdata.cli.options import add_capture_options, given_flags, name_and_value, open_captures, positive
+from pcdata.cli.options import add_capture_options, given_flags, open_captures
 from pcdata.cli.progress_bar import ProgressBar
 
 if TYPE_CHECKING:

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import CARVINGS, WEIGHTINGS
-from pcdata.cli.options import add_capture_options, open_captures, positive
+from pcdata.cli.options import add_capture_options, open_captures
 from pcdata.cli.progress_bar import ProgressBar
 
 

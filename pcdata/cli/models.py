@@ -6,8 +6,9 @@ import argparse
 import json
 from typing import Any
 
+from pcdata.cli.argument_types import positive
 from pcdata.cli.choices import add_model_options, given_choices
-from pcdata.cli.options import add_import_option, positive
+from pcdata.cli.options import add_import_option
 
 
 def add_to(commands: Any) -> None:

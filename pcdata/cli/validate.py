@@ -10,8 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
+from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import CHECKS, SENSORS
-from pcdata.cli.options import add_capture_options, open_captures, positive, said_again
+from pcdata.cli.options import add_capture_options, open_captures, said_again
 from pcdata.cli.progress_bar import ProgressBar
 
 

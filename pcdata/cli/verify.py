@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pcdata.cli.options import positive
+from pcdata.cli.argument_types import positive
 from pcdata.cli.progress_bar import ProgressBar
 
 

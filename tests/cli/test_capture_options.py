@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from pcdata import open_source
+from pcdata.cli.capture_flags import COMBINATOR_FLAGS, LAYOUT_FLAGS
 from pcdata.cli.main import main
-from pcdata.cli.options import _COMBINED, _FLAGS, _NO_OPTIONS, KINDS, add_capture_options, attribute_of, given_options
+from pcdata.cli.options import _NO_OPTIONS, KINDS, add_capture_options, attribute_of, given_options
 from pcdata.errors import CaptureError, ConfigError, PcdataError, UnitError
 from pcdata.io import COMBINATORS, LAYOUTS, CaptureCamera, read_capture_camera, write_capture_camera
 from pcdata.io.calibration.capture_camera import _STATED
@@ -47,11 +48,11 @@ def parsed(*words: str) -> argparse.Namespace:
 
 def test_flags_and_kinds_are_those_of_the_layouts() -> None:
     options = {name for layout in LAYOUTS.values() for name in inspect.signature(layout).parameters} - {"path"}
-    assert set(_FLAGS) <= options
-    assert options - set(_FLAGS) == set(), "give the new option a flag, so that --help tells of it"
+    assert set(LAYOUT_FLAGS) <= options
+    assert options - set(LAYOUT_FLAGS) == set(), "give the new option a flag, so that --help tells of it"
     assert {*_NO_OPTIONS, "skip_file"} == {*OPENING}
     assert tuple(LAYOUTS) == KINDS
-    assert tuple(_COMBINED) == tuple(COMBINATORS), "give the new combinator a flag, so that --help tells of it"
+    assert tuple(COMBINATOR_FLAGS) == tuple(COMBINATORS), "give the new combinator a flag, so that --help tells of it"
 
 
 def test_every_flag_becomes_the_option_of_python() -> None:
@@ -85,7 +86,7 @@ def test_every_flag_becomes_the_option_of_python() -> None:
         "clock": (["recorded"], "recorded"),
         "max_gap": (["0.2"], 0.2),
     }
-    for name, (flag, _) in _FLAGS.items():
+    for name, (flag, _) in LAYOUT_FLAGS.items():
         text, value = words[name]
         assert given_options(parsed(flag, *text)) == {name: value}
         assert getattr(parsed(), attribute_of(flag)) is None
@@ -125,7 +126,7 @@ def test_the_page_on_captures_tells_every_layout_option_and_combinator() -> None
     page = (Path(__file__).resolve().parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
     rows = {name for line in page.splitlines() if line.startswith("| `") for name in re.findall(r"`([^`]+)`", line)}
     named = {word for row in rows for word in row.split()}
-    assert {*LAYOUTS, *COMBINATORS, *_FLAGS, *(flag for flag, _ in _FLAGS.values())} <= named
+    assert {*LAYOUTS, *COMBINATORS, *LAYOUT_FLAGS, *(flag for flag, _ in LAYOUT_FLAGS.values())} <= named
     for name, combinator in COMBINATORS.items():
         assert {*fields_of(combinator), f"--{name}"} <= named
 
@@ -140,9 +141,9 @@ def test_every_command_on_captures_takes_them_and_lists_the_kinds(command: str, 
     with pytest.raises(SystemExit):
         main([*command.split(), "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    combined = [f"--{name}" for name in _COMBINED]
+    combined = [f"--{name}" for name in COMBINATOR_FLAGS]
     for flag in (
-        *(flag for flag, _ in _FLAGS.values()),
+        *(flag for flag, _ in LAYOUT_FLAGS.values()),
         *combined,
         "--option",
         "--only",

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pcdata import DepthFrame
-from pcdata.cli.options import value_of
+from pcdata.cli.argument_types import value_of
 from pcdata.functional.depth.rendered import ray_lengths
 from pcdata.geometry import rigid
 from pcdata.geometry.camera_axes import CAMERA_AXES
