@@ -9,40 +9,27 @@ from typing import Any
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note, near_matches
-from pcdata.io.messages.cameras import camera_of
+from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note
+from pcdata.io.messages.camera_descriptions import described
 from pcdata.io.messages.clock import Clock
-from pcdata.io.messages.decoding import decoded, is_known, plain_type
-from pcdata.io.messages.images import DEPTH_ENCODINGS, ImageForm, form_of
+from pcdata.io.messages.image_topics import (
+    ImageTopic,
+    named_image,
+    pixels,
+    preferred,
+    same_pixels,
+    told,
+    topics_in_words,
+)
+from pcdata.io.messages.images import DEPTH_ENCODINGS
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.messages.statement import Statement
-from pcdata.io.messages.transforms import plain_frame
 from pcdata.structures import Camera
 
-_IMAGES = (
-    "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"
-)  # fmt: skip
-_INFOS = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
 ROLES = ("labels", "mask", "confidence")
-_TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
 RECORDED = "stated in the recording"
 _MILLIMETRE = 0.001  # REP 118
-
-
-@dataclass(frozen=True, eq=False)
-class ImageTopic:
-    """A topic of images, and what its first message shows."""
-
-    topic: Topic
-    form: ImageForm
-    frame: str
-
-    @property
-    def base(self) -> str:
-        """The name without what only says how images are packed."""
-        start, _, end = self.topic.name.rpartition("/")
-        return start if end in _TRANSPORTS and start else self.topic.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,33 +95,6 @@ class Choice:
     clock: Clock = "header"
 
 
-def image_topics(log: MessageLog) -> dict[str, ImageTopic]:
-    """Return the topics of images by name, each with what its first message shows; damaged ones are left out."""
-    found = {}
-    with log.opened() as read:
-        for topic in log.topics.values():
-            if plain_type(topic.type) in _IMAGES and len(topic) and is_known(topic):
-                try:
-                    message = decoded(topic, read(topic, 0))
-                    form = form_of(message, topic.name)
-                except CaptureError:
-                    continue
-                found[topic.name] = ImageTopic(topic, form, plain_frame(message.header.frame_id))
-    return found
-
-
-def topics_in_words(log: MessageLog, kinds: Sequence[str] | None = None) -> str:
-    """Return the topics with type, number of messages and rate, one to a line."""
-    shown = [one for one in log.topics.values() if kinds is None or plain_type(one.type) in kinds]
-    return "".join(f"\n  {told(one)}" for one in shown) or " none"
-
-
-def told(topic: Topic) -> str:
-    """Return what a topic is in a few words."""
-    rate = f", {topic.rate():.3g} Hz" if topic.rate() else ""
-    return f"{topic.name} ({topic.type}, {len(topic)} message{'s' * (len(topic) != 1)}{rate})"
-
-
 def chosen_cameras(
     where: str, log: MessageLog, images: Mapping[str, ImageTopic], said: Statement, choice: Choice
 ) -> list[CameraStream]:
@@ -162,12 +122,12 @@ def _depths(
     where: str, log: MessageLog, images: Mapping[str, ImageTopic], said: Statement, named: Sequence[str]
 ) -> list[tuple[str, ImageTopic]]:
     if named:
-        return [(_camera_name(name, named), _named_image(where, log, images, name)) for name in named]
+        return [(_camera_name(name, named), named_image(where, log, images, name)) for name in named]
     depths = [image for image in images.values() if image.form.role == "depth"]
     if said.cameras:
         found = []
         for camera in said.cameras:
-            fitting = _preferred([image for image in depths if image.base.startswith(f"/{camera}/depth/")])
+            fitting = preferred([image for image in depths if image.base.startswith(f"/{camera}/depth/")])
             if len(fitting) != 1:
                 raise CaptureError(
                     f"{where}: it states a camera {camera!r:.100}, but {len(fitting)} topics of depth begin with "
@@ -175,7 +135,7 @@ def _depths(
                 )
             found.append((camera, fitting[0]))
         return found
-    fitting = _preferred(depths)
+    fitting = preferred(depths)
     if len(fitting) == 1:
         return [(_camera_name(fitting[0].topic.name, ()), fitting[0])]
     how = "depth=TOPIC (--depth-topic TOPIC), or a list of topics for views of one frame"
@@ -187,27 +147,6 @@ def _depths(
     raise CaptureError(
         f"{where}: no topic holds depth images (16UC1, 32FC1, compressedDepth) that say so; name one by {how}. "
         f"Topics:{topics_in_words(log)}"
-    )
-
-
-def _preferred(images: Sequence[ImageTopic]) -> list[ImageTopic]:
-    """Return one for each image that is there both raw and packed: the raw one, which nothing was taken from."""
-    best: dict[str, ImageTopic] = {}
-    for image in sorted(images, key=lambda one: (one.topic.name != one.base, one.topic.name)):
-        best.setdefault(image.base, image)
-    return list(best.values())
-
-
-def _named_image(where: str, log: MessageLog, images: Mapping[str, ImageTopic], name: str) -> ImageTopic:
-    if name in images:
-        return images[name]
-    if name in log.topics:
-        topic = log.topics[name]
-        why = "has no messages" if not len(topic) else "is none of images, or its first message is damaged"
-        raise CaptureError(f"{where}: topic {told(topic)} {why}")
-    raise ConfigError(
-        f"{where}: there is no topic {name!r:.200}{near_matches(name, log.topics)}; topics of images:"
-        f"{topics_in_words(log, _IMAGES)}"
     )
 
 
@@ -234,17 +173,17 @@ def _stream(
     facts = said.cameras.get(own, {})
     unit, float_unit, unit_source = _units(where, image, facts, choice.metres_per_unit)
     is_window = facts.get("is_window") is True
-    camera, infos, rectified = _described(where, log, choice, image, choice.intrinsics, is_window=is_window)
+    camera, infos, rectified = described(where, log, image, choice.camera_info, choice.intrinsics, is_window=is_window)
     color = _color(where, log, images, choice, image, number)
     color_camera = None
-    if color is not None and not _same_pixels(color, image):
+    if color is not None and not same_pixels(color, image):
         if not choice.registered:
             raise CaptureError(
-                f"{where}: the images of {color.topic.name} ({_pixels(color)}, frame {color.frame!r}) are of other "
-                f"pixels than the depth ({_pixels(image)}, frame {image.frame!r}); registered=True (--registered) "
+                f"{where}: the images of {color.topic.name} ({pixels(color)}, frame {color.frame!r}) are of other "
+                f"pixels than the depth ({pixels(image)}, frame {image.frame!r}); registered=True (--registered) "
                 "registers the depth to them"
             )
-        color_camera, color_infos, _ = _described(where, log, choice, color, None)
+        color_camera, color_infos, _ = described(where, log, color, choice.camera_info, None)
         if color_camera is None:
             assert color_infos is not None
             raise IntrinsicsError(
@@ -266,14 +205,6 @@ def _stream(
         log.topics.get(f"/{own}/pose_matrix") if facts else None,
         facts,
     )
-
-
-def _pixels(image: ImageTopic) -> str:
-    return f"{image.form.size[1]}x{image.form.size[0]}"
-
-
-def _same_pixels(one: ImageTopic, other: ImageTopic) -> bool:
-    return one.form.size == other.form.size and one.frame == other.frame
 
 
 def _units(where: str, image: ImageTopic, said: Mapping[str, Any], given: float | None) -> tuple[float, float, str]:
@@ -299,63 +230,6 @@ def _units(where: str, image: ImageTopic, said: Mapping[str, Any], given: float 
     )
 
 
-# -- what describes the images -----------------------------------------------------------------------------------------
-
-
-def _described(
-    where: str,
-    log: MessageLog,
-    choice: Choice,
-    image: ImageTopic,
-    intrinsics: tuple[float, float, float, float] | None,
-    *,
-    is_window: bool = False,
-) -> tuple[Camera | None, Topic | None, bool]:
-    """Return the camera of all images, or the topic that describes each, and whether its projection is theirs."""
-    size = image.form.size
-    if intrinsics is not None:
-        fx, fy, cx, cy = intrinsics
-        return Camera.pinhole(fx=fx, fy=fy, cx=cx, cy=cy, size=size), None, False
-    topic = _info_topic(where, log, choice, image)
-    told_by = f"{where}: {topic.name}"
-    with log.opened() as read:
-        first, last = (decoded(topic, read(topic, place)) for place in (0, len(topic) - 1))
-    rectified = "rect" in image.base.rpartition("/")[2] and any(first.d if hasattr(first, "d") else first.D)
-    camera = camera_of(told_by, first, size, rectified=rectified, is_window=is_window)
-    if camera.to_dict() == camera_of(told_by, last, size, rectified=rectified, is_window=is_window).to_dict():
-        return camera, None, rectified
-    return None, topic, rectified
-
-
-def _info_topic(where: str, log: MessageLog, choice: Choice, image: ImageTopic) -> Topic:
-    infos = {name: one for name, one in log.topics.items() if plain_type(one.type) in _INFOS and len(one)}
-    named = (choice.camera_info or {}).get(image.topic.name)
-    if named is not None:
-        if named not in infos:
-            raise ConfigError(f"{where}: camera_info {named!r:.200} is no topic of them; it has {', '.join(infos)}")
-        return infos[named]
-    beside = [
-        f"{image.base.rpartition('/')[0]}/{word}" for word in ("camera_info", "calibration", "camera_calibration")
-    ]
-    for name in beside:
-        if name in infos:
-            return infos[name]
-    fitting = [one for one in infos.values() if _frame_of(log, one) == image.frame and image.frame]
-    if len(fitting) == 1:
-        return fitting[0]
-    have = f"topics that describe cameras: {', '.join(infos)}" if infos else "no topic describes a camera"
-    raise IntrinsicsError(
-        f"{where}: nothing describes the camera of {image.topic.name}: there is no {beside[0]}; {have}. Name it by "
-        f'camera_info={{"{image.topic.name}": TOPIC}}, or say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX '
-        "FY CX CY)"
-    )
-
-
-def _frame_of(log: MessageLog, topic: Topic) -> str:
-    with log.opened() as read:
-        return plain_frame(decoded(topic, read(topic, 0)).header.frame_id)
-
-
 # -- color -------------------------------------------------------------------------------------------------------------
 
 
@@ -367,9 +241,9 @@ def _color(
             return None
         if len(choice.color) not in (1, len(choice.depth) or 1):
             raise ConfigError(f"{where}: color names {len(choice.color)} topics for {len(choice.depth)} of depth")
-        return _named_image(where, log, images, choice.color[number % len(choice.color)])
-    colors = _preferred([image for image in images.values() if image.form.role == "color"])
-    same = [image for image in colors if _same_pixels(image, depth)]
+        return named_image(where, log, images, choice.color[number % len(choice.color)])
+    colors = preferred([image for image in images.values() if image.form.role == "color"])
+    same = [image for image in colors if same_pixels(image, depth)]
     fitting = same or (colors if choice.registered else [])
     if len(fitting) > 1:
         fitting = _beside(fitting, depth)

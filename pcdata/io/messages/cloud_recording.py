@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
-from pcdata.io.messages.camera_streams import told
 from pcdata.io.messages.clock import Clock, on_clock
 from pcdata.io.messages.decoding import decoded
+from pcdata.io.messages.image_topics import told
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.messages.point_clouds import cloud_of

@@ -15,16 +15,15 @@ from pcdata.errors import CaptureError, FrameError, add_note
 from pcdata.io.messages.camera_streams import (
     CameraStream,
     Choice,
-    ImageTopic,
     chosen_cameras,
-    image_topics,
-    told,
 )
 from pcdata.io.messages.clock import Clock, has_header, on_clock
 from pcdata.io.messages.decoding import decoded, plain_type
+from pcdata.io.messages.image_topics import ImageTopic, image_topics, told
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
-from pcdata.io.messages.signal_streams import SignalStream, chosen_signals
+from pcdata.io.messages.signal_choice import chosen_signals
+from pcdata.io.messages.signal_streams import SignalStream
 from pcdata.io.messages.statement import TOPIC, Statement, read_statement
 from pcdata.io.messages.transforms import FrameTree, TreeBuilder
 from pcdata.io.sources.recording import READ_COLOR

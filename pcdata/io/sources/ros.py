@@ -12,9 +12,10 @@ from pcdata.errors import CaptureError, ConfigError, PcdataError
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, in_order, name_some
 from pcdata.io.calibration.foreign_cameras import check_motion
-from pcdata.io.messages.camera_streams import Choice, image_topics, told
+from pcdata.io.messages.camera_streams import Choice
 from pcdata.io.messages.clock import CLOCKS, Clock
 from pcdata.io.messages.cloud_recording import CloudRecording, cloud_topics
+from pcdata.io.messages.image_topics import image_topics, told
 from pcdata.io.messages.joined_recording import JoinedRecording
 from pcdata.io.messages.joined_topics import Joining
 from pcdata.io.messages.message_log import CONTAINERS, METADATA, MessageLog, container_of, opened_log
