@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import CaptureError, DTypeError, NoReadingError, PcdataWarning, UnitError
-from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, decoded, unit_fits, units_in_words
+from pcdata.functional.depth.unit_fit import WORTH_NAMING, DepthEncoding, DepthUnit, decoded, unit_fits, units_in_words
 
 _NEAREST, _FARTHEST = 0.01, 100.0  # metres: no median of a depth camera's frame lies outside
 MARKS = {65535: "the highest 16-bit number", 32767: "the highest 15-bit number", 4095: "the highest 12-bit number"}
 _FEW = 1000  # fewer readings may hold any number by chance
 _MARKED = 0.002  # of the readings: a single depth holds less of any real scene
 _SAMPLE = 1 << 16  # pixels that tell as much as all
-_NAMED = 0.001  # probability above which a unit is named: without the camera even the right one may look unlikely
 
 
 def metres_of_value(metres_per_unit: float, encoding: DepthEncoding = "plain") -> NDArray[np.float32]:
@@ -120,7 +119,7 @@ def check_plausible(where: str, depth: NDArray[np.float32], unit: DepthUnit, sto
     median = float(np.median(valid[:: max(1, len(valid) >> 16)]))  # 65,536 pixels tell as much as all
     if not _NEAREST <= median <= _FARTHEST:
         fits = unit_fits(np.where(depth > 0, stored, 0), declared=unit)
-        likely = [fit for fit in fits if fit.probability >= _NAMED and _NEAREST <= fit.median <= _FARTHEST]
+        likely = [fit for fit in fits if fit.probability >= WORTH_NAMING and _NEAREST <= fit.median <= _FARTHEST]
         named = f"the numbers fit {units_in_words(likely)}" if likely else "give the length of one unit in metres"
         raise UnitError(
             f"{where}: half of the valid depth is {'beyond' if median > 1 else 'within'} {median:g} m with {unit}; is "

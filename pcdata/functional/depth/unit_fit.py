@@ -85,6 +85,7 @@ _PIXELS = 1 << 17  # looked at: shares are known to 0.4 %
 _STEREO_NOISE = (0.8, 0.55)  # center, spread of the logarithm
 _FLIGHT_NOISE = (0.0015, 0.5)
 _FLIGHT_RARER = -0.7
+WORTH_NAMING = 0.001  # probability above which a unit is named: without the camera even the right one may look unlikely
 # Disparity step over baseline, in pixels per metre: 1/32 of a pixel over 0.1 m, to 1/8 over 0.075 m and a margin.
 _STEPS = (0.3, 2.0)
 _STEP_SPREAD = 0.3
@@ -134,6 +135,11 @@ def unit_fits(
         UnitFit(unit, weight / total, traces[unit.encoding].median * unit.metres) for unit, weight in weights.items()
     ]
     return sorted(fits, key=lambda fit: -fit.probability)
+
+
+def likely_fits(stored: NDArray[Any]) -> list[UnitFit]:
+    """Return the up to four units that stored depth fits best, of those that are worth a mention; the best first."""
+    return [fit for fit in unit_fits(stored) if fit.probability >= WORTH_NAMING][:4]
 
 
 def check_depth_encoding(where: str, encoding: str) -> DepthEncoding:

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import ConfigError, IntrinsicsError, UnitError
-from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
+from pcdata.functional.depth.unit_fit import likely_fits, units_in_words
 from pcdata.io.sources.lerobot_cameras import DepthStream
 from pcdata.io.sources.lerobot_index import LeRobotIndex
 from pcdata.io.sources.lerobot_sidecars import intrinsics_beside
 from pcdata.io.sources.lerobot_views import Lens, Pose, lens_of_column, lens_of_numbers
 from pcdata.io.sources.option_checks import check_pinhole
-
-_NAMED = 0.001  # probability above which a unit is worth a mention
 
 
 def with_unit(where: str, stream: DepthStream, units: Any, first_image: Callable[[], NDArray[Any]]) -> DepthStream:
@@ -48,7 +46,7 @@ def with_unit(where: str, stream: DepthStream, units: Any, first_image: Callable
 
 def _no_unit(where: str, stream: DepthStream, stored: NDArray[Any]) -> UnitError:
     """Name the units that an image fits."""
-    fits = [fit for fit in unit_fits(stored) if fit.probability >= _NAMED][:4]
+    fits = likely_fits(stored)
     told = f"by its numbers it may be {units_in_words(fits)}" if fits else ways(float(stored.max(initial=0)))
     example = f"{fits[0].unit.metres:.10g}" if fits else "0.001"
     return UnitError(

@@ -19,7 +19,7 @@ from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
 from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, name_some, positions
-from pcdata.functional.depth.unit_fit import unit_fits, units_in_words
+from pcdata.functional.depth.unit_fit import WORTH_NAMING, likely_fits, unit_fits, units_in_words
 from pcdata.io.images.reading import read_color, read_raw_depth
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.joined_views import join_views
@@ -30,7 +30,6 @@ from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
 
 Size = tuple[int, int]  # (height, width)
 ONE_IMAGE = "Give the path of one image instead of the folder"  # the advice where images are of several units
-_NAMED = 0.001  # probability above which a unit is worth a mention
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -211,7 +210,7 @@ def stated_unit(where: str, unit: float | None, depth: Path, others: Sequence[Pa
     if unit is not None:
         return check_metres_per_unit(where, unit)
     raw = read_raw_depth(where, depth)
-    fits = [fit for fit in unit_fits(raw) if fit.probability >= _NAMED][:4]
+    fits = likely_fits(raw)
     if not fits:
         raise UnitError(f"{where}: no file states the unit of depth; {ways(float(raw.max(initial=0)))}")
     best = fits[0].unit
@@ -219,7 +218,7 @@ def stated_unit(where: str, unit: float | None, depth: Path, others: Sequence[Pa
     for other in others:
         theirs = {fit.unit: fit.probability for fit in unit_fits(read_raw_depth(where, other))}
         likely = max(theirs, key=lambda unit: theirs[unit], default=best)
-        if theirs and min(theirs.get(best, 0.0), own.get(likely, 0.0)) < _NAMED:
+        if theirs and min(theirs.get(best, 0.0), own.get(likely, 0.0)) < WORTH_NAMING:
             raise UnitError(
                 f"{where}: no file states the unit of depth, and by their numbers the images are not of the same: "
                 f"{depth.name} may be {best}, {other.name} {likely}. {ONE_IMAGE}, and its unit with it"
@@ -282,3 +281,9 @@ def one_of(where: str, option: str, name: str | None, names: Sequence[str]) -> s
     if name not in names:
         raise ConfigError(f"{where}: {option} {name!r} is not there; it has {', '.join(names)}")
     return name
+
+
+def unread_cameras(names: Sequence[str], chosen: Sequence[str]) -> list[str]:
+    """Name the cameras that are there and not chosen, in one line; no line where there are none."""
+    others = [name for name in names if name not in chosen]
+    return [f"{len(others)} other cameras: {name_some(others)}"] if others else []

@@ -19,33 +19,32 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PoseError
 from pcdata.files.opening import read_text
-from pcdata.files.sample_names import in_order, name_some
+from pcdata.files.sample_names import in_order
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import invert_rigid
 from pcdata.io.calibration.foreign_cameras import matrix_of, pinhole_of_matrix
 from pcdata.io.sources.demonstration_file import arrays_below, episode_names, opened
-from pcdata.io.sources.demonstrations import (
+from pcdata.io.sources.demonstration_steps import (
     Demonstration,
-    DemonstrationSource,
+    Shapes,
     Steps,
     Stream,
     check_lengths,
     color_of,
     plane_of,
     same_cameras,
-    sample_name,
+    seconds_of_rate,
 )
+from pcdata.io.sources.demonstrations import DemonstrationSource, sample_name
 from pcdata.io.sources.frame_files import make_frame
-from pcdata.io.sources.listed import one_of
+from pcdata.io.sources.listed import one_of, unread_cameras
 from pcdata.io.sources.listing import has_file
 from pcdata.io.sources.option_checks import check_label, check_name
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.rendered_images import centered_camera
 from pcdata.structures import DepthFrame
-
-Shapes = Mapping[str, tuple[int, ...]]  # of arrays, by their paths
 
 _DATA, _PARAM = "obs/sensor_data", "obs/sensor_param"
 _DEPTH, _POSITION = "depth", "PositionSegmentation"
@@ -126,7 +125,6 @@ class _ManiSkillSource(DemonstrationSource):
                     raise CaptureError(f"{where}: {name} has {length} observations and {actions} actions")
                 if length:
                     demonstrations[name] = Demonstration(name, length, facts.get(name, {}), {}, seconds)
-        others = [name for name in cameras if name not in chosen]
         super().__init__(
             path,
             demonstrations,
@@ -135,7 +133,7 @@ class _ManiSkillSource(DemonstrationSource):
             signals=signals,
             frame_id=frame,
             skipped=skipped,
-            unread=[f"{len(others)} other cameras: {name_some(others)}"] if others else [],
+            unread=unread_cameras(cameras, chosen),
         )
 
     @classmethod
@@ -192,9 +190,9 @@ def _lengths(where: str, group: Any, name: str, cameras: list[str]) -> tuple[int
     arrays = arrays_below(own, group, _DATA)
     same_cameras(where, cameras, _cameras(arrays), name)
     length = check_lengths(
-        own, {path: (*shape, 0)[0] for path, shape in arrays.items() if path.endswith((f"/{_DEPTH}", f"/{_POSITION}"))}
+        own, {path: shape for path, shape in arrays.items() if path.endswith((f"/{_DEPTH}", f"/{_POSITION}"))}
     )
-    actions = {path: (*shape, 0)[0] for path, shape in arrays_below(own, group, "actions").items()}
+    actions = arrays_below(own, group, "actions")
     return length, check_lengths(own, actions) if actions else None
 
 
@@ -274,8 +272,7 @@ def _facts(where: str, path: Path) -> tuple[dict[str, dict[str, Any]], float | N
 def _seconds(env: Mapping[str, Any]) -> float | None:
     settings = env.get("env_kwargs")
     sim = settings.get("sim_config") if isinstance(settings, dict) else None
-    rate = sim.get("control_freq") if isinstance(sim, dict) else None
-    return 1 / rate if isinstance(rate, (int, float)) and not isinstance(rate, bool) and 1e-6 < rate < 1e6 else None
+    return seconds_of_rate(sim)
 
 
 _OF_EPISODE: Sequence[str] = ("episode_seed", "control_mode", "success", "fail")

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError
 from pcdata.files.opening import read_text
-from pcdata.files.sample_names import in_order, name_some
+from pcdata.files.sample_names import in_order
 from pcdata.files.strict_json import json_object
 from pcdata.io.calibration.foreign_cameras import matrix_of, pinhole_of_matrix
 from pcdata.io.images.coded_depth import read_ranged_depth, read_rgb_ids
-from pcdata.io.sources.listed import ListedSource, Size, StoredView, checked_folder, files_by_id, one_of
+from pcdata.io.sources.listed import ListedSource, Size, StoredView, checked_folder, files_by_id, one_of, unread_cameras
 from pcdata.io.sources.listing import LinkTargets, entries, has_file, is_file, is_folder, link_targets
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.rlbench_records import PICKLES, read_rlbench_pickle, rlbench_signals
@@ -90,8 +90,7 @@ class _RlbenchSource(ListedSource):
             *(path / name for name in (_META, *PICKLES)),
             *(path / form.format(name) for name in names for form in _FOLDERS.values()),
         ]
-        others = [name for name in names if name not in chosen]
-        told = [f"{len(others)} other cameras: {name_some(others)}"] if others else []
+        told = unread_cameras(names, chosen)
         super().__init__(path, views, frame_id=frame_id, read=read, unread=told, links_to=links_to)
 
     @classmethod

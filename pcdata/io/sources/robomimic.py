@@ -29,27 +29,27 @@ from pcdata.functional.depth.rendered import check_planes, z_of_rendered
 from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.io.arrays.hdf5_arrays import hard_linked
 from pcdata.io.sources.demonstration_file import arrays_below, episode_names, json_attribute, opened, text_attribute
-from pcdata.io.sources.demonstrations import (
+from pcdata.io.sources.demonstration_steps import (
     Demonstration,
-    DemonstrationSource,
+    Shapes,
     Steps,
     Stream,
     check_lengths,
     color_of,
     plane_of,
     same_cameras,
+    seconds_of_rate,
     without_frame,
 )
+from pcdata.io.sources.demonstrations import DemonstrationSource
 from pcdata.io.sources.frame_files import make_frame
-from pcdata.io.sources.listed import one_of
+from pcdata.io.sources.listed import one_of, unread_cameras
 from pcdata.io.sources.option_checks import check_label, check_name, check_numbers, check_pinhole
 from pcdata.io.sources.registry import register_layout
 from pcdata.io.sources.rendered_images import ROWS
 from pcdata.io.sources.robosuite_cameras import KnownCameras, StatedCameras, known_cameras
 from pcdata.io.sources.stated import opened_calibration
 from pcdata.structures import Calibration, DepthFrame
-
-Shapes = Mapping[str, tuple[int, ...]]  # of arrays, by their paths
 
 _DEPTH, _COLOR, _LABELS = "_depth", "_image", "_segmentation_"
 _WORLD = "world"
@@ -178,8 +178,7 @@ class _RobomimicSource(DemonstrationSource):
                     f"(--camera {name} --intrinsics FX FY CX CY), or calibration=FILE with a camera of that name"
                 )
         if len(named) == 1:
-            others = [name for name in cameras if name not in named]
-            return named, [f"{len(others)} other cameras: {name_some(others)}"] if others else []
+            return named, unread_cameras(cameras, named)
         posed = [name for name in named if known[name].pose is not None]
         if not posed:
             raise CaptureError(
@@ -252,16 +251,14 @@ def _cameras(obs: Shapes) -> list[str]:
 
 def _demonstrations(where: str, data: Any, names: Sequence[str], cameras: list[str]) -> dict[str, Demonstration]:
     said = json_attribute(where, data, "env_args")
-    settings = said.get("env_kwargs")
-    rate = settings.get("control_freq") if isinstance(settings, dict) else None
-    seconds = 1 / rate if isinstance(rate, (int, float)) and not isinstance(rate, bool) and 1e-6 < rate < 1e6 else None
+    seconds = seconds_of_rate(said.get("env_kwargs"))
     facts = {key: said[key] for key in ("env_name", "env_version") if isinstance(said.get(key), str)}
     found = {}
     for name in names:
         group, own = data[name], f"{where}: {name}"
         obs = arrays_below(own, group, "obs")
         same_cameras(where, cameras, _cameras(obs), name)
-        length = check_lengths(own, {path: (*shape, 0)[0] for path, shape in obs.items() if path.endswith(_DEPTH)})
+        length = check_lengths(own, {path: shape for path, shape in obs.items() if path.endswith(_DEPTH)})
         words = json_attribute(own, group, "ep_meta").get("lang")
         texts = {"task": words} if isinstance(words, str) and words else {}
         found[name] = Demonstration(f"data/{name}", length, facts, texts, seconds)
