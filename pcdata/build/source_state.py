@@ -17,7 +17,8 @@ import torch
 from pcdata.errors import PcdataError
 from pcdata.files.inputs import states_of
 from pcdata.io.sources.capture_source import CaptureSource, all_within, episodes_of, inputs_of
-from pcdata.io.sources.combine import JoinedSource, SubsetSource
+from pcdata.io.sources.combine import SubsetSource
+from pcdata.io.sources.joined_source import JoinedSource
 from pcdata.io.sources.source import Source, stored_captures
 
 

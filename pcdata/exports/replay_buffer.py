@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -24,6 +23,7 @@ from pcdata.exports.copies import copies_among, copy_name
 from pcdata.exports.episode_signals import next_row, signal_row
 from pcdata.exports.episodes import Given, episode_names, read_episodes
 from pcdata.exports.model_contracts import require_cloud
+from pcdata.exports.padding_ranges import PaddingRanges
 from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
@@ -209,7 +209,7 @@ class _ReplayBuffer(Target):
         for group in (folder, folder / "data", folder / "meta"):
             write_group(group)
         arrays = _Arrays(folder / "data", len(item.ids) - len(item.unwritten), self.compression)
-        ranges = _Ranges()
+        ranges = PaddingRanges()
         for sample_id, rows in self._steps(item, samples):
             arrays.add(rows)
             ranges.add(sample_id, rows["point_cloud"])
@@ -289,45 +289,6 @@ class _Arrays:
         self._writers[name] = RowWriter(
             self._folder / name, (self._total, *shape), dtype, chunk_rows=_CHUNK, compression=self._compression
         )
-
-
-class _Ranges:
-    """Range of x, y, z with and without rows of zeros, by which simulators and some samplers pad short clouds."""
-
-    def __init__(self) -> None:
-        self.padded = 0
-        self.first = ""
-        self.all, self.real = (np.array([[np.inf] * 3, [-np.inf] * 3]) for _ in repeat(None, 2))
-
-    def add(self, sample_id: str, rows: NDArray[np.float32]) -> None:
-        points = rows[:, :3]
-        zero = ~points.any(axis=1)
-        if zero.any():
-            self.first = self.first or sample_id
-            self.padded += 1
-        for limits, chosen in ((self.all, points), (self.real, points[~zero])):
-            if len(chosen):
-                np.minimum(limits[0], chosen.min(axis=0), out=limits[0])
-                np.maximum(limits[1], chosen.max(axis=0), out=limits[1])
-
-    def warning(self, name: str) -> str | None:
-        if not self.padded:
-            return None
-        moved = not np.array_equal(self.all, self.real)
-        effect = (
-            f"{name} scales x, y, z by their range over all rows, which those zeros widen from {_words(self.real)} to "
-            f"{_words(self.all)}"
-            if moved
-            else f"the range that {name} scales x, y, z by does not change"
-        )
-        return (
-            f"{self.padded} clouds have points at exactly 0 0 0, as padding has (first: sample {self.first!r}); "
-            f"{effect}. Pad by repeated points instead: FarthestPointSample(if_short='repeat')"
-        )
-
-
-def _words(limits: NDArray[np.float64]) -> str:
-    return " x ".join(f"{low:.3g}..{high:.3g}" for low, high in limits.T)
 
 
 def _buffer(name: str, model: str, arrays: str, *, colors: bool = True, image: bool = False, **facts: Any) -> Any:

@@ -18,8 +18,9 @@ from pcdata.io.images.reading import read_color, read_depth, read_labels, read_m
 from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
 from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.capture_source import CaptureSource, refused_captures
-from pcdata.io.sources.combine import CombinedSource, JoinedSource, SubsetSource
+from pcdata.io.sources.combine import CombinedSource, SubsetSource
 from pcdata.io.sources.episode_file import write_episodes
+from pcdata.io.sources.joined_source import JoinedSource
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.sources.registry import COMBINATORS, LAYOUTS, register_combinator, register_layout
 from pcdata.io.sources.source import Source

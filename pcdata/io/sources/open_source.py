@@ -14,8 +14,9 @@ from pcdata.errors import CaptureError, ConfigError, PcdataError, add_note, loca
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
 from pcdata.io.sources.capture_source import kinds_of, refused_captures
-from pcdata.io.sources.combine import JoinedSource, Selectable
+from pcdata.io.sources.combine import Selectable
 from pcdata.io.sources.detect import detect_layout
+from pcdata.io.sources.joined_source import JoinedSource
 from pcdata.io.sources.layouts import COMBINATORS, LAYOUTS
 from pcdata.io.sources.listing import absolute, check_links, is_litter, link_targets
 from pcdata.io.sources.registry import checked_fields, combined, layout_named, options_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from pcdata.io.messages.image_topics import image_topics, told
 from pcdata.io.messages.joined_recording import JoinedRecording
 from pcdata.io.messages.joined_topics import Joining
 from pcdata.io.messages.message_log import CONTAINERS, METADATA, MessageLog, container_of, opened_log
+from pcdata.io.messages.recorded_episodes import recorded_episodes, renamed, sample_ids, stated_episodes
 from pcdata.io.sources.listing import LinkTargets, absolute, entries, is_file, is_folder, link_targets
 from pcdata.io.sources.option_checks import (
     check_invalid_values,
@@ -141,13 +141,13 @@ class _RosSource(Source):
         self._numbers: dict[str, tuple[str, int]] = {}
         skipped: dict[str, str] = {}
         whole: list[tuple[str, int, list[Episode]]] = []
-        for (name, recording), ids in zip(self._recordings.items(), _ids(self._recordings)):
+        for (name, recording), ids in zip(self._recordings.items(), sample_ids(self._recordings)):
             for number, sample_id in enumerate(ids):
                 if number in recording.skipped:
                     skipped[sample_id] = recording.skipped[number]
                 else:
                     self._numbers[sample_id] = (name, number)
-            whole.append((name, len(ids), _episodes(recording, name or path.stem)))
+            whole.append((name, len(ids), recorded_episodes(recording, name or path.stem)))
         super().__init__(path, self._numbers, links_to)
         self._skipped = skipped
         self._whole = whole
@@ -224,9 +224,9 @@ class _RosSource(Source):
     def _read_episodes(self) -> list[Episode]:
         if is_folder(self.path) and is_file(self.path / "episodes.json"):
             return super()._read_episodes()
-        found = _stated_episodes(self._whole)
+        found = stated_episodes(self._whole)
         if len(self._recordings) > 1 and not self._states_episodes(found):
-            found = [_renamed(one) for one in joined_episodes(self._whole)]
+            found = [renamed(one) for one in joined_episodes(self._whole)]
         total = sum(count for _, count, _ in self._whole)
         starts, before = {}, 0
         for name, count, _ in self._whole:
@@ -276,52 +276,6 @@ def _cloud_topic(where: str, log: MessageLog, choice: Choice, named: str | None)
     if len(clouds) != 1 or any(image.form.role == "depth" for image in image_topics(log).values()):
         return None
     return clouds[0].name
-
-
-def _ids(recordings: Mapping[str, JoinedRecording | CloudRecording]) -> list[list[str]]:
-    """Return the ids of all images of each recording: as they state them, else numbers; of several with their names."""
-    stated = [one.said.samples or [] for one in recordings.values()]
-    together = [name for names in stated for name in names]
-    fits = all(len(names) == len(one.times) for names, one in zip(stated, recordings.values()))
-    if fits and len(set(together)) == len(together) and in_order(together) == together:
-        return stated
-    numbers = [[f"{number:06d}" for number in range(len(one.times))] for one in recordings.values()]
-    return [[f"{name}/{one}" if name else one for one in own] for name, own in zip(recordings, numbers)]
-
-
-def _episodes(recording: JoinedRecording | CloudRecording, name: str) -> list[Episode]:
-    times = recording.times
-
-    def episode(name: str, first: int, length: int, attributes: Mapping[str, Any]) -> Episode:
-        inside = times[first : first + length]
-        start = int(inside[0]) if len(inside) else 0
-        seconds = [(int(time) - start) / 1e9 for time in inside] if len(inside) == length else []
-        return Episode(name, first, length, seconds, {**attributes, "start_ns": start})
-
-    if recording.said.episodes is None:
-        return [episode(name, 0, len(times), {})]
-    found = []
-    for said in recording.said.episodes:
-        if not {"id", "first", "length"} <= set(said) <= {"id", "first", "length", "attributes"}:
-            raise CaptureError(f"{recording.where}: topic /pcdata: an episode must have id, first and length")
-        bare = Episode(said["id"], said["first"], said["length"], attributes=said.get("attributes", {}))
-        found.append(episode(bare.id, bare.first, bare.length, bare.attributes))
-    return checked_episodes(f"{recording.where}: topic /pcdata", found, len(times))
-
-
-def _stated_episodes(whole: list[tuple[str, int, list[Episode]]]) -> list[Episode]:
-    """Return the episodes of all recordings under their own names, which parts of one whole share across files."""
-    found, before = [], 0
-    for _, count, episodes in whole:
-        found += [replace(one, first=before + one.first) for one in episodes]
-        before += count
-    return found
-
-
-def _renamed(episode: Episode) -> Episode:
-    """Return an episode NAME/NAME as NAME: the only one of its file."""
-    start, _, end = episode.id.partition("/")
-    return replace(episode, id=start) if start == end else episode
 
 
 def _topics(where: str, option: str, given: Any) -> tuple[str, ...] | None:
