@@ -22,7 +22,7 @@ from typing import Literal
 
 from pcdata.errors import CacheError, write_fault
 from pcdata.files.interrupts import shielded
-from pcdata.files.locks import try_lock
+from pcdata.files.locks import release, try_lock
 
 Note = Callable[[str], None]  # tell the user what is no error
 
@@ -72,8 +72,7 @@ def scratch_beside(folder: Path, *, alone: bool = False, note: Note = silent) ->
     finally:
         with shielded():
             shutil.rmtree(partial, ignore_errors=True)
-            if lock is not None:
-                os.close(lock)
+            release(lock)
 
 
 @contextmanager
@@ -109,8 +108,7 @@ def claimed(path: Path, note: Note = silent) -> Iterator[Path | None]:
         with shielded():
             with suppress(OSError):
                 os.unlink(own)
-            if lock is not None:
-                os.close(lock)
+            release(lock)
 
 
 def living_claims(folder: Path) -> list[Path]:
@@ -128,8 +126,7 @@ def _settled(claim: Path, made_by: str) -> str:
     if state == "dead":
         with suppress(OSError):
             os.unlink(claim)
-    if lock is not None:
-        os.close(lock)
+    release(lock)
     return state
 
 
@@ -183,8 +180,7 @@ def _settle_others(folder: Path, own: Path, alone: bool, note: Note) -> None:
             )
         elif alone and state == "unknown":
             note(f"{other} was left by a process of which nothing is known here; remove it if that has ended")
-        if lock is not None:
-            os.close(lock)
+        release(lock)
 
 
 def _made(name: str) -> str:
@@ -202,8 +198,7 @@ def _owner(scratch: Path, made_by: str) -> tuple[Literal["alive", "dead", "unkno
     if not here:
         # Whether locks reach across machines depends on the file system: one that is held is sure, a free one is not.
         lock, held = try_lock(scratch)
-        if lock is not None:
-            os.close(lock)
+        release(lock)
         return ("alive" if held else "unknown"), None
     deadline = time.monotonic() + _LOCKING
     while True:

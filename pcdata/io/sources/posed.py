@@ -51,6 +51,8 @@ class _PosedSource(CombinedSource):
     episode: str = ""
     camera: str = ""
     inputs: Inputs = field(init=False, repr=False, compare=False)
+    _poses: Mapping[str | None, _Poses] = field(init=False, repr=False, compare=False)
+    _episode_of: Mapping[str, str] = field(init=False, repr=False, compare=False)  # by sample id
 
     def __post_init__(self) -> None:
         if not isinstance(self.file, (str, os.PathLike)) or not str(self.file):
@@ -104,7 +106,7 @@ class _PosedSource(CombinedSource):
 
     def unread(self) -> list[str]:
         """Say which episodes keep the poses that they have, besides what the source does not read."""
-        poses: Mapping[str | None, _Poses] = self._poses  # type: ignore[attr-defined]
+        poses = self._poses
         lacking = [] if None in poses else [one.id for one in episodes_of(self.source) if one.id not in poses]
         told = [f"{Path(self.file).name} has no poses for {name_some(lacking)}: they keep theirs"] if lacking else []
         return [*told, *super().unread()]
@@ -163,11 +165,9 @@ class _PosedSource(CombinedSource):
         )
 
     def _poses_at(self, sample_id: str) -> _Poses:
-        poses: Mapping[str | None, _Poses] = self._poses  # type: ignore[attr-defined]
-        if None in poses:
-            return poses[None]
-        episodes: Mapping[str, str] = self._episode_of  # type: ignore[attr-defined]
-        return poses.get(episodes.get(sample_id), {})
+        if None in self._poses:
+            return self._poses[None]
+        return self._poses.get(self._episode_of.get(sample_id), {})
 
     def _names(self, frame: DepthFrame) -> list[list[str]]:
         """Return what each view's camera is called, the likeliest first."""
