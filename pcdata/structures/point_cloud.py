@@ -189,11 +189,19 @@ class PointCloud(CloudBatch):
         return checked_copy(self, extra={**self.extra, name: value}, kinds={**self.kinds, name: Kind(kind)})
 
     def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
-        """Merge one mapping of JSON-able findings into the meta of each cloud."""
+        """Merge one mapping of JSON-able findings into the meta of each cloud.
+
+        Raises:
+            ValueError: there is not one mapping for each cloud.
+        """
         return derived(self, meta=tuple([{**old, **new} for old, new in zip(self.meta, entries, strict=True)]))
 
     def with_steps(self, steps: Sequence[Step] | OfClouds) -> PointCloud:
-        """Add one JSON-able step to the history of each cloud."""
+        """Add one JSON-able step to the history of each cloud.
+
+        Raises:
+            ShapeError: there is not one step for each cloud.
+        """
         held = vars(self)["history"]
         if len(steps) != len(held):
             raise ShapeError(f"PointCloud.with_steps: takes a step of each of {len(held)} clouds, got {len(steps)}")
@@ -203,6 +211,9 @@ class PointCloud(CloudBatch):
         """Keep the rows ``index`` (M,) int64, or a (N,) bool mask, of every per-point field; ``ptr`` cuts the result.
 
         Rows of a cloud must stay within that cloud. A mask keeps their order, and so the image they lie on.
+
+        Raises:
+            ShapeError: ptr (B+1,) int64 does not cut the M rows into B clouds.
         """
         rows = pick_rows(self.fields(), index)
         sizes = check_tensors("PointCloud", {**rows, "ptr": ptr}, _SELECTED, check_values=False)
@@ -240,6 +251,9 @@ class PointCloud(CloudBatch):
             matrix: new_from_old, (B, 4, 4) float64.
             frame_id: the frame the cloud is in afterwards; None = the frame keeps its name.
             unit: the unit afterwards; None = unchanged.
+
+        Raises:
+            ShapeError: there is not one matrix for each cloud.
         """
         matrix = matrix.to(dtype=torch.float64, device=self.device)
         if tuple(matrix.shape) != (self.num_clouds, 4, 4):
@@ -248,7 +262,11 @@ class PointCloud(CloudBatch):
         return self._with_rows(rows, **self._facts_moved(matrix, frame_id, unit))
 
     def with_facts_moved(self, matrix: Tensor) -> PointCloud:
-        """Do what :meth:`transformed` does, but for the points, which are left to the caller."""
+        """Do what :meth:`transformed` does, but leave the points as they are: the caller moves them.
+
+        Args:
+            matrix: new_from_old, (B, 4, 4) float64.
+        """
         matrix = matrix.to(dtype=torch.float64, device=self.device)
         fields = self.fields()
         points = fields.pop("points")
