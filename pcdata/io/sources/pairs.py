@@ -114,9 +114,9 @@ class _PairsSource(ListedSource):
         allowed = [folder, *link_targets(links_to)]
         found = _by_role(folder)
         if folder != path and _told(path.name)[0] is None:
-            found["depth"] = _untold([path])
+            found["depth"] = _depth_by_name([path])
         elif not found["depth"]:
-            found["depth"] = _untold(visible_files(folder, _can_be_depth))
+            found["depth"] = _depth_by_name(visible_files(folder, _can_be_depth))
         if folder != path:
             found["depth"] = {name: file for name, file in found["depth"].items() if file == path}
             others = {role: files for role, files in found.items() if role != "depth"}
@@ -207,7 +207,8 @@ def _can_be_depth(name: str) -> bool:
     return Path(name).suffix.lower() in DEPTH_SUFFIXES and words.isdisjoint([*_WORDS, *_PICTURES])
 
 
-def _untold(files: Sequence[Path]) -> dict[str, Path]:
+def _depth_by_name(files: Sequence[Path]) -> dict[str, Path]:
+    """Return depth images by their names, which have no word that tells what they are."""
     found: dict[str, Path] = {}
     for file in files:
         name = "-".join(word for word in _SEPARATORS.split(file.stem) if word)

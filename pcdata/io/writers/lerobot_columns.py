@@ -73,17 +73,20 @@ def check_alike(sample_id: str, frame: DepthFrame, first_id: str, first: DepthFr
             f"{first.num_views} of {first.size[1]}x{first.size[0]}; write these apart (--only, --skip)"
         )
     for name in ("colors", "world_from_camera", *IMAGES):
-        if (getattr(frame, name) is None) != (getattr(first, name) is None):
-            raise CaptureError(f"{sample_id}: has {name} or not, unlike {first_id}; write these apart")
+        has_it, first_has_it = (getattr(one, name) is not None for one in (frame, first))
+        if has_it != first_has_it:
+            told = f"has {name}, {first_id} has none" if has_it else f"has no {name}, {first_id} has"
+            raise CaptureError(f"{sample_id}: {told}; write these apart (--only, --skip)")
     if frame.frame_id != first.frame_id:
         raise CaptureError(
             f"{sample_id}: its poses lead to {frame.frame_id!r}, those of {first_id} to {first.frame_id!r}"
         )
-    lenses = [one.camera.distortion for one in (frame, first)]
-    if [None if lens is None else lens.shape for lens in lenses].count(
-        None if lenses[0] is None else lenses[0].shape
-    ) != 2 or frame.camera.is_window != first.camera.is_window:
-        raise CaptureError(f"{sample_id}: has another lens model than {first_id}; write these apart")
+    models = [
+        (None if one.distortion is None else one.distortion.shape, one.is_window)
+        for one in (frame.camera, first.camera)
+    ]
+    if models[0] != models[1]:
+        raise CaptureError(f"{sample_id}: has another lens model than {first_id}; write these apart (--only, --skip)")
 
 
 def check_same_signals(sample_id: str, frame: DepthFrame, first_id: str, signals: Mapping[str, SignalFacts]) -> None:

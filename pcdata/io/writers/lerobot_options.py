@@ -53,7 +53,7 @@ class LeRobotOptions(Writer):
             raise ConfigError("lerobot: depth=array stores metres as they are; leave out metres_per_unit")
         fps: Any = self.fps
         if fps is not None and not (isinstance(fps, (int, float)) and 1 <= fps <= 1000):
-            raise ConfigError(f"lerobot: fps must be steps in a second, 1 or more, got {fps!r:.60}")
+            raise ConfigError(f"lerobot: fps must be steps in a second, 1 to 1000, got {fps!r:.60}")
         points: Any = self.points
         if isinstance(points, bool) or not isinstance(points, int) or not 0 <= points < 1 << 24:
             raise ConfigError(f"lerobot: points must be a whole number from 0, got {points!r:.60}")
