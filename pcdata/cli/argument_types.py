@@ -34,9 +34,15 @@ def positive(text: str) -> int:
 
 def whole_numbers(text: str) -> list[int]:
     """Read whole numbers with commas between them."""
-    return [int(number) for number in text.split(",")]
+    try:
+        return [int(number) for number in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be whole numbers such as 65535 or 0,65535, got {text!r}") from None
 
 
 def numbers(text: str) -> list[float]:
     """Read numbers with spaces or commas between them."""
-    return [float(number) for number in text.replace(",", " ").split()]
+    try:
+        return [float(number) for number in text.replace(",", " ").split()]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be numbers with spaces between them, got {text!r}") from None

@@ -98,6 +98,13 @@ def test_every_flag_becomes_the_option_of_python() -> None:
     }
 
 
+@pytest.mark.parametrize("flag", ["--invalid-values", "--color-from-depth"])
+def test_numbers_that_are_none_are_refused_in_words(flag: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        parsed(flag, "1 0 zero")
+    assert "numbers" in capsys.readouterr().err.partition(f"argument {flag}: must be ")[2]
+
+
 def test_any_option_can_be_given_by_its_name(capture: Path) -> None:
     options = given_options(parsed("--option", "invalid_values=[65535]", "--option", "frame_id=base"))
     assert options == {"invalid_values": [65535], "frame_id": "base"}
