@@ -97,9 +97,12 @@ def claimed(path: Path, note: Note = silent) -> Iterator[Path | None]:
         first = None
         for other in sorted(path.parent.glob(glob.escape(path.name) + ".*")):
             made_by = other.name.removeprefix(f"{path.name}.")
-            if other == own or (state := _settled(other, made_by)) == "dead":
+            if other == own:
                 continue
-            if state == "unknown":
+            state = _settled(other, made_by)
+            if state == "dead":
+                note(f"a process that wrote it before was killed ({made_by.rpartition('-')[0]})")
+            elif state == "unknown":
                 note(f"{other} was left by a process of which nothing is known here; remove it if that has ended")
             elif _made(made_by) < _made(own.name):  # of two at once, the first goes on
                 first = other
