@@ -221,7 +221,7 @@ def test_options_and_captures_that_do_not_fit_are_refused(tmp_path: Path) -> Non
     for odd, words in [
         (second.with_signal("more", torch.zeros(1, 2), "invariant"), "more differ"),
         (second.with_signal("joints", torch.zeros(1, 7), "invariant"), "joints differ"),
-        (replace(second, colors=None), "has colors or not"),
+        (replace(second, colors=None), "has no colors, 0 has"),
         (replace(second, frame_id="table", recorded_signals={}), "poses lead to 'table'"),
         (made_frame(1, views=2), "has 2 views"),
     ]:
