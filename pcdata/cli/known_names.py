@@ -31,6 +31,7 @@ CHECKS = (
     "raw_values",
     "coverage",
     "readings",
+    "depth_axis",
     "intrinsics",
     "stated",
     "poses",

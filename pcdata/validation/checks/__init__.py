@@ -4,6 +4,7 @@
 from pcdata.validation.checks import stored_files
 from pcdata.validation.checks import coverage
 from pcdata.validation.checks import readings
+from pcdata.validation.checks import depth_axis
 from pcdata.validation.checks import cameras
 from pcdata.validation.checks import behind_camera
 from pcdata.validation.checks import sequence
@@ -18,6 +19,7 @@ __all__ = [
     "cameras",
     "color_on_depth",
     "coverage",
+    "depth_axis",
     "pose_direction",
     "pose_direction_over_time",
     "readings",

@@ -19,6 +19,7 @@ Agreement = tuple[int, int]  # of readings carried from one view into another: t
 Reading = Callable[[DepthFrame], DepthFrame]  # one view as given -> as it is when read by a convention
 
 LEAST_COMPARED = 200  # readings that views must share before they can be said to agree or not
+RAYS = "lengths along the rays"  # the name of that convention
 AGREE = 0.5  # of the readings compared: under a wrong pose few agree, and those by chance
 _LEAST_GAIN = 0.1  # by which another convention must agree better
 _LEAST_MOTION = (0.02, 0.035)  # metres, radians: closer cameras agree under every convention
@@ -88,7 +89,7 @@ CONVENTIONS: dict[str, _Convention] = {
     "poses of bodies (x forward, y left, z up)": _Convention("the poses", _from_axes("body"), "--convention body"),
     "translations in millimetres": _Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-3)), ""),
     "translations in centimetres": _Convention("the poses", _of_pose(lambda pose: _with_translation(pose, 1e-2)), ""),
-    "lengths along the rays": _Convention("the depth", _along_axis, "--option convention.depth=ray"),
+    RAYS: _Convention("the depth", _along_axis, "--option convention.depth=ray"),
     "images whose bottom row is first": _Convention("the depth", _top_first, "--option convention.rows=bottom_first"),
 }
 
