@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.geometry.lens import undistort_normalized
+from pcdata.rng import seeded
 
 POWERS = (0, 1, -1)
 _READINGS = 3000  # looked at: the bend is then known to 0.05 where noise is a quarter of it
@@ -130,7 +131,8 @@ def _noise(image: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray
 
 def _largest_plane(design: _Array, values: _Array, off_plane: float) -> NDArray[np.bool_]:
     """Return which readings lie in the plane that has the most, of planes through three; the same ones every time."""
-    triples = np.random.default_rng(0).integers(0, len(values), (_TRIES, 3))
+    draw = torch.randint(len(values), (_TRIES, 3), generator=seeded(0), dtype=torch.int64, device="cpu")
+    triples = draw.numpy()
     three = design[triples]
     wide = np.abs(np.linalg.det(three)) > 1e-6
     planes = np.linalg.solve(three[wide], values[triples[wide]][..., None])[..., 0]  # (T, 3)
