@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from pcdata.build.building_folder import BuildingFolder
-from pcdata.build.carried import carry_splits
+from pcdata.build.card import write_card
+from pcdata.build.carried import carry_answers, carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.contents import check_only_dataset
 from pcdata.build.engines.in_process import work_here
@@ -216,6 +217,8 @@ def _finish(
         if (folder / SPLITS).is_file():
             for told in carry_splits(folder, partial):
                 note(told)
+        carry_answers(folder, partial)
+        write_card(partial, name=folder.name)
         put_into_place(partial, folder, replaced, check_only_dataset, note)
         building.remove()
     return True

@@ -1,14 +1,26 @@
-"""What a dataset that replaces another takes over from it: which samples are held out, so that none ever moves."""
+"""What a dataset that replaces another takes over from it: which samples are held out, and what people said of it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from pcdata.build.card_answers import FILE_NAME as ANSWERS
+from pcdata.build.card_answers import CardAnswers
 from pcdata.datasets.split_dataset import added
 from pcdata.datasets.split_groups import SampleFacts
 from pcdata.datasets.splits import FILE_NAME, Splits
 from pcdata.errors import ConfigError
 from pcdata.io.store.manifest import Manifest
+
+
+def carry_answers(old: Path, new: Path) -> None:
+    """Copy what people said for the card of an old dataset into the one that takes its place.
+
+    Raises:
+        ConfigError: it is damaged.
+    """
+    if (old / ANSWERS).is_file():
+        CardAnswers.read(old / ANSWERS).write(new / ANSWERS)
 
 
 def carry_splits(old: Path, new: Path) -> list[str]:

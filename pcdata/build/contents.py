@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from pcdata.build.card import CARD_FILES
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError
 from pcdata.io.store.manifest import FILE_NAME, Manifest
@@ -18,7 +19,7 @@ from pcdata.io.store.shards import FOLDER as SHARDS
 from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, TABLE, shard_folder
 from pcdata.io.store.stores import STORES
 
-_TOP = {FILE_NAME, "pipeline.yaml", "load.py", SPLITS}
+_TOP = {FILE_NAME, "pipeline.yaml", "load.py", SPLITS, *CARD_FILES}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 _IN_VIEW = re.compile(  # what write_capture writes below raw/KEY of a shard
     r"|view[0-9]+(/intrinsics\.json|/depth(/0\.(png|npy))?|/(labels|masks|color|confidence)(/0\.png)?|/poses(/0\.txt)?)?"

@@ -54,7 +54,10 @@ USUAL: Mapping[str, _Usual] = {
 }
 
 _FEWEST = 5  # captures, below which none is called an outlier of the rest
-_SPREAD = 0.05  # the least spread that is believed: 5 % more or fewer points are no news, however alike captures are
+# The least spread that is believed, however alike captures are: 5 % more or fewer points are no news where a step keeps
+# nearly all. What is left of a step that keeps little, such as objects on a plane, differs from scene to scene.
+_SPREAD, _SPREAD_OF_LITTLE = 0.05, 0.2
+_SPREAD_AT_FIRST = 0.1  # of the points that a capture begins with
 _DEVIATIONS = 6.0  # robust standard deviations; of normal data one capture in 500 million is farther out
 _MOST_REPEATS = 0.5  # of the points after a step, those that are copies of others
 _SHOWN = 5
@@ -134,7 +137,9 @@ def _of_the_rest(
         return []
     left = np.log1p(after[places]) - (0.0 if before is None else np.log1p(before[places]))
     middle = float(np.median(left))
-    spread = max(_MAD_TO_SIGMA * float(np.median(np.abs(left - middle))), _SPREAD)
+    kept = min(1.0, float(np.exp(middle)))
+    least = _SPREAD_AT_FIRST if before is None else _SPREAD * kept + _SPREAD_OF_LITTLE * (1 - kept)
+    spread = max(_MAD_TO_SIGMA * float(np.median(np.abs(left - middle))), least)
     away = np.abs(left - middle) / spread
     odd = np.flatnonzero(away > _DEVIATIONS)
     if not len(odd):
