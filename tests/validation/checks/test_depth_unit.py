@@ -15,7 +15,7 @@ from pcdata.functional.depth.unit_fit import DepthUnit, encoded, unit_fits
 from pcdata.io import open_source
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import look_at, tabletop
-from pcdata.validation import CaptureLimits
+from pcdata.validation import CaptureLimits, validate_source
 from pcdata.validation.checks.depth_unit import depth_unit_check
 from pcdata.verdicts import Finding, Verdict
 
@@ -128,3 +128,17 @@ def test_depth_made_in_memory_is_told_the_factor() -> None:
 
 def test_numbers_without_a_reading_fit_no_unit() -> None:
     assert unit_fits(np.zeros((20, 20), np.uint16)) == []
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_depth_in_tenths_of_a_millimeter_read_as_millimeters_never_passes_and_is_named(
+    tmp_path: Path, seed: int
+) -> None:
+    path = capture(tmp_path, table(seed), DepthUnit(0.0001))
+    facts = json.loads((path / "intrinsics.json").read_text()) | {"metres_per_unit": 0.001}
+    (path / "intrinsics.json").write_text(json.dumps(facts))
+    (report,) = (one for one in validate_source(open_source(path)) if not one.whole)
+    (finding,) = (one for one in report.findings if one.name == "depth_unit")
+    assert report.verdict is Verdict.FAIL
+    assert finding.verdict in (Verdict.WARN, Verdict.FAIL)
+    assert "metres_per_unit=0.0001" in finding.advice
