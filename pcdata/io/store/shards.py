@@ -28,7 +28,7 @@ SIGNALS_FOLDER = "signals"  # beside the shards: a store with one record, of the
 SIGNALS_KEY = "~signals"  # of that record; no sample has a key that begins so
 
 _NAME = re.compile(r"[0-9]{5,}")
-_LINE = re.compile(r"([0-9a-f]{64})\t([0-9]{1,18})\t([^\t\n\r\\:]+)")
+_LINE = re.compile(r"([0-9a-f]{64})\t([0-9]{1,18})\t([^\x00-\x1f\x7f\\:]+)")
 _MOST_BYTES = 1 << 32  # of a table
 _BLOCK = 1 << 22  # bytes that are hashed at once
 _MOST_OPEN = 128  # stores that hold a file open

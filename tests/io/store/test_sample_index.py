@@ -174,6 +174,7 @@ ZEROS = "0" * 64
         f"{ZEROS}\t{10**30}\tx",
         f"{ZEROS}\t5\tx\n{ZEROS}\t5\tx",
         f"{ZEROS}\t5\ta//b",
+        f"{ZEROS}\t5\ta\0b",
         "nothing of the kind",
     ],
 )
