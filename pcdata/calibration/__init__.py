@@ -2,7 +2,7 @@
 
 from pcdata.calibration.board_images import read_board_images
 from pcdata.calibration.board_pose import locate_board
-from pcdata.calibration.boards import Board, BoardView, Charuco, Chessboard, parse_board
+from pcdata.calibration.boards import Board, BoardView, Charuco, Chessboard, Tag, parse_board
 from pcdata.calibration.hand_eye import calibrate_hand_eye
 from pcdata.calibration.intrinsics import calibrate_intrinsics, find_board
 from pcdata.calibration.limits import CalibrationLimits
@@ -22,6 +22,7 @@ __all__ = [
     "PlaneResult",
     "Refinement",
     "RobotPoses",
+    "Tag",
     "calibrate_hand_eye",
     "calibrate_intrinsics",
     "check_plane",

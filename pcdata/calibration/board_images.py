@@ -15,7 +15,7 @@ from pcdata.extras import require
 from pcdata.files.opening import read_bytes
 from pcdata.io.sources.listing import absolute, visible_files
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _MAX_BYTES = 1 << 28
 
 
@@ -35,7 +35,7 @@ def read_board_images(paths: Sequence[str | os.PathLike[str]]) -> dict[str, Gray
                 raise CaptureError(f"{file}: there are two images of this name; rename one")
             images[file.name] = read_gray(file)
     if not images:
-        raise CaptureError(f"{', '.join(map(str, paths))}: holds no image; looked for {', '.join(_SUFFIXES)}")
+        raise CaptureError(f"{', '.join(map(str, paths))}: holds no image; looked for {', '.join(IMAGE_SUFFIXES)}")
     return images
 
 
@@ -56,4 +56,4 @@ def read_gray(path: Path) -> GrayImage:
 def _image_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    return visible_files(path, lambda name: Path(name).suffix.lower() in _SUFFIXES)
+    return visible_files(path, lambda name: Path(name).suffix.lower() in IMAGE_SUFFIXES)

@@ -14,7 +14,7 @@ from pcdata.extras import require
 from pcdata.geometry import rigid
 from pcdata.structures import Camera
 
-_MIN_CORNERS = 6
+_MIN_CORNERS = 4  # of a tag; what is found of a board has more
 
 
 def locate_board(view: BoardView, camera: Camera) -> tuple[Tensor, float]:  # camera_from_target (4, 4), RMS in pixels
@@ -23,7 +23,7 @@ def locate_board(view: BoardView, camera: Camera) -> tuple[Tensor, float]:  # ca
     A plane seen without perspective has two poses that fit alike; the better of them is taken and then refined.
 
     Raises:
-        CalibrationError: fewer than 6 corners, or no pose fits them.
+        CalibrationError: fewer than 4 corners, or no pose fits them.
 
     Source: Collins & Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014; cv2.solvePnPRefineLM.
     """

@@ -19,13 +19,13 @@ from pcdata.calibration.limits import CalibrationLimits
 from pcdata.calibration.motions import Poses, check_motions, inverse, motions_between, rotation_vectors
 from pcdata.calibration.park_martin import park_martin
 from pcdata.calibration.robot_poses import RobotPoses
-from pcdata.errors import ConfigError
+from pcdata.errors import CalibrationError, ConfigError
 from pcdata.structures.calibration import Evidence
 from pcdata.verdicts import Finding, Verdict, at_most, worst
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 
-SETUPS = ("eye-in-hand", "eye-to-hand")
+SETUPS: tuple[Setup, Setup] = ("eye-in-hand", "eye-to-hand")
 FINAL = "least squares over all poses"
 
 # Times the median residual. A board seen head-on is located several times worse than one that is tilted, so less would
@@ -81,7 +81,9 @@ class _HandEyeResult:
         )
 
 
-def calibrate_hand_eye(poses: RobotPoses, *, setup: Setup, limits: CalibrationLimits | None = None) -> _HandEyeResult:
+def calibrate_hand_eye(
+    poses: RobotPoses, *, setup: Setup | None = None, limits: CalibrationLimits | None = None
+) -> _HandEyeResult:
     """Solve for the camera on the gripper (eye-in-hand) or beside the robot (eye-to-hand).
 
     In both, ``holder_from_mount @ mount_from_camera @ camera_from_target`` is one and the same for all poses, where the
@@ -94,16 +96,18 @@ def calibrate_hand_eye(poses: RobotPoses, *, setup: Setup, limits: CalibrationLi
     Args:
         poses: robot and target poses; see :func:`read_robot_poses`.
         setup: ``eye-in-hand`` (camera on the gripper, target fixed) or ``eye-to-hand`` (camera fixed, target on the
-            gripper).
+            gripper). None = the one that fits the poses far better than the other.
         limits: None = those of :class:`CalibrationLimits`.
 
     Raises:
-        CalibrationError: the poses cannot determine the answer, and what to do.
+        CalibrationError: the poses cannot determine the answer, or which setup it is, and what to do.
         ConfigError: the setup is not known.
     """
-    if setup not in SETUPS:
+    if setup is not None and setup not in SETUPS:
         raise ConfigError(f"calibrate_hand_eye: setup must be {' or '.join(SETUPS)}, got {setup!r}")
     robot, target = poses.base_from_gripper.numpy(), poses.camera_from_target.numpy()
+    if setup is None:
+        setup = _setup_of(robot, target)
     holder_from_mount = robot if setup == "eye-in-hand" else inverse(robot)
     motions = motions_between(holder_from_mount, target)
     check_motions(*motions, len(robot))
@@ -178,12 +182,30 @@ def _other_reading(robot: Poses, target: Poses, setup: Setup, residual: float) -
     }
     found = {}
     for advice, (reading, inverted) in readings.items():
-        mount = robot if reading == "eye-in-hand" else inverse(robot)
-        seen = inverse(target) if inverted else target
-        placed = mount @ park_martin(*motions_between(mount, seen)) @ seen
-        found[advice] = _root_mean_square(_distances(placed, mean_pose(placed))[0])
+        found[advice] = _residual(robot, inverse(target) if inverted else target, reading)
     best = min(found, key=lambda advice: found[advice])
     return f"{best} (residual {1000 * found[best]:.2g} mm)" if found[best] < _CLEARLY_BETTER * residual else None
+
+
+def _setup_of(robot: Poses, target: Poses) -> Setup:
+    """Return the setup that fits far better than the other."""
+    check_motions(*motions_between(robot, target), len(robot))
+    found: dict[Setup, float] = {setup: _residual(robot, target, setup) for setup in SETUPS}
+    best, other = sorted(found, key=lambda setup: found[setup])
+    if found[best] >= _CLEARLY_BETTER * found[other]:
+        raise CalibrationError(
+            "hand-eye: the poses do not tell whether the camera is on the gripper or beside the robot (residual "
+            f"{1000 * found[best]:.2g} mm as {best}, {1000 * found[other]:.2g} mm as {other}); say "
+            f"--setup {' or '.join(SETUPS)}"
+        )
+    return best
+
+
+def _residual(robot: Poses, target: Poses, setup: Setup) -> float:
+    """Return how far apart, RMS in metres, the closed form leaves the target under a reading of the poses."""
+    mount = robot if setup == "eye-in-hand" else inverse(robot)
+    placed = mount @ park_martin(*motions_between(mount, target)) @ target
+    return _root_mean_square(_distances(placed, mean_pose(placed))[0])
 
 
 def _length(name: str, value: float, limit: float, advice: str) -> Finding:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pcdata.calibration.boards import Board, BoardView, GrayImage
+from pcdata.calibration.boards import Board, BoardView, GrayImage, Tag
 from pcdata.calibration.limits import CalibrationLimits
 from pcdata.errors import CalibrationError, CaptureError, ConfigError, told_apart
 from pcdata.extras import require
@@ -74,8 +74,11 @@ def find_board(images: Mapping[str, GrayImage], board: Board) -> tuple[dict[str,
 
     Raises:
         CaptureError: there is no image, or their sizes differ.
+        ConfigError: the board is a single tag.
         CalibrationError: the board is in none of them; says so when one that is described differently is.
     """
+    if isinstance(board, Tag):
+        raise ConfigError(f"find_board: {board} has four corners, which tell nothing of a lens; use a ChArUco board")
     sizes = {image.shape[:2]: name for name, image in images.items()}
     if len(sizes) != 1:
         listed = ", ".join(f"{name} is {width}x{height}" for (height, width), name in sizes.items())

@@ -7,7 +7,7 @@ import io
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -16,11 +16,25 @@ import torch
 import yaml
 from torch import Tensor
 
-from pcdata.errors import CalibrationError, ShapeError, first_lines, locates_path, near_matches
+from pcdata.calibration.boards import Board
+from pcdata.calibration.hand_eye_set import HandEyeSet
+from pcdata.calibration.robot_cal_tools_set import read_robot_cal_tools_set
+from pcdata.calibration.visp_set import read_visp_set
+from pcdata.errors import CalibrationError, CaptureError, ShapeError, first_lines, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
 from pcdata.geometry import rigid
 from pcdata.io.calibration.pose_nodes import POSE_KEYS, known_entries, matrix_from_node, pose_from_entries
+from pcdata.io.sources.hand_eye_names import (
+    MOVEIT,
+    MOVEIT_FILE,
+    ROBOT_CAL_TOOLS,
+    VISP,
+    hand_eye_folders,
+    hand_eye_tool,
+)
+from pcdata.io.sources.listing import absolute, is_folder
+from pcdata.structures import Camera
 from pcdata.structures.calibration import LARGEST_TRANSLATION, RIGID_TOLERANCE
 from pcdata.yaml_nodes import YamlDocument
 
@@ -38,6 +52,8 @@ class RobotPoses:
     names: tuple[str, ...]
     base_from_gripper: Tensor  # (N, 4, 4) float64
     camera_from_target: Tensor  # (N, 4, 4) float64
+    reprojection_rms: tuple[float | None, ...] = ()  # pixels, per pose; empty or None where no image was looked at
+    read_from: tuple[str, ...] = ()  # what a folder's files said besides the poses, in words
 
     def __post_init__(self) -> None:
         for name in (ROBOT, TARGET):
@@ -57,18 +73,27 @@ def read_robot_poses(
     path: str | os.PathLike[str],
     *,
     locate: Callable[[Path], Tensor] | None = None,
+    board: Board | None = None,
+    camera: Camera | None = None,
 ) -> RobotPoses:
-    """Read a YAML, JSON or CSV file of poses; ``docs/calibration.md`` describes them.
+    """Read a YAML, JSON or CSV file of poses, or a folder that a tool saved; ``docs/calibration.md`` describes them.
 
     Args:
         path: the file; its suffix says which kind it is.
         locate: returns ``camera_from_target`` of an image, for entries that name an ``image`` in its place.
+        board: the target in a folder's images, in place of the one that its files describe.
+        camera: the camera of a folder's images, in place of the one that its files describe.
 
     Raises:
-        CaptureError: the file is missing or not text.
+        CaptureError: the file is missing or not text; a folder holds no poses, or lacks images, which are named.
         CalibrationError: every fault in it, with its place.
+        ConfigError: a folder's files describe no board, or no camera, and none is given.
     """
     file = Path(path)
+    if is_folder(absolute(path)):
+        if hand_eye_tool(absolute(path)) == MOVEIT:
+            return read_robot_poses(file / MOVEIT_FILE)
+        return _from_set(read_hand_eye_set(absolute(path)), str(path), board, camera)
     text = read_text("read_robot_poses", file)
     if file.suffix.lower() == ".csv":
         return _from_csv(text, str(path))
@@ -79,10 +104,43 @@ def read_robot_poses(
     return _from_yaml(text, str(path), file.parent, locate)
 
 
+def read_hand_eye_set(folder: Path) -> HandEyeSet:
+    """Read what a tool for hand-eye calibration saved in a folder; its images are not looked at.
+
+    Raises:
+        CaptureError: no such tool saved it.
+        CalibrationError: every fault in its files, with its place.
+    """
+    reader = {VISP: read_visp_set, ROBOT_CAL_TOOLS: read_robot_cal_tools_set}.get(hand_eye_tool(folder))
+    if reader is not None:
+        return reader(folder)
+    inside = [f"{folder.name}/{one.name}" for one in hand_eye_folders(folder)]
+    advice = (
+        f"give one of the folders in it: {name_some(inside)}" if inside else "docs/calibration.md lists what is read"
+    )
+    raise CaptureError(f"{folder}: is a folder without poses of a robot; {advice}")
+
+
+def _from_set(found: HandEyeSet, name: str, board: Board | None, camera: Camera | None) -> RobotPoses:
+    targets = found.targets(name, board, camera)
+    names = [one for one in found.base_from_gripper if one in targets]
+    said = [f"saved by {found.tool}"]
+    if any(rms is not None for _, rms in targets.values()):
+        said.append(f"camera: {found.camera_said}" if camera is None else "camera: as given")
+        said.append(f"board: {found.board} ({found.board_said})" if board is None else f"board: {board}, as given")
+    if unseen := [found.images[one].name for one in found.base_from_gripper if one not in targets]:
+        said.append(f"no board in {name_some(unseen)}")
+    for one in names:
+        _check_pose(f"{name}: {one}: {ROBOT}", found.base_from_gripper[one])
+    joined = _joined(name, names, [found.base_from_gripper[one] for one in names], [targets[one][0] for one in names])
+    return replace(joined, reprojection_rms=tuple(targets[one][1] for one in names), read_from=tuple(said))
+
+
 def _from_yaml(text: str, name: str, folder: Path, locate: Callable[[Path], Tensor] | None) -> RobotPoses:
     document = YamlDocument(text, name, error=CalibrationError)
     if isinstance(document.root, yaml.SequenceNode) and name.lower().endswith(".json"):
         return _from_moveit(document, document.root, name)
+    _check_no_joints(document)
     top = known_entries(document, document.root, "a file of poses", required=("unit", "poses"))
     if "unit" in top and (unit := document.plain(top["unit"][1])) != "metre":
         document.fault(top["unit"][1], f"unit must be 'metre', got {unit!r}; convert every translation to metres")
@@ -102,6 +160,19 @@ def _from_yaml(text: str, name: str, folder: Path, locate: Callable[[Path], Tens
             target.append(locate(folder / str(document.plain(entries[IMAGE][1]))))
     document.raise_faults()
     return _joined(name, names, cast("list[Tensor]", robot), cast("list[Tensor]", target))
+
+
+def _check_no_joints(document: YamlDocument) -> None:
+    """Name measurements of joints for what they are: each entry would else be an unknown key."""
+    root = document.root
+    entries = [value for _, value in root.value] if isinstance(root, yaml.MappingNode) else []
+    for entry in entries[:1]:
+        keys = {str(key.value) for key, _ in entry.value} if isinstance(entry, yaml.MappingNode) else set()
+        if any(key.endswith("joints") for key in keys):
+            raise CalibrationError(
+                f"{document.name}: its {len(entries)} entries have angles of joints ({', '.join(sorted(keys))[:80]}), "
+                "and no file here tells the kinematics; write what the robot's model makes of them as base_from_gripper"
+            )
 
 
 def _from_moveit(document: YamlDocument, root: yaml.SequenceNode, name: str) -> RobotPoses:

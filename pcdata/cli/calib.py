@@ -15,7 +15,7 @@ from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, open_captures
 
 if TYPE_CHECKING:
-    from pcdata.calibration import Board, Calibration, PlaneResult
+    from pcdata.calibration import Board, Calibration, PlaneResult, RobotPoses
     from pcdata.structures import DepthFrame
     from pcdata.verdicts import Finding, Verdict
 
@@ -72,19 +72,22 @@ def _add_intrinsics(steps: Any) -> None:
 
 def _add_hand_eye(steps: Any) -> None:
     hand_eye = steps.add_parser("hand-eye", help="where the camera sits on the robot, or beside it")
-    hand_eye.add_argument("poses", metavar="POSES", help="YAML, JSON or CSV file of robot and target poses")
+    hand_eye.add_argument(
+        "poses", metavar="POSES", help="file of robot and target poses, or a folder that ViSP or robot_cal_tools saved"
+    )
     hand_eye.add_argument(
         "--setup",
-        required=True,
         choices=("eye-in-hand", "eye-to-hand"),
-        help="camera on the gripper, or beside the robot with the target on the gripper",
+        help="camera on the gripper, or beside the robot with the target on the gripper (default: what fits the poses)",
     )
     hand_eye.add_argument("--camera", default="camera", metavar="NAME", help="the camera's name (default: camera)")
     hand_eye.add_argument(
         "--gripper", default="gripper", metavar="FRAME", help="the gripper's frame (default: gripper)"
     )
     hand_eye.add_argument("--base", default="base", metavar="FRAME", help="the robot's base frame (default: base)")
-    hand_eye.add_argument("--board", type=_board, help="of the images in POSES: charuco:COLSxROWS:SQUARE:MARKER:DICT")
+    hand_eye.add_argument(
+        "--board", type=_board, help="of the images: charuco:..., chessboard:... or tag:DICT:SIDE; metres"
+    )
     hand_eye.add_argument("--calibration", metavar="FILE", help="calibration file with the camera that took the images")
     _add_file_options(hand_eye)
     hand_eye.set_defaults(run=_hand_eye)
@@ -198,21 +201,27 @@ def _intrinsics(arguments: argparse.Namespace) -> int:
 
 
 def _hand_eye(arguments: argparse.Namespace) -> int:
-    from pcdata.calibration import calibrate_hand_eye, read_robot_poses
+    from pcdata.calibration import calibrate_hand_eye
     from pcdata.report.plain_table import text_table
 
-    poses = read_robot_poses(arguments.poses, locate=_locator(arguments))
+    poses = _read_poses(arguments)
+    for line in poses.read_from:
+        print(line)
     result = calibrate_hand_eye(poses, setup=arguments.setup)
+    if arguments.setup is None:
+        print(f"setup: {result.setup}, which of the two fits the poses")
+    pixels = dict(zip(poses.names, poses.reprojection_rms))
     rows = [
         [
             name,
             f"{1000 * millimetres:.2f}",
             f"{math.degrees(result.rotation_residuals[name]):.3f}",
+            *(["" if (rms := pixels[name]) is None else f"{rms:.3f}"] if pixels else []),
             "OUTLIER" if name in result.outliers else "",
         ]
         for name, millimetres in result.translation_residuals.items()
     ]
-    print(text_table(["pose", "mm", "degrees", ""], rows))
+    print(text_table(["pose", "mm", "degrees", *(["image RMS px"] if pixels else []), ""], rows))
     solvers = [
         [name, *(f"{value:.5f}" for value in solution[:3, 3].tolist())] for name, solution in result.solutions.items()
     ]
@@ -230,39 +239,31 @@ def _hand_eye(arguments: argparse.Namespace) -> int:
     )
 
 
-def _locator(arguments: argparse.Namespace) -> Callable[[Path], Any] | None:
-    """Return what finds the board in an image that takes the place of a target pose, where the options allow it."""
-    from pcdata.calibration import Chessboard
+def _read_poses(arguments: argparse.Namespace) -> RobotPoses:
+    """Read the poses; images are looked at with the board and the camera of the options, or of a folder's files."""
+    from pcdata.calibration import read_robot_poses
     from pcdata.errors import ConfigError
     from pcdata.io import read_calibration
 
-    if arguments.board is None and arguments.calibration is None:
-        return None
-    if arguments.board is None or arguments.calibration is None:
+    board, file = arguments.board, arguments.calibration
+    camera = None if file is None else read_calibration(file).camera(arguments.camera)
+    if Path(arguments.poses).is_dir():
+        return read_robot_poses(arguments.poses, board=board, camera=camera)
+    if (board is None) != (camera is None):
         raise ConfigError("calib hand-eye: --board and --calibration go together: both locate the board in images")
-    if isinstance(arguments.board, Chessboard):
-        raise ConfigError(
-            "calib hand-eye: a chessboard looks the same turned by half a turn, so its pose is not certain; use a "
-            "ChArUco board"
-        )
-    camera = read_calibration(arguments.calibration).camera(arguments.camera)
-    return functools.partial(_locate, board=arguments.board, camera=camera)
+    locate = None if board is None else functools.partial(_locate, board=board, camera=camera)
+    return read_robot_poses(arguments.poses, locate=locate)
 
 
 def _locate(path: Path, board: Board, camera: Any) -> Any:
-    from pcdata.calibration import locate_board
     from pcdata.calibration.board_images import read_gray
+    from pcdata.calibration.hand_eye_set import locate_in_image
     from pcdata.errors import CaptureError
 
-    image = read_gray(path)
-    if image.shape != camera.size:
-        raise CaptureError(
-            f"{path}: is {image.shape[1]}x{image.shape[0]}, the camera {camera.size[1]}x{camera.size[0]}"
-        )
-    view = board.find(image)
-    if view is None:
+    located = locate_in_image(str(path), read_gray(path), board, camera)
+    if located is None:
         raise CaptureError(f"{path}: {board} is not in this image; leave its pose out")
-    return locate_board(view, camera)[0]
+    return located[0]
 
 
 def _findings_table(findings: Sequence[Finding]) -> str:

@@ -46,6 +46,7 @@ def _inspect(arguments: argparse.Namespace) -> None:
     from pcdata.io.sources.listing import absolute
     from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.capture_facts import capture_facts
+    from pcdata.report.hand_eye_facts import hand_eye_facts, hand_eye_text
     from pcdata.report.inspection_text import dataset_text, facts_text
     from pcdata.report.unopened_text import unopened_facts, unopened_text
 
@@ -63,6 +64,9 @@ def _inspect(arguments: argparse.Namespace) -> None:
         told = unopened_facts(arguments.path, arguments.kind, error)
         if told is not None:
             _tell(arguments.json, told, unopened_text(told, words))
+        elif arguments.kind is None and (poses := hand_eye_facts(arguments.path)) is not None:
+            _tell(arguments.json, poses, hand_eye_text(poses))
+            return
         raise
     _tell(arguments.json, facts, facts_text(facts, words))
 

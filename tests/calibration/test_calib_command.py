@@ -15,7 +15,7 @@ from pcdata.calibration import Calibration, Evidence
 from pcdata.cli import main
 from pcdata.io import read_calibration, write_calibration, write_depth
 from pcdata.sensors import sensor_profile
-from tests.calibration.boards import CAMERA, CHARUCO, CHESSBOARD, good_poses, rendered
+from tests.calibration.boards import CAMERA, CHARUCO, good_poses, rendered
 from tests.calibration.robots import HOLDER_FROM_TARGET, MOUNT_FROM_CAMERA, apart, camera_poses, robot_poses
 from tests.calibration.test_plane_check import wall
 from tests.calibration.test_robot_poses import plain
@@ -193,7 +193,7 @@ def test_target_poses_are_found_in_images(capsys, tmp_path: Path):
     assert millimetres < 2.0  # eight poses, corners found in the images
     assert degrees < 0.2
     for options, message in [
-        ([*cell, "--board", CHESSBOARD], "a chessboard looks the same turned by half a turn"),
+        ([*cell, "--board", "chessboard:8x6:0.025"], "looks the same turned by half a turn"),
         (cell, "--board and --calibration go together"),
     ]:
         code, _, err = run(capsys, *common, *options)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError
+from pcdata.files.xml import xml_root
 from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import from_rotation_translation
 from pcdata.geometry.rotations import rotation_from_quaternion
@@ -42,12 +43,7 @@ def read_mujoco_model(where: str, text: str) -> MujocoModel:
     Raises:
         CaptureError: it is no XML, has a document type (entities may stand for gigabytes), or numbers are none.
     """
-    if "<!" in text.replace("<!--", ""):
-        raise CaptureError(f"{where}: a model has no document type and no entities; remove <!DOCTYPE ...>")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise CaptureError(f"{where}: is no XML: {str(error)[:200]}") from error
+    root = xml_root(where, text)
     extent = _number(where, root.find("statistic"), "extent")
     planes = root.find("visual/map")
     near = None if extent is None else extent * (_number(where, planes, "znear") or 0.01)

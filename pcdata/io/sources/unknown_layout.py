@@ -12,6 +12,7 @@ from pcdata.errors import CaptureError, PcdataError
 from pcdata.files.opening import open_input
 from pcdata.files.sample_names import name_some
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from pcdata.io.sources.hand_eye_names import hand_eye_folders, hand_eye_tool
 from pcdata.io.sources.listing import entries, is_folder
 from pcdata.io.sources.registry import LAYOUTS
 
@@ -45,7 +46,7 @@ def unknown_layout(path: Path) -> CaptureError:
     if path.is_file() and (fault := _fault_of_file(path)):
         return CaptureError(f"open_source: {path}: {fault}")
     start = f"open_source: {path}: no known layout; found {_contents(path)}."
-    for way in (_by_its_folder, _captures_inside, _without_calibration, _images_alone):
+    for way in (_by_its_folder, _captures_inside, _robot_poses, _without_calibration, _images_alone):
         if told := way(path):
             return CaptureError(f"{start} {told}. docs/captures.md lists the layouts")
     known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
@@ -93,6 +94,16 @@ def _captures_inside(path: Path) -> str:
             return f"Captures by themselves are {names}: {_command(found[0])}{_for_all(path, inside, found)}"
         level = [entry for entry in inside if is_folder(entry)]
     return ""
+
+
+def _robot_poses(path: Path) -> str:
+    """Say that these are poses of a robot, which calibrate a camera and hold no captures."""
+    sets = hand_eye_folders(path)
+    if not sets:
+        return ""
+    command = f"pcdata calib hand-eye {shlex.quote(os.fspath(sets[0]))}"
+    tools = name_some({hand_eye_tool(one) for one in sets})
+    return f"These are poses of a robot that calibrate a camera to it, saved by {tools}: {command}"
 
 
 def _for_all(path: Path, inside: list[Path], found: list[Path]) -> str:
