@@ -167,6 +167,7 @@ def test_names_of_samples_sensors_and_errors_cannot_write_into_the_card(tmp_path
     assert rows[0].count("|") == 3
 
 
+@pytest.mark.filterwarnings("ignore")  # of what those packages use in turn
 def test_the_card_is_read_by_mlcroissant_and_hugging_face(folder):
     mlcroissant, hub = pytest.importorskip("mlcroissant"), pytest.importorskip("huggingface_hub")
     split_dataset(folder)
