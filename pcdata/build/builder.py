@@ -218,7 +218,7 @@ def _finish(
             for told in carry_splits(folder, partial):
                 note(told)
         carry_answers(folder, partial)
-        write_card(partial, name=folder.name)
+        write_card(partial)
         put_into_place(partial, folder, replaced, check_only_dataset, note)
         building.remove()
     return True

@@ -28,7 +28,6 @@ def write_card(
     answers: Mapping[str, str | None] | None = None,
     *,
     strict: bool = False,
-    name: str | None = None,
 ) -> list[str]:
     """Write the card of a dataset anew, as after a split; return what is not known, and how to say it.
 
@@ -36,7 +35,6 @@ def write_card(
         folder: the dataset.
         answers: fields of :class:`~pcdata.build.card_answers.CardAnswers` by name; they are kept in ``card.yaml``.
         strict: write nothing where something is not known.
-        name: what the dataset is called where no title is given; None = as its folder.
 
     Raises:
         ConfigError: a name or a value that is no answer; with ``strict`` something is not known: names it all.
@@ -48,7 +46,7 @@ def write_card(
     given = {name: value for name, value in (answers or {}).items() if value is not None}
     if given:
         said = said.with_others(vars(CardAnswers.of("card", given)))
-    facts = CardFacts.of(folder, said, name)
+    facts = CardFacts.of(folder, said)
     missing = facts.missing()
     if strict and missing:
         raise ConfigError("card: these are not known, and strict wants all of them:\n" + "\n".join(missing))

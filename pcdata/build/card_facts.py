@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,8 @@ from pcdata.build.card_answers import UNKNOWN, CardAnswers
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.datasets.splits import Splits
 from pcdata.io.store.cloud_record import cloud_from_record
-from pcdata.io.store.manifest import Manifest
-from pcdata.io.store.shards import Shards
+from pcdata.io.store.manifest import FILE_NAME, Manifest
+from pcdata.io.store.shards import Shards, hash_of
 from pcdata.structures import PointCloud
 from pcdata.validation.step_losses import PERCENTILES
 
@@ -47,8 +46,8 @@ class CardFacts:
     num_empty: int
 
     @classmethod
-    def of(cls, folder: Path, answers: CardAnswers, name: str | None = None) -> CardFacts:
-        """Read a dataset; ``name`` is what it is called where no title is given, None = as its folder.
+    def of(cls, folder: Path, answers: CardAnswers) -> CardFacts:
+        """Read a dataset; without a title it is called by its contents, which are the same under any name.
 
         Raises:
             CacheError: it is damaged.
@@ -63,7 +62,7 @@ class CardFacts:
         splits = Splits.read(folder, ids) if (folder / SPLITS).is_file() else None
         found = np.percentile(counts, list(PERCENTILES.values()), method="nearest")
         points = dict(zip(PERCENTILES, map(int, found)))
-        title = answers.title or name or os.path.basename(os.path.realpath(folder))
+        title = answers.title or f"Point clouds {hash_of(folder / FILE_NAME)[1][:8]}"
         return cls(folder, title, manifest, answers, first, splits, points, int((counts == 0).sum()))
 
     @property

@@ -15,7 +15,7 @@ _ANSWERS = {
     "creator": ("TEXT", "who made the data"),
     "url": ("URL", "where it is at home"),
     "date_published": ("DATE", "such as 2026-01-29"),
-    "title": ("TEXT", "of the card (default: the name of the folder)"),
+    "title": ("TEXT", "of the card (default: the first digits of a hash of the contents)"),
     "description": ("TEXT", "one or two sentences"),
 }
 

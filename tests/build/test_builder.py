@@ -323,7 +323,9 @@ def test_a_target_below_a_file_is_a_cache_error(tmp_path, source, configure):
 
 def test_a_shard_of_an_hdf5_dataset_is_one_file_with_a_group_per_scene(tmp_path, source, configure):
     build_dataset(configure(), source, tmp_path / "out")
-    assert sorted(os.listdir(tmp_path / "out")) == ["dataset.json", "index", "load.py", "pipeline.yaml", "shards"]
+    assert sorted(os.listdir(tmp_path / "out")) == [
+        "README.md", "croissant.json", "dataset.json", "index", "load.py", "pipeline.yaml", "shards",
+    ]  # fmt: skip
     assert sorted(os.listdir(first_shard(tmp_path / "out"))) == ["clouds.h5", "files.tsv"]
     with h5py.File(first_shard(tmp_path / "out") / "clouds.h5", "r") as file:
         assert list(file) == source.ids

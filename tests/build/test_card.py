@@ -15,6 +15,7 @@ from pcdata.build.escaped_text import as_markdown
 from pcdata.cli.main import main
 from pcdata.errors import ConfigError
 from pcdata.files.whole_folders import is_free
+from pcdata.io.store.shards import hash_of
 
 EVIL = [
     "a|b",
@@ -74,7 +75,7 @@ def test_a_build_writes_a_card_of_what_happened(folder):
     text = (folder / "README.md").read_text()
     assert head_of(text) == {
         "license": "unknown",
-        "pretty_name": "set",
+        "pretty_name": f"Point clouds {hash_of(folder / 'dataset.json')[1][:8]}",
         "task_categories": ["robotics"],
         "size_categories": ["n<1K"],
         "tags": ["point-cloud", "depth", "robotics", "3d", "pcdata"],
@@ -173,7 +174,7 @@ def test_the_card_is_read_by_mlcroissant_and_hugging_face(folder):
     split_dataset(folder)
     write_card(folder)
     dataset = mlcroissant.Dataset(str(folder / "croissant.json"))  # raises where there are errors
-    assert dataset.metadata.name == "set"
+    assert dataset.metadata.name.startswith("Point-clouds-")
     found = [(one["splits/name"], one["splits/num_samples"]) for one in dataset.records("splits")]
     assert [(str(name.decode() if isinstance(name, bytes) else name), count) for name, count in found] == [
         ("train", 2),
@@ -182,4 +183,4 @@ def test_the_card_is_read_by_mlcroissant_and_hugging_face(folder):
     ]
     card = hub.DatasetCard.load(folder / "README.md")
     assert card.data.license == "unknown"
-    assert card.data.pretty_name == "set"
+    assert card.data.pretty_name.startswith("Point clouds ")

@@ -79,7 +79,7 @@ def test_the_bytes_are_the_same_whichever_way_a_dataset_was_built(tmp_path, form
     build(tmp_path / "plain", form)
     wanted = tree(tmp_path / "plain")
     assert {name.split("/")[0] for name in wanted} == {
-        "dataset.json", "pipeline.yaml", "load.py", "index", "shards", "signals",
+        "README.md", "croissant.json", "dataset.json", "pipeline.yaml", "load.py", "index", "shards", "signals",
     }  # fmt: skip
     for workers in (1, 2):
         build(tmp_path / f"pool{workers}", form, workers=workers)
@@ -290,7 +290,7 @@ def test_builds_killed_at_any_moment_end_in_the_same_bytes(tmp_path):
             os.waitpid(pid, 0)
             while scratch.living_claims(tmp_path / ".out.building" / "claims"):
                 time.sleep(0.02)  # forked workers hold the lock of their parent, until they find that it is gone
-        build(tmp_path / "out", workers=workers, overwrite=True)
+        build(tmp_path / "out", workers=workers, source=_Slow(), overwrite=True)
         assert tree(tmp_path / "out") == tree(tmp_path / "whole")
         assert sorted(os.listdir(tmp_path)) == ["out", "whole"]
         shutil.rmtree(tmp_path / "out")

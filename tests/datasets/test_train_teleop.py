@@ -22,10 +22,14 @@ def test_actions_that_move_point_at_the_cube_of_turned_clouds_and_recorded_ones_
     windows = script.demonstrations(1, (36, 48))
     batch = collate_windows([windows[number] for number in range(4)])  # on the way to the cube
     recorded = batch.clouds.recorded_signals["action"].values[1::2]
-    for action, hits in ((batch.signals["action"], True), (recorded, False)):
-        for points, labels, target in zip(batch.points[:, -1], batch.field("labels")[:, -1], action[:, 1, :3]):
-            gap = (points[labels == CUBE] - target).norm(dim=1).amin()
-            assert (0.02 < gap < 0.044) == hits  # from its middle to its nearest corner or face
+
+    def hits(action):
+        clouds = zip(batch.points[:, -1], batch.field("labels")[:, -1], action[:, 1, :3])
+        gaps = [(points[labels == CUBE] - target).norm(dim=1).amin() for points, labels, target in clouds]
+        return sum(bool(0.02 < gap < 0.044) for gap in gaps)  # from its middle to its nearest corner or face
+
+    assert hits(batch.signals["action"]) == 4
+    assert hits(recorded) <= 1  # by chance, where a cloud is hardly turned
 
 
 def test_a_policy_is_trained_and_tried(script, monkeypatch):

@@ -61,6 +61,8 @@ class _FolderWriter(Writer):
                     f"{sample_id}: has {frame.num_views} views, but those before it {len(views)}; write these apart "
                     "(--only, --skip)"
                 )
+            if len(views) > 1 and KEPT["sensor"](frame):
+                captures.lose("sensor", "it is told of captures, not of each of their cameras", captures=1)
             for view, written in enumerate(views):
                 written.add(names[sample_id], frame, view)
         times = captures.times()

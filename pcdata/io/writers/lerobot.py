@@ -24,7 +24,7 @@ class _LeRobotWriter(LeRobotOptions):
 
     kind: ClassVar[str] = "lerobot"
     layout: ClassVar[str] = "LeRobot v3.0: Parquet, videos, and depth without loss; needs pyarrow and av"
-    keeps: ClassVar[frozenset[str]] = frozenset(KEPT)
+    keeps: ClassVar[frozenset[str]] = frozenset(KEPT) - {"sensor"}
 
     def write(self, captures: Captures, folder: Path) -> None:
         """Write all captures, episode after episode; captures of no episode become episodes between them."""

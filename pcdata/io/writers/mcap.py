@@ -49,7 +49,7 @@ class _McapWriter(Writer):
 
     kind: ClassVar[str] = "mcap"
     layout: ClassVar[str] = "EPISODE.mcap, a ROS 2 recording of each episode (ros2 bag, Foxglove, RViz)"
-    keeps: ClassVar[frozenset[str]] = frozenset(KEPT)
+    keeps: ClassVar[frozenset[str]] = frozenset(KEPT) - {"sensor"}
 
     color: Literal["raw", "png", "jpeg"] = "raw"
     quality: int = 90

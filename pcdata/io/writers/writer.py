@@ -23,7 +23,9 @@ KEPT: dict[str, Callable[[DepthFrame], bool]] = {
     "lens": lambda frame: frame.camera.distortion is not None,
     "pose": lambda frame: frame.world_from_camera is not None,
     "signals": lambda frame: bool(frame.recorded_signals),
+    "sensor": lambda frame: any(frame.provenance.get(key) for key in ("sensor_name", "serial")),
 }
+_NO_STREAM = ("signals", "sensor")  # one is told by the names of the signals, the other is a remark
 
 
 @dataclass
@@ -109,7 +111,7 @@ class Captures:
 
         Raises:
             ConfigError: one is no depth image.
-        NoReadingError: no pixel of one has a reading, which no layout could give back.
+            NoReadingError: no pixel of one has a reading, which no layout could give back.
             PcdataError: one cannot be read.
         """
         for sample_id in ids:
@@ -176,7 +178,7 @@ class Writer(ABC):
 
 
 def _streams(frame: DepthFrame) -> list[str]:
-    held = [name for name, has in KEPT.items() if has(frame) and name != "signals"]
+    held = [name for name, has in KEPT.items() if has(frame) and name not in _NO_STREAM]
     return ["depth", *held, *(f"signal {name}" for name in frame.recorded_signals)]
 
 

@@ -165,7 +165,7 @@ HOLD = "import h5py, sys; f = h5py.File(sys.argv[1], 'r+'); print('held', flush=
 def doors(path: Path, folder: Path) -> dict[str, Callable[[], object]]:
     return {
         "cached dataset": lambda: CachedCloudDataset(folder)[0],
-        "store": lambda: STORES["hdf5"](folder).read("a"),
+        "store": lambda: STORES["hdf5"](path.parent).read("a"),
         "check": lambda: foreign(path, "a/points"),
     }
 

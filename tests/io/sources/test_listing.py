@@ -325,5 +325,5 @@ def test_suffixes_are_read_in_either_case(tmp_path: Path) -> None:
 
 def test_a_capture_one_folder_down_is_named(tmp_path: Path) -> None:
     folder(tmp_path / "archive" / "capture", ["1"])
-    with pytest.raises(CaptureError, match="A capture by itself: capture; give its path"):
+    with pytest.raises(CaptureError, match=r"A capture by itself is capture: pcdata inspect .*/archive/capture"):
         open_source(tmp_path / "archive")

@@ -8,7 +8,7 @@ from PIL import Image
 
 from pcdata import open_source
 from pcdata.errors import CaptureError
-from pcdata.io.sources.detect import _FILES
+from pcdata.io.sources.unknown_layout import _FILES
 
 
 @pytest.mark.parametrize("suffix", _FILES)
@@ -30,7 +30,7 @@ def test_one_image_is_no_capture(tmp_path):
     Image.fromarray(np.zeros((4, 5), np.uint16)).save(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", np.zeros((4, 5)))
     for name in ("a.png", "a.npy"):
-        with pytest.raises(CaptureError, match="one image is no capture; give the folder"):
+        with pytest.raises(CaptureError, match=r"one image is no capture\. If the images are depth: pcdata inspect "):
             open_source(tmp_path / name)
     (tmp_path / "a.txt").write_text("nothing")
     with pytest.raises(CaptureError, match="The layouts and what each needs"):

@@ -48,8 +48,8 @@ def clouds(tmp_path: Path) -> Path:
 
 
 def test_a_folder_of_no_known_layout_lists_what_each_needs_and_what_was_found(tmp_path: Path) -> None:
-    (tmp_path / "holiday.jpg").write_bytes(b"x")
-    with pytest.raises(CaptureError, match=r"found holiday\.jpg") as caught:
+    (tmp_path / "holiday.txt").write_bytes(b"x")
+    with pytest.raises(CaptureError, match=r"found holiday\.txt") as caught:
         open_source(tmp_path)
     assert all(layout.needs in str(caught.value) for layout in LAYOUTS.values())
 

@@ -60,7 +60,7 @@ def made_frame(number: int = 0, views: int = 1, **changed: Any) -> DepthFrame:
             "frame_id": "base",
             "capture_index": number,
             "sample_id": f"{number:03d}",
-            "provenance": {"metres_per_unit": UNIT, "sensor": "made up"},
+            "provenance": {"metres_per_unit": UNIT, "sensor_name": "made up"},
             "recorded_signals": made_signals(number),
             **changed,
         }
