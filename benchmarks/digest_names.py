@@ -227,6 +227,8 @@ def call_inner(name: str, backend: str, arguments: Sequence[Any], named: Mapping
     operation = INNER[name]
     body = operation.reference if backend == "torch" else operation.kernels[backend]
     found = body(*arguments, **named)
+    if name == "copy_blocks":  # it fills its first argument
+        return arguments[0]
     if not isinstance(found, Iterator):
         return found
     columns = [torch.cat(parts) for parts in zip(*found)]  # neighbors of some queries at a time, in no fixed order

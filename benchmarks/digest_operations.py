@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
+import numpy as np
 import torch
 from digest_inputs import poses, rendered, seeded, with_confidence
 from digest_names import backends_of, call, call_inner, functional, inner_names, operation_names, tsdf
@@ -252,6 +253,13 @@ def _into_box(lens: str, *, moved: bool) -> Arguments:
     return _images(lens)[0], {**box, "matrix": matrix}
 
 
+def _blocks() -> Arguments:
+    sources = [np.arange(40, dtype=np.uint8), np.arange(100, 140, dtype=np.uint8)]
+    numbers = [[0, 9, 20], [0, 1, 0], [3, 0, 30], [9, 11, 4]]  # where to, of which, from where, how many
+    begins, which, starts, sizes = (np.array(row, np.int64) for row in numbers)
+    return (torch.zeros(24, dtype=torch.uint8), begins, sources, which, starts, sizes), {}
+
+
 def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     """Yield inner function, input, and what makes the arguments."""
     rows = torch.tensor([3, 3, 89, 0])
@@ -262,6 +270,18 @@ def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     for name in ("transform_points", "transform_directions"):
         yield name, "one", lambda: ((points(90, 1), ptr_of(90), poses(2)[:1]), {})
         yield name, "two", lambda: ((points(90, 1), ptr_of(50, 40), poses(2)), {})
+    seeds, two = torch.tensor([5, -7]), ptr_of(50, 40)
+    yield (
+        "move_points",
+        "two",
+        lambda: ((points(90, 1), two, [poses(2), (seeds, 0.01, None), (seeds + 1, 0.02, 0.03)]), {}),
+    )
+    yield (
+        "random_rows",
+        "three",
+        lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
+    )
+    yield "copy_blocks", "two", _blocks
     yield "inside_box", "random", lambda: ((points(90, 1), (0.05, 0.0, 0.0), (0.15, 0.2, 0.1)), {})
     spoilt = points(90, 1).index_fill(0, rows[:1], torch.nan)
     yield "inside_box", "not finite", lambda: ((spoilt, (0.0,) * 3, (1.0,) * 3), {})
