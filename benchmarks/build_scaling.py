@@ -25,7 +25,10 @@ from pcdata.synthetic import SyntheticSource
 RESULTS = Path(__file__).parent / "results"
 CONFIG = """
 depth: [MaskDepth: {near: 0.1, far: 3.0}, Deproject]
-cloud: [ToFrame: {frame: base}, RemoveRadiusOutliers: {}, FarthestPointSample: {num_points: 1024, if_short: repeat}]
+cloud:
+  - ToFrame: {frame: base}
+  - RemoveRadiusOutliers: {radius: RADIUS}
+  - FarthestPointSample: {num_points: 1024, if_short: repeat}
 output: {format: packed, shard_size: SHARD}
 """
 
@@ -63,7 +66,7 @@ def timed(captures: int, workers: int, size: tuple[int, int], shard_size: int) -
 
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        config = config_from_yaml(CONFIG.replace("SHARD", str(shard_size)))
+        config = config_from_yaml(CONFIG.replace("SHARD", str(shard_size)).replace("RADIUS", str(4.0 / size[1])))
         build_dataset(config, source, Path(folder) / "out", workers=workers, progress=progress)
         return round(time.perf_counter() - begun, 2), memory
 
