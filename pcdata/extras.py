@@ -38,6 +38,8 @@ EXTRAS = {
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
         _Extra("av", "av", "recordings of an Azure Kinect (.mkv) and videos of LeRobot datasets"),
         _Extra("pyarrow", "lerobot", "LeRobot datasets"),
+        _Extra("fsspec", "remote", "datasets at a URL"),
+        _Extra("s3fs", "remote", "datasets at s3://"),
         _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
         _Extra("open3d", "open3d", "viewing and comparing with Open3D"),

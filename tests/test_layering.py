@@ -17,7 +17,8 @@ ROOT = Path(pcdata.__file__).parent
 # ALLOWED_SIBLINGS says so.
 LAYERS = [
     {"errors"},
-    {"rng", "threads", "extras", "files", "registry", "progress"},
+    {"extras"},
+    {"rng", "threads", "files", "registry", "progress"},
     {"contracts"},
     {"geometry"},
     {"functional"},
