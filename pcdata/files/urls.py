@@ -7,6 +7,7 @@ through the door for files.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -41,6 +42,10 @@ def path_of(place: str | os.PathLike[str]) -> Path:
         parts = urlsplit(place)
         return Path(unquote(parts.path if parts.netloc in ("", "localhost") else parts.netloc + parts.path))
     return Path(place)
+
+
+def _is_full(cause: Exception) -> bool:
+    return isinstance(cause, OSError) and cause.errno == errno.ENOSPC
 
 
 class UrlStatus(NamedTuple):
@@ -116,7 +121,7 @@ class UrlFolder:
             halves = int.from_bytes(digest[:8], "big") >> 1, int.from_bytes(digest[8:16], "big") >> 1
             return UrlStatus(told["size"], (*halves, told["size"], 0) if marks else None)
 
-        return self._tried(name, "its size", ask)
+        return self._tried(name, "its size cannot be read", ask)
 
     def read(self, name: str, begin: int, end: int) -> bytes:
         """Read the bytes from ``begin`` to ``end`` of a file, all of them.
@@ -132,7 +137,7 @@ class UrlFolder:
                 raise OSError(f"{len(content)} bytes came")
             return content
 
-        return self._tried(name, f"its bytes {begin} to {end}", ask) if end > begin else b""
+        return self._tried(name, f"its bytes {begin} to {end} cannot be read", ask) if end > begin else b""
 
     def _tried(self, name: str, what: str, ask: Callable[[], _T]) -> _T:
         for attempt in range(self._retries + 1):
@@ -146,18 +151,17 @@ class UrlFolder:
                 raise self._failed(name, "the file is missing; check the URL, or copy it again") from cause
             except Exception as cause:  # every file system has errors of its own
                 fault = cause
-                if isinstance(cause, _FINAL):
+                if isinstance(cause, _FINAL) or "Credential" in type(cause).__name__ or _is_full(cause):
                     break
         tried = f"tried {attempt + 1} times; " if attempt else ""
         failed = self._failed(
             name,
-            f"{what} cannot be read ({type(fault).__name__}: {fault!s:.300}); {tried}check the connection and the "
-            "rights, then go on",
+            f"{what} ({type(fault).__name__}: {fault!s:.300}); {tried}check the connection and the rights, then go on",
         )
         raise failed from fault
 
     def _failed(self, name: str, what: str) -> PcdataError:
-        place = f"{self}/{name}"
+        place = f"{self}/{name}" if name else str(self)
         error = self._error(f"{self._where}: {place}: {what}")
         locate(error, path=place)
         return error
