@@ -10,9 +10,9 @@ from typing import Literal
 
 from pcdata.build.building_folder import BuildingFolder
 from pcdata.build.card import write_card
+from pcdata.build.card_answers import FILE_NAME as ANSWERS
 from pcdata.build.carried import carry_answers, carry_splits
 from pcdata.build.config import BuildConfig
-from pcdata.build.contents import check_only_dataset
 from pcdata.build.engines.in_process import work_here
 from pcdata.build.finishing import complete_dataset, counts_of
 from pcdata.build.plan import Plan, plan_of
@@ -23,7 +23,6 @@ from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
-from pcdata.files.whole_folders import check_replaceable, prepared, put_into_place
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
@@ -107,10 +106,10 @@ def build_dataset(
     # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
     folder = Path(os.path.realpath(Path(folder).expanduser()))
     report = BuildReport(folder, skipped=skipped_of(source))
-    check_replaceable(folder, overwrite, check_only_dataset)
+    building = BuildingFolder(folder)
+    building.check_target(overwrite)
     plan = plan_of(config, source)
     limit = most_bad(max_bad, len(plan.ids))
-    building = BuildingFolder(folder)
     job = Job.of(config, source, plan, building)
 
     def tell(text: str) -> None:
@@ -120,7 +119,7 @@ def build_dataset(
 
     what = "finalize" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
     with building.opened(plan, what, restart=restart, note=tell):
-        replaced = prepared(folder, overwrite, check_only_dataset, tell) if part is None else None
+        replaced = building.prepared(overwrite, tell) if part is None else None
         shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
         done = _finished(job, shards, tell)
         if finalize and len(done) < plan.num_shards:
@@ -191,7 +190,7 @@ def _finish(
     note: Note,
 ) -> bool:
     """Put the dataset into place; False where another process that has a part of the work does."""
-    folder, building = job.folder.target, job.folder
+    building = job.folder
     if not any(record.samples for record in done.values()):
         failed = {name: why for record in done.values() for name, why in record.quarantined.items()}
         raise all_failed(failed, len(job.plan.ids))
@@ -204,23 +203,23 @@ def _finish(
             note("another process puts the dataset into place")
             return False
         if part is not None:
-            replaced = prepared(folder, overwrite, check_only_dataset, note)
+            replaced = building.prepared(overwrite, note)
         alarms = judge_step_losses(counts_of(done))
         for one in alarms:
             note(f"{one.name} {one.found}; {one.advice}")
         if alarms and strict:
             raise CaptureError(
                 f"build_dataset: steps drop more than is usual, of which the notes tell; what is finished is kept in "
-                f"{building.path}: mend the steps or leave captures out, or take it as it is without strict"
+                f"{building.kept_at}: mend the steps or leave captures out, or take it as it is without strict"
             )
         partial = complete_dataset(config, source, job, done, alarms)
-        if (folder / SPLITS).is_file():
-            for told in carry_splits(folder, partial):
+        before = building.carried((SPLITS, ANSWERS))
+        if (before / SPLITS).is_file():
+            for told in carry_splits(before, partial):
                 note(told)
-        carry_answers(folder, partial)
+        carry_answers(before, partial)
         write_card(partial)
-        put_into_place(partial, folder, replaced, check_only_dataset, note)
-        building.remove()
+        building.put_into_place(job.plan, done, replaced, note)
     return True
 
 
@@ -229,8 +228,8 @@ def _tell_kept(error: BaseException, building: BuildingFolder, plan: Plan) -> No
     if any(record.samples for record in kept.values()):
         add_note(
             error,
-            f"{len(kept)} of {plan.num_shards} shards are finished and kept in {building.path}; the same command goes "
-            "on from there",
+            f"{len(kept)} of {plan.num_shards} shards are finished and kept in {building.kept_at}; the same command "
+            "goes on from there",
         )
 
 

@@ -16,30 +16,78 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from pcdata.build.contents import check_only_dataset
 from pcdata.build.plan import FILE_NAME as PLAN
-from pcdata.build.plan import Plan
+from pcdata.build.plan import MOST_BYTES as MOST_PLAN
+from pcdata.build.plan import Plan, write_json
+from pcdata.build.records import MOST_BYTES as MOST_RECORD
 from pcdata.build.records import ShardRecord
 from pcdata.errors import CacheError, write_fault
 from pcdata.files.interrupts import shielded
+from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import Note, claimed, hidden_folder, living_claims, scratch_beside
 from pcdata.files.syncing import sync_folder, sync_tree
-from pcdata.io.store.shards import shard_folder
+from pcdata.files.whole_folders import check_replaceable, prepared, put_into_place
+from pcdata.io.store.shards import FOLDER, shard_folder
 
 _SHARDS, _RECORDS, _CLAIMS, _DATASET = "shards", "records", "claims", "dataset"
+_MOST_MARK = 1 << 20  # bytes
 SHARD, SIGNALS = "shard", "signals"  # in the folder of a finished shard: what the dataset gets, and what is joined
 
 
 class BuildingFolder:
     """The folder of the unfinished build of one dataset; holds names alone, so it can be pickled."""
 
+    target: object  # the dataset, as messages name it
+    kept_at: object  # where what is finished is kept
+    path: Path  # of this machine, to work in
+    dataset: Path  # there: what becomes the target
+
     def __init__(self, target: Path) -> None:
-        self.target = target
-        self.path = hidden_folder(target, "building")
+        self._target = self.target = target
+        self.path = self.kept_at = hidden_folder(target, "building")
         self.dataset = self.path / _DATASET
+
+    # -- the name that the dataset gets ----------------------------------------------------------------------------
+
+    def check_target(self, overwrite: bool) -> None:
+        """Require that the name is free, or that a dataset alone is there, which may be replaced.
+
+        Raises:
+            CacheError: it is neither.
+        """
+        check_replaceable(self._target, overwrite, check_only_dataset)
+
+    def prepared(self, overwrite: bool, note: Note) -> object:
+        """Put right what killed overwrites left at the name; return what is there, for :meth:`put_into_place`.
+
+        Raises:
+            CacheError: as for :meth:`check_target`.
+        """
+        return prepared(self._target, overwrite, check_only_dataset, note)
+
+    def carried(self, names: Iterable[str]) -> Path:
+        """Return a folder that holds those of some files that the dataset has which is to be replaced."""
+        return self._target
+
+    def put_into_place(self, plan: Plan, records: Mapping[int, ShardRecord], replaced: object, note: Note) -> None:
+        """Give the dataset its name, and delete what was there before, and this folder.
+
+        Args:
+            plan: of the build.
+            records: of all its shards.
+            replaced: what :meth:`prepared` found.
+            note: told what is left.
+
+        Raises:
+            CacheError: something else is there now, or it cannot be put there.
+        """
+        put_into_place(self.dataset, self._target, replaced, check_only_dataset, note)
+        self.remove()
 
     # -- who works on it -------------------------------------------------------------------------------------------
 
@@ -87,7 +135,7 @@ class BuildingFolder:
     def _settle(self, plan: Plan, what: str, restart: bool, note: Note) -> None:
         """Make the folder that of this plan."""
         try:
-            different = plan.differences(self.path)
+            different = self.differences(plan)
         except CacheError:
             different = ["plan.json, which is damaged"]
         records = self._num_kept()
@@ -106,7 +154,19 @@ class BuildingFolder:
             self._empty()
             if records:
                 note(f"deleted the {records} finished shards of an unfinished build of {self.target}")
-        plan.write(self.path)
+        write_json(self.path / PLAN, plan.to_json())
+
+    def differences(self, plan: Plan) -> list[str] | None:
+        """Say in words how the build that is there differs from a plan; None = there is none.
+
+        Raises:
+            CacheError: the plan there cannot be read.
+        """
+        path = self.path / PLAN
+        if not path.exists():
+            return None
+        there = read_bytes("build", path, max_bytes=MOST_PLAN, error=CacheError)
+        return plan.differences(str(path), there)
 
     def _num_kept(self) -> int:
         """Return how many shards are finished and still here."""
@@ -159,7 +219,9 @@ class BuildingFolder:
     def record(self, plan: Plan, shard: int) -> ShardRecord | None:
         """Return the record of a finished shard; it does not ask whether the captures are still the same."""
         with suppress(CacheError):
-            record = ShardRecord.read(self._record_path(shard), plan, shard)
+            path = self._record_path(shard)
+            text = read_bytes("build", path, max_bytes=MOST_RECORD, error=CacheError)
+            record = ShardRecord.of(str(path), text, plan, shard)
             return record if self.place_of(record) is not None else None
         return None
 
@@ -176,6 +238,53 @@ class BuildingFolder:
     def work_place(self, record: ShardRecord) -> Path:
         """Return the folder that a finished shard was given."""
         return self.path / _SHARDS / record.folder_name
+
+    def mark(self, shard: int, text: bytes) -> None:
+        """Say of a shard what is done now, where the process that does it may end without a word.
+
+        Raises:
+            CacheError: it cannot be written.
+        """
+        folder = self.path / "marks"
+        try:
+            folder.mkdir(exist_ok=True)
+            (folder / f"{shard:05d}.json").write_bytes(text)
+        except OSError as error:
+            raise CacheError(f"{self.target}: cannot be written: {write_fault(error)}") from error
+
+    def marked(self, shard: int) -> bytes:
+        """Return what was said of a shard last.
+
+        Raises:
+            CacheError: nothing that can be read.
+        """
+        path = self.path / "marks" / f"{shard:05d}.json"
+        return read_bytes("build", path, max_bytes=_MOST_MARK, error=CacheError)
+
+    def gather(self, records: Sequence[ShardRecord], form: str) -> None:
+        """Let :attr:`dataset` hold the shards of some records, and nothing else.
+
+        Args:
+            records: of all shards.
+            form: of their stores.
+
+        Raises:
+            CacheError: one is gone.
+            OSError: the disk is full.
+        """
+        shards = self.dataset / FOLDER
+        shards.mkdir(parents=True, exist_ok=True)
+        for record in records:
+            place, final = self.place_of(record), shard_folder(self.dataset, record.shard)
+            if place is None:
+                raise CacheError(f"{self.target}: shard {record.shard} is gone; start again: only it is built anew")
+            if place != final:
+                shutil.rmtree(final, ignore_errors=True)
+                place.rename(final)
+        wanted = {shards, *(shard_folder(self.dataset, record.shard) for record in records)}
+        for path in [*self.dataset.iterdir(), *shards.iterdir()]:
+            if path not in wanted:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     @contextmanager
     def shard_scratch(self, shard: int) -> Iterator[Path]:
@@ -212,7 +321,7 @@ class BuildingFolder:
                         shutil.rmtree(place)
                         os.rename(scratch, place)
                 sync_folder(place.parent)
-                record.write(self._record_path(record.shard))
+                write_json(self._record_path(record.shard), record.to_json())
         except OSError as error:
             if isinstance(error, CacheError):
                 raise

@@ -6,7 +6,6 @@ Every step may be done again after a kill: shards are moved one by one, everythi
 from __future__ import annotations
 
 import platform
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from pcdata.io.store.cloud_record import record_from_signals
 from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.sample_index import Sample
 from pcdata.io.store.sample_keys import key_of
-from pcdata.io.store.shards import FOLDER, SIGNALS_FOLDER, SIGNALS_KEY, shard_folder
+from pcdata.io.store.shards import FOLDER, SIGNALS_FOLDER, SIGNALS_KEY
 from pcdata.io.store.stores import STORES
 from pcdata.structures import Episode, Signal
 from pcdata.structures.episodes import kept_episodes
@@ -55,7 +54,7 @@ def complete_dataset(
     _check_captures(source, job, ordered)
     dataset = job.folder.dataset
     try:
-        _gather(job, ordered)
+        job.folder.gather(ordered, config.output.format)
         samples = [
             Sample(one.id, key_of(one.id), one.num_points, one.digest, record.shard)
             for record in ordered
@@ -114,23 +113,6 @@ def _check_captures(source: CaptureSource, job: Job, records: Sequence[ShardReco
                 f"build_dataset: a file of the captures {ids[0]!r} to {ids[-1]!r} was changed after it was read, so "
                 "the dataset would mix two states of them; let them rest and start again: only these are built anew"
             )
-
-
-def _gather(job: Job, records: Sequence[ShardRecord]) -> None:
-    """Move the shards into the dataset, and remove whatever else is there."""
-    dataset = job.folder.dataset
-    (dataset / FOLDER).mkdir(parents=True, exist_ok=True)
-    for record in records:
-        place, final = job.folder.place_of(record), shard_folder(dataset, record.shard)
-        if place is None:
-            raise CacheError(f"{job.folder.target}: shard {record.shard} is gone; start again: only it is built anew")
-        if place != final:
-            shutil.rmtree(final, ignore_errors=True)
-            place.rename(final)
-    wanted = {dataset / FOLDER, *(shard_folder(dataset, record.shard) for record in records)}
-    for path in [*dataset.iterdir(), *(dataset / FOLDER).iterdir()]:
-        if path not in wanted:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _write_signals(config: BuildConfig, job: Job, records: Sequence[ShardRecord]) -> dict[str, str]:

@@ -48,7 +48,7 @@ def outlook(config: BuildConfig, source: CaptureSource, folder: str | os.PathLik
         except CacheError as error:
             hindrances.append(str(error))
     try:
-        different = plan.differences(building.path)
+        different = building.differences(plan)
     except CacheError as error:
         different = [str(error)]
     if different:

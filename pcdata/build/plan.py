@@ -16,7 +16,7 @@ import pcdata
 from pcdata.build.config import BuildConfig
 from pcdata.build.source_state import digest_of, state_of
 from pcdata.errors import CacheError
-from pcdata.files.opening import read_bytes, replacing
+from pcdata.files.opening import replacing
 from pcdata.files.strict_json import json_object
 from pcdata.files.syncing import sync_file, sync_folder
 from pcdata.imports import imported_files, step_names
@@ -26,7 +26,7 @@ from pcdata.io.store.stores import STORES
 
 SCHEMA = "pcdata.plan/1"
 FILE_NAME = "plan.json"
-_MAX_BYTES = 1 << 20
+MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,9 @@ class Plan:
         """Return the ids of the captures of one shard."""
         return self.ids[shard * self.shard_size : (shard + 1) * self.shard_size]
 
-    def write(self, folder: Path) -> None:
-        """Say in a folder which build it is.
-
-        Raises:
-            CacheError: it cannot be written.
-        """
-        content = {
+    def to_json(self) -> dict[str, Any]:
+        """Say which build it is."""
+        return {
             "schema": SCHEMA,
             "identity": self.identity,
             "settings": self.settings,
@@ -65,20 +61,14 @@ class Plan:
             "num_samples": len(self.ids),
             "shard_size": self.shard_size,
         }
-        write_json(folder / FILE_NAME, content)
 
-    def differences(self, folder: Path) -> list[str] | None:
-        """Say in words how the build that a folder belongs to differs from this plan; None = there is no plan in it.
+    def differences(self, where: str, content: bytes) -> list[str]:
+        """Say in words how the build of another plan, as :meth:`to_json` wrote it, differs from this one.
 
         Raises:
-            CacheError: the plan there cannot be read.
+            CacheError: that plan is damaged; the message begins with ``where`` it is.
         """
-        path = folder / FILE_NAME
-        if not path.exists():
-            return None
-        there = json_object(
-            str(path), read_bytes("build", path, max_bytes=_MAX_BYTES, error=CacheError), error=CacheError
-        )
+        there = json_object(where, content, error=CacheError)
         if there.get("identity") == self.identity:
             return []
         settings = there.get("settings")
@@ -122,7 +112,11 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         CacheError: it cannot be written.
     """
     with replacing("build", path, error=CacheError) as temporary:
-        with open(temporary, "w", encoding="utf-8", errors="surrogatepass") as file:
-            json.dump(content, file, separators=(",", ":"), allow_nan=False)
+        temporary.write_bytes(json_bytes(content))
         sync_file(temporary)
     sync_folder(path.parent)
+
+
+def json_bytes(content: Mapping[str, Any]) -> bytes:
+    """Return what a file of JSON holds; names may have bytes that are no text."""
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode("utf-8", "surrogatepass")

@@ -8,15 +8,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pcdata.build.plan import Plan, write_json
+from pcdata.build.plan import Plan
 from pcdata.build.source_state import digest_of
 from pcdata.errors import CacheError
-from pcdata.files.opening import read_bytes
 from pcdata.files.strict_json import json_object
 from pcdata.io.store.shards import TABLE, hash_of
 
 SCHEMA = "pcdata.shard/1"
-_MAX_BYTES = 1 << 30
+MOST_BYTES = 1 << 30
 _NOT_BYTES = ("seconds",)  # of a record: differs from run to run
 
 
@@ -54,24 +53,18 @@ class ShardRecord:
                 del sample[name]
         return f"{self.shard:05d}-{digest_of(content)[:16]}"
 
-    def write(self, path: Path) -> None:
-        """Write the file: the shard is committed.
-
-        Raises:
-            CacheError: it cannot be written.
-        """
-        write_json(path, {"schema": SCHEMA, "folder": self.folder_name, **asdict(self)})
+    def to_json(self) -> dict[str, Any]:
+        """Return what the file holds that commits the shard."""
+        return {"schema": SCHEMA, "folder": self.folder_name, **asdict(self)}
 
     @classmethod
-    def read(cls, path: Path, plan: Plan, shard: int) -> ShardRecord:
-        """Read the record of a shard of a plan.
+    def of(cls, where: str, text: bytes, plan: Plan, shard: int) -> ShardRecord:
+        """Return the record of a shard of a plan, as :meth:`to_json` wrote it.
 
         Raises:
-            CacheError: missing or damaged, or of another plan.
+            CacheError: damaged, or of another plan; the message begins with ``where`` it is.
         """
-        content = json_object(
-            str(path), read_bytes("build", path, max_bytes=_MAX_BYTES, error=CacheError), error=CacheError
-        )
+        content = json_object(where, text, error=CacheError)
         schema, folder = content.pop("schema", None), content.pop("folder", None)
         try:
             record = cls(**content)
@@ -84,9 +77,9 @@ class ShardRecord:
                 and folder == record.folder_name
             )
         except (TypeError, ValueError, KeyError, AttributeError) as error:
-            raise CacheError(f"{path}: is no record of a shard: {error}") from error
+            raise CacheError(f"{where}: is no record of a shard: {error}") from error
         if not is_it:
-            raise CacheError(f"{path}: is damaged, or the record of another build")
+            raise CacheError(f"{where}: is damaged, or the record of another build")
         return record
 
     @property

@@ -6,7 +6,6 @@ A task says in a small file which capture it works on, since nothing else is lef
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 from collections.abc import Iterable
@@ -14,15 +13,14 @@ from contextlib import suppress
 from typing import Any
 
 from pcdata import extras
+from pcdata.build.plan import json_bytes
 from pcdata.build.schedule import Schedule, Task
 from pcdata.build.shard_work import Job
 from pcdata.build.tally import Tally, stop_in_words, stopped
-from pcdata.errors import CacheError, write_fault
+from pcdata.errors import CacheError
 from pcdata.files.interrupts import shielded
-from pcdata.files.opening import read_bytes
 from pcdata.files.strict_json import json_object
 
-_MOST_MARK = 1 << 20  # bytes
 _WAIT = 1.0  # seconds between two looks at signals
 
 
@@ -83,8 +81,8 @@ def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: 
         record = job.folder.record(job.plan, task.shard)
         if record is None:
             raise CacheError(
-                f"{job.folder.path}: a finished shard does not show here; do all machines see this folder, under this "
-                "path?"
+                f"{job.folder.kept_at}: a finished shard does not show here; do all machines see this folder, under "
+                "this path?"
             )
         for sample_id, why in told[0].items():
             tally.captured(task.shard, sample_id, why)
@@ -99,21 +97,13 @@ def _mark(job: Job, shard: int, sample_id: str | None = None, what: str = "") ->
     Raises:
         CacheError: it cannot be written.
     """
-    folder = job.folder.path / "marks"
-    try:
-        folder.mkdir(exist_ok=True)
-        with open(folder / f"{shard:05d}.json", "w", encoding="utf-8") as file:
-            json.dump({"sample_id": sample_id, "what": what}, file)
-    except OSError as error:
-        raise CacheError(f"{job.folder.target}: cannot be written: {write_fault(error)}") from error
+    job.folder.mark(shard, json_bytes({"sample_id": sample_id, "what": what}))
 
 
 def _marked(job: Job, shard: int) -> tuple[str | None, str]:
     """Return which capture of a shard was worked on last, and what happened to it."""
-    path = job.folder.path / "marks" / f"{shard:05d}.json"
     try:
-        text = read_bytes("build", path, max_bytes=_MOST_MARK, error=CacheError)
-        told = json_object(str(path), text, error=CacheError)
+        told = json_object("the mark of a shard", job.folder.marked(shard), error=CacheError)
     except CacheError:  # cut short by the end of its process
         return None, ""
     return told.get("sample_id"), str(told.get("what", ""))
