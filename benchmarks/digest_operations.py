@@ -65,11 +65,13 @@ NEIGHBOR_OPERATIONS = {
     "knn": [{"k": 4}, {"k": 40}],
     "dbscan": [{"eps": 0.03, "min_points": 4}, {"eps": 0.02, "min_points": 7}],
     "estimate_normals": [{"radius": 0.05, "max_neighbors": 12}],
+    "radius_neighbors": [{"radius": 0.03}, {"radius": 0.06, "exclude_self": True}],
     "radius_outlier_mask": [{"radius": 0.03, "min_neighbors": 2}, {"radius": 0.02, "min_neighbors": 6}],
     "statistical_outlier_mask": [{"num_neighbors": 6, "std_ratio": 1.0}],
 }
 CLOUD_OPERATIONS = {
     "farthest_point_sample": [{"num_samples": 20}],
+    "farthest_point_groups": [{"ratio": 0.2}],
     "find_voxel_size": [{"num_points": 12}],
     "ransac_plane": [
         {"distance": 0.01, "num_hypotheses": 100},

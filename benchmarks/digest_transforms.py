@@ -123,6 +123,7 @@ EXAMPLES: dict[str, list[Example]] = {
     ],
     "RandomColorJitter": _of("RandomColorJitter", {}, {"brightness": 0.9, "hue": 0.5}),
     "RandomColumn": _of("RandomColumn", {"size": 0.15, "min_points": 3}),
+    "RandomFarthestPointSample": _of("RandomFarthestPointSample", {"num_points": 32, "color_weight": 0.1}),
     "RandomFlip": _of("RandomFlip", {}, {"probability": (0.5, 0.5, 0.5), "about": "centroid"}),
     "RandomJitter": _of("RandomJitter", {}, {"sigma": 0.0001, "clip": None}),
     "RandomPointCount": _of(

@@ -49,6 +49,7 @@ _HOMES = {
         "RandomApply",
         "RandomColorJitter",
         "RandomColumn",
+        "RandomFarthestPointSample",
         "RandomFlip",
         "RandomJitter",
         "RandomPointCount",

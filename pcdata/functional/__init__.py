@@ -1,9 +1,9 @@
 """Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
-decimated, resized and filled depth, disparity, Chamfer distance. None flow through decisions (indices, masks, labels,
-planes, sizes, the neighbors and distances of a search), nor through estimated normals, ``register_depth``,
-``spatial_filter`` and TSDF volumes. The distance of neighbors with a gradient is that of the rows that a search named.
+decimated, resized and filled depth, disparity, Chamfer distance, distances of neighbors. None flow through decisions
+(indices, masks, labels, planes, sizes, which points are neighbors), nor through estimated normals, ``register_depth``,
+``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.clusters import dbscan
@@ -17,11 +17,11 @@ from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import chamfer_distance
-from pcdata.functional.neighbors import ball_query, knn
+from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.sampling import farthest_point_sample, random_sample_index
+from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_downsample,
@@ -47,6 +47,7 @@ __all__ = [
     "disparity_to_depth",
     "distort_normalized",
     "estimate_normals",
+    "farthest_point_groups",
     "farthest_point_sample",
     "fill_holes",
     "fill_rows",
@@ -56,6 +57,7 @@ __all__ = [
     "orient_normals",
     "pixel_rays",
     "project_points",
+    "radius_neighbors",
     "radius_outlier_mask",
     "random_sample_index",
     "range_to_depth",

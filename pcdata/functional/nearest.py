@@ -27,11 +27,11 @@ def rooted(squared: Tensor) -> Tensor:
 
 @inner
 def nearest_chunks(
-    points: Tensor,  # (N, 3) float32
+    points: Tensor,  # (N, D) float32
     ptr: Tensor,  # (B+1,)
     k: int,
     *,
-    queries: Tensor | None = None,  # (Q, 3) float32; None = the points
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points
     queries_ptr: Tensor | None = None,  # (B+1,)
     radius: float | None = None,
     backend: str = "auto",
@@ -74,15 +74,26 @@ def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tenso
         at_once = max(1, _PAIRS // max(1, stop - start))
         for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(at_once):
             if len(query):
-                yield _Pairs(query, row, squared_distance(queries[query, None], points[start:stop]))
+                yield _Pairs(query, row, _all_squared(queries[query], points[start:stop]))
+
+
+def _all_squared(queries: Tensor, points: Tensor) -> Tensor:
+    """Return the (m, n) squared distances of all pairs, column by column: never (m, n, D) numbers at once."""
+    total = torch.zeros((len(queries), len(points)), dtype=queries.dtype, device=queries.device)
+    for a, b in zip(queries.unbind(1), points.unbind(1)):
+        offset = a[:, None] - b
+        total += offset.mul_(offset)
+    return total
 
 
 def squared_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Return the squared distance between (..., 3) points of two tensors that broadcast."""
+    """Return the squared distance between (..., D) points of two tensors that broadcast."""
     return sum_of_squares(a - b)
 
 
 def sum_of_squares(offset: Tensor) -> Tensor:
-    """Return ((x*x)+(y*y))+(z*z) of (..., 3) offsets: separate operations in this order, so all backends agree."""
-    square = offset * offset
-    return (square[..., 0] + square[..., 1]) + square[..., 2]
+    """Return ((x*x)+(y*y))+(z*z) of (..., 3) offsets, and so on: separate operations in this order on all backends."""
+    total, *others = (offset * offset).unbind(-1)
+    for square in others:
+        total = total + square
+    return total

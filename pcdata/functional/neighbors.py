@@ -1,45 +1,105 @@
 """Nearest neighbors and neighbors within a radius, exact, on ragged batches.
 
-One convention for all: a point counts itself; squared distance is ((dx*dx)+(dy*dy))+(dz*dz) in float32; neighbors
-ascend by (squared distance, row), so equal distances go to the lowest row; missing neighbors are padded with distance
-infinity and row N, which makes a gather without a mask fail loudly instead of taking the last point (SciPy's choice).
-Squared distances must fit in float32: points more than 1.8e19 apart are never neighbors.
+One convention for all: a point counts itself unless ``exclude_self``; squared distance is ((dx*dx)+(dy*dy))+(dz*dz) in
+float32, and so on for more columns; neighbors ascend by (squared distance, row), so equal distances go to the lowest
+row; missing neighbors are padded with distance infinity and row N, which makes a gather without a mask fail loudly
+instead of taking the last point (SciPy's choice). Squared distances must fit in float32: points more than 1.8e19 apart
+are never neighbors.
+
+Which points are neighbors is a decision; their distances carry the gradient of the formula to points and queries, 0
+where a distance is 0.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import checked_count, checked_length
+from pcdata.contracts.dispatch import inner, op
+from pcdata.contracts.numbers import checked_count, require_length
+from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
-from pcdata.functional.nearest import nearest_chunks, rooted
+from pcdata.functional.nearest import nearest_chunks, rooted, squared_distance
+from pcdata.functional.rows import ptr_from_counts
+
+# Neighbors of a query that radius_neighbors asks for at first, and places in a table that it fills at once.
+_FIRST, _PLACES = 32, 1 << 22
+
+
+@inner
+def nearest_rows(
+    points: Tensor,  # (N, D) float32
+    ptr: Tensor,  # (B+1,)
+    k: int,
+    *,
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points
+    queries_ptr: Tensor | None = None,
+    radius: float | None = None,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:  # index (Q, k) int64, distance (Q, k) float32
+    """Find the k nearest points of its own cloud (with d < radius) for every query; padding is (N, infinity)."""
+    return laid_out(
+        nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius, backend="torch"),
+        len(points if queries is None else queries),
+        k,
+        points.device,
+    )
+
+
+def laid_out(chunks: Any, num_queries: int, k: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Put the neighbors that chunks name into (Q, k) rows and distances."""
+    index = torch.empty((num_queries, k), dtype=torch.int64, device=device)
+    distance = torch.empty((num_queries, k), dtype=torch.float32, device=device)
+    for query, squared, nearest in chunks:
+        index[query] = nearest
+        distance[query] = rooted(squared)
+    return index, distance
+
+
+def checked_radius(where: str, name: str, arguments: Any) -> float | Tensor:
+    """Require a positive length for all queries, or one per query (Q,)."""
+    value = arguments[name]
+    if not isinstance(value, Tensor) or value.ndim == 0:
+        value = value.item() if isinstance(value, Tensor) else value
+        require_length(where, name, value)
+        return float(value)
+    queries = arguments["points"] if arguments["queries"] is None else arguments["queries"]
+    if value.shape != (len(queries),):
+        raise ShapeError(f"{where}: {name} must be one number or one per query ({len(queries)},), {tuple(value.shape)}")
+    if not value.dtype.is_floating_point:
+        raise DTypeError(f"{where}: {name} must be float, not {value.dtype}")
+    for extreme in [value.min().item(), value.max().item()] if len(value) else []:
+        require_length(where, name, extreme)
+    return value.detach().to(device=queries.device, dtype=torch.float32)
 
 
 @op(
-    points="N 3",
+    points="N D",
     ptr="ptr N B",
-    queries="Q 3",
+    queries="Q D",
     queries_ptr="ptr Q B",
     k=checked_count,
     grid=checked_grid,
-    steps=(nearest_chunks,),
-    gradient=False,
+    steps=(nearest_rows,),
 )
 def knn(
-    points: Tensor,  # (N, 3) float32
+    points: Tensor,  # (N, D) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
     *,
     k: int,
-    queries: Tensor | None = None,  # (Q, 3) float32; None = the points themselves
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
     queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    exclude_self: bool = False,
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # index (Q, k) int64 rows of points; distance (Q, k) float32
     """Find the k nearest points of its own cloud for every query.
 
-    A cloud with fewer than k points fills the rest with index N and distance infinity. Distances carry no gradient.
+    A cloud with fewer than k points fills the rest with index N and distance infinity. Any number of columns will do;
+    three are searched by trees and image windows, others by looking at all pairs of a cloud.
 
     Args:
         points: the clouds to search, in any unit of length; distances are in the same unit.
@@ -47,43 +107,37 @@ def knn(
         k: neighbors per query, the point itself included when the queries are the points.
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
+        exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
-        ConfigError: k is less than 1.
+        ConfigError: k is less than 1, or exclude_self with other queries.
     """
     assert ptr is not None  # @op fills it
-    num_queries = len(points if queries is None else queries)
-    index = torch.empty((num_queries, k), dtype=torch.int64, device=points.device)
-    distance = torch.empty((num_queries, k), dtype=torch.float32, device=points.device)
-    searches = nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, backend=backend)
-    for query, squared, nearest in searches:
-        index[query] = nearest
-        distance[query] = rooted(squared)
-    return index, distance
+    return _neighbors("knn", points, ptr, k, queries, queries_ptr, None, exclude_self, grid, backend)
 
 
 @op(
-    points="N 3",
+    points="N D",
     ptr="ptr N B",
-    queries="Q 3",
+    queries="Q D",
     queries_ptr="ptr Q B",
-    radius=checked_length,
+    radius=checked_radius,
     max_neighbors=checked_count,
     grid=checked_grid,
-    steps=(nearest_chunks,),
-    gradient=False,
+    steps=(nearest_rows,),
 )
 def ball_query(
-    points: Tensor,  # (N, 3) float32
+    points: Tensor,  # (N, D) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
     *,
-    radius: float,
+    radius: float | Tensor,  # or (Q,) float
     max_neighbors: int,
-    queries: Tensor | None = None,  # (Q, 3) float32; None = the points themselves
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
     queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    exclude_self: bool = False,
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # index (Q, m) int64; distance (Q, m) float32; count (Q,) int64
@@ -95,27 +149,168 @@ def ball_query(
     Args:
         points: the clouds to search, in any unit of length.
         ptr: row pointers of the points.
-        radius: in the unit of the points.
+        radius: in the unit of the points; one, or one per query.
         max_neighbors: at most this many per query, the point itself included when the queries are the points.
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
+        exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
-        ConfigError: the radius is not a positive length, or max_neighbors is less than 1.
+        ConfigError: the radius is not a positive length, max_neighbors is less than 1, or exclude_self with other
+            queries.
     """
     assert ptr is not None  # @op fills it
-    num_queries = len(points if queries is None else queries)
-    index = torch.empty((num_queries, max_neighbors), dtype=torch.int64, device=points.device)
-    distance = torch.empty((num_queries, max_neighbors), dtype=torch.float32, device=points.device)
-    count = torch.empty(num_queries, dtype=torch.int64, device=points.device)
-    searches = nearest_chunks(
-        points, ptr, max_neighbors, queries=queries, queries_ptr=queries_ptr, radius=radius, backend=backend
+    found = _neighbors(
+        "ball_query", points, ptr, max_neighbors, queries, queries_ptr, radius, exclude_self, grid, backend
     )
-    for query, squared, nearest in searches:
-        index[query] = nearest
-        distance[query] = rooted(squared)
-        count[query] = squared.isfinite().sum(1)
-    return index, distance, count
+    return *found, (found[0] < len(points)).sum(1)
+
+
+@op(
+    points="N D",
+    ptr="ptr N B",
+    queries="Q D",
+    queries_ptr="ptr Q B",
+    radius=checked_radius,
+    grid=checked_grid,
+    steps=(nearest_rows,),
+)
+def radius_neighbors(
+    points: Tensor,  # (N, D) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    radius: float | Tensor,  # or (Q,) float
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
+    queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    exclude_self: bool = False,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # index (E,) int64; distance (E,) float32; neighbors_ptr (Q+1,)
+    """Find *all* points with d < radius for every query: query q has entries neighbors_ptr[q]:neighbors_ptr[q+1].
+
+    As :func:`ball_query`, without a limit and without padding (compressed sparse rows, as Open3D's
+    ``fixed_radius_search``): memory grows with the number of pairs.
+
+    Args:
+        points: the clouds to search, in any unit of length.
+        ptr: row pointers of the points.
+        radius: in the unit of the points; one, or one per query.
+        queries: where to search from.
+        queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
+        exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
+        grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
+        ConfigError: the radius is not a positive length, or exclude_self with other queries.
+    """
+    assert ptr is not None  # @op fills it
+    _require_own_queries("radius_neighbors", exclude_self, queries)
+    asked, asked_ptr = (points, ptr) if queries is None or queries_ptr is None else (queries, queries_ptr)
+    open_ = torch.arange(len(asked), dtype=torch.int64, device=points.device)
+    largest = int((ptr[1:] - ptr[:-1]).max())
+    width, parts = min(_FIRST, max(largest, 1)), []
+    while len(open_):
+        full = []
+        for query in open_.split(max(1, _PLACES // width)):
+            everyone = len(query) == len(asked)
+            own: dict[str, Any] = {}
+            if not everyone or queries is not None:
+                bounds = torch.searchsorted(query, asked_ptr.contiguous())
+                own = {"queries": asked[query].detach(), "queries_ptr": bounds}
+            index, distance = _search(
+                points,
+                ptr,
+                width,
+                own,
+                radius if isinstance(radius, float) else radius[query],
+                grid if everyone else None,
+                backend,
+            )
+            found = index < len(points)
+            more = found[:, -1] & (width < largest)
+            full.append(query[more])
+            place = (found & ~more[:, None]).nonzero()
+            parts.append((query[place[:, 0]], index[place.unbind(1)], distance[place.unbind(1)]))
+        open_, width = torch.cat(full), min(4 * width, largest)
+    query, index, distance = (torch.cat(values) for values in zip(*parts)) if parts else (open_, open_, open_.float())
+    if exclude_self:
+        query, index, distance = (values[index != query] for values in (query, index, distance))
+    order = query.argsort(stable=True)  # entries of one query are from one table, in order
+    query, index, distance = query[order], index[order], distance[order]
+    if _wants_gradient(points, queries):
+        distance = _distance(asked[query], points[index])
+    return index, distance, ptr_from_counts(torch.bincount(query, minlength=len(asked)))
+
+
+def _neighbors(
+    where: str,
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    radius: float | Tensor | None,
+    exclude_self: bool,
+    grid: ImageGrid | None,
+    backend: str,
+) -> tuple[Tensor, Tensor]:
+    _require_own_queries(where, exclude_self, queries)
+    own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
+    index, distance = _search(points, ptr, k + exclude_self, own, radius, grid, backend)
+    if exclude_self:
+        itself = index == torch.arange(len(points), dtype=torch.int64, device=points.device)[:, None]
+        itself[:, -1] |= ~itself.any(1)  # more repeats than were asked for: the last one is too many
+        index, distance = (values[~itself].reshape(-1, k) for values in (index, distance))
+    if _wants_gradient(points, queries) and len(points):
+        found = index < len(points)
+        apart = _distance((points if queries is None else queries)[:, None], points[index.clamp(max=len(points) - 1)])
+        distance = torch.where(found, apart, torch.inf)
+    return index, distance
+
+
+def _search(
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    own: dict[str, Any],
+    radius: float | Tensor | None,
+    grid: ImageGrid | None,
+    backend: str,
+) -> tuple[Tensor, Tensor]:
+    """Search from the points, or from ``own`` queries; a radius per query is cut out of the largest."""
+    points = points.detach()
+    if not isinstance(radius, Tensor):
+        found: tuple[Tensor, Tensor] = nearest_rows(points, ptr, k, **own, radius=radius, grid=grid, backend=backend)
+        return found
+    widest = float(radius.max()) if len(radius) else None
+    index, distance = nearest_rows(points, ptr, k, **own, radius=widest, grid=grid, backend=backend)
+    if not len(points):
+        return index, distance
+    queries = own.get("queries", points)
+    squared = squared_distance(queries[:, None], points[index.clamp(max=len(points) - 1)])
+    outside = squared >= (radius * radius)[:, None]
+    return index.masked_fill(outside, len(points)), distance.masked_fill(outside, torch.inf)
+
+
+def _require_own_queries(where: str, exclude_self: bool, queries: Tensor | None) -> None:
+    if exclude_self and queries is not None:
+        raise ConfigError(
+            f"{where}: exclude_self means nothing for queries of their own; leave queries out, or drop the neighbors "
+            "at distance 0 afterwards"
+        )
+
+
+def _wants_gradient(*tensors: Tensor | None) -> bool:
+    return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    """Return float32 distances of rows with a gradient, 0 where they are 0; the bits are those of the search."""
+    squared = squared_distance(a, b)
+    apart = squared > 0
+    return torch.where(apart, rooted(torch.where(apart, squared, 1.0)), 0.0)

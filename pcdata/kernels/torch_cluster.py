@@ -34,8 +34,8 @@ def unavailable() -> str | None:
     return None
 
 
-@kernel("farthest_point_sample", "torch_cluster")
-def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: list[int]) -> tuple[Tensor, Tensor]:
+@kernel("farthest_rows", "torch_cluster")
+def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     """Sample with ``torch_cluster.fps``, cloud by cloud: it takes a ratio, and writes out of bounds for empty samples.
 
     Raises:
@@ -45,19 +45,20 @@ def farthest_point_sample(points: Tensor, ptr: Tensor, num_samples: list[int]) -
     starts = ptr.tolist()
     picked = [
         start + _sample_cloud(points[start:stop], count, cloud)
-        for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], num_samples, strict=False))
+        for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], counts, strict=False))
     ]
-    return torch.cat(picked), ptr_from_counts(num_samples)
+    return torch.cat(picked)
 
 
 @kernel("ball_query", "torch_cluster")
 def ball_query(
     points: Tensor,
     ptr: Tensor,
-    radius: float,
+    radius: float | Tensor,
     max_neighbors: int,
     queries: Tensor | None,
     queries_ptr: Tensor | None,
+    exclude_self: bool,
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Search with ``torch_cluster.radius``, asking for *all* neighbors, then keep the nearest by the contract's order.
@@ -65,9 +66,13 @@ def ball_query(
     Memory grows with the number of pairs within the radius, unlike the reference.
 
     Raises:
-        BackendError: on CUDA.
+        BackendError: on CUDA; for a radius per query, without the points themselves, or where not in three dimensions.
     """
     _require_cpu("ball_query", points)
+    if isinstance(radius, Tensor) or exclude_self or points.shape[1] != 3:
+        raise BackendError(
+            "ball_query: torch-cluster takes one radius, three coordinates and no exclude_self; use backend='auto'"
+        )
     if queries is None:
         queries, queries_ptr = points, ptr
     assert queries_ptr is not None  # @op fills it

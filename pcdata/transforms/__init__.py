@@ -10,7 +10,13 @@ from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
 from pcdata.transforms.depth_inpainting import InpaintDepth
 from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, ResizeDepth
-from pcdata.transforms.downsample import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
+from pcdata.transforms.downsample import (
+    FarthestPointSample,
+    RandomFarthestPointSample,
+    RandomPointCount,
+    RandomSample,
+    VoxelDownsample,
+)
 from pcdata.transforms.families import SelectTransform, SpatialTransform
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
@@ -55,6 +61,7 @@ __all__ = [
     "RandomApply",
     "RandomColorJitter",
     "RandomColumn",
+    "RandomFarthestPointSample",
     "RandomFlip",
     "RandomJitter",
     "RandomPointCount",

@@ -1,13 +1,14 @@
-"""Fewer points: VoxelDownsample, FarthestPointSample, RandomSample, RandomPointCount."""
+"""Fewer points: VoxelDownsample, samples of points far apart or at random."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
 from torch import Tensor
 
-from pcdata.errors import ConfigError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample
@@ -17,7 +18,7 @@ from pcdata.structures import METRE, PointCloud
 from pcdata.structures.kinds import fillers
 from pcdata.transforms.base import Params, Transform, sample_name
 from pcdata.transforms.families import SelectTransform
-from pcdata.transforms.field_types import Count, Fraction, FromSensor, IfShort, Metres, Unit
+from pcdata.transforms.field_types import Count, Fraction, FromSensor, IfShort, Metres, NonNegative, Unit
 
 
 class VoxelDownsample(Transform):
@@ -120,17 +121,62 @@ class _Sample(SelectTransform, abstract=True):
         return rows.repeat(-(-wanted // len(rows)))[:wanted]
 
 
-class FarthestPointSample(_Sample):
-    """Sample exactly ``num_points`` points, each the farthest from those before it; starts at the first point.
+class _FarthestPoints(_Sample, abstract=True):
+    """A sampler of points far apart, in space alone or in space and color.
 
-    With ``if_short`` repeat or tile, a short cloud's points come again in sampling order.
+    Args:
+        color_weight: how far apart black and pure red count beside a distance of 1 in the cloud's unit; 0 = not at all.
+        balance_labels: every label gets as many points as it has, up to an equal share, in turns by label.
     """
+
+    color_weight: NonNegative = 0.0
+    balance_labels: bool = False
+
+    def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
+        """Where each cloud begins, as farthest_point_sample takes it."""
+        raise NotImplementedError
 
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
         """Sample all clouds in one call."""
+        name = type(self).__name__
+        if self.color_weight and cloud.colors is None:
+            raise DTypeError(f"{name}: color_weight is {self.color_weight} but the cloud has no colors; leave it out")
+        if self.balance_labels and cloud.labels is None:
+            raise DTypeError(f"{name}: balance_labels is on but the cloud has no labels; put ClusterObjects before it")
+        features = cloud.points
+        if self.color_weight and cloud.colors is not None:
+            features = torch.cat([features, self.color_weight * cloud.colors], dim=1)
         asked = torch.tensor(counts, dtype=torch.int64, device=cloud.device)
-        index, ptr = farthest_point_sample(cloud.points, cloud.ptr, num_samples=asked)
+        given = self.starts(cloud, seeds)
+        labels = cloud.labels if self.balance_labels else None
+        index, ptr = farthest_point_sample(features, cloud.ptr, num_samples=asked, labels=labels, **given)
         return list(torch.tensor_split(index, ptr[1:-1].cpu()))
+
+
+class FarthestPointSample(_FarthestPoints):
+    """Sample exactly ``num_points`` points, each the farthest from those before it.
+
+    With ``if_short`` repeat or tile, a short cloud's points come again in sampling order.
+
+    Args:
+        start: row of each cloud to start at, 0 = its first; the last one where a cloud has fewer.
+    """
+
+    start: Annotated[int, Ge(0)] = 0
+
+    def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
+        """Return the row, as far as the clouds have it."""
+        return {"start": (cloud.counts - 1).clamp(min=0, max=self.start)} if self.start else {}
+
+
+class RandomFarthestPointSample(_FarthestPoints):
+    """Sample ``num_points`` points far apart, starting at a random one of each cloud: another covering every time."""
+
+    is_random = True
+
+    def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
+        """Return the seeds that the start is drawn from."""
+        return {"seeds": torch.tensor(seeds, dtype=torch.int64, device=cloud.device)}
 
 
 class RandomSample(_Sample):

@@ -48,7 +48,10 @@ USUAL: Mapping[str, _Usual] = {
     "SplitObjects": _Usual(0.0, 0.7, "most of what is left is in no object: use a larger eps, or other limits of size"),
     # These leave the number that somebody asked for; see _MOST_REPEATS for the other end.
     **dict.fromkeys(
-        ("FarthestPointSample", "RandomSample", "RandomVoxelSample", "VoxelSample", "RandomPointCount"),
+        (
+            *("FarthestPointSample", "RandomFarthestPointSample", "RandomSample", "RandomPointCount"),
+            *("RandomVoxelSample", "VoxelSample"),
+        ),
         _Usual(0.0, 1.0, ""),
     ),
 }

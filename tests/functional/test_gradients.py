@@ -21,13 +21,12 @@ from pcdata.rng import seeded
 # Decisions (indices, masks, labels, planes, sizes) have no derivative; normals, registered and smoothed depth are
 # documented to give none.
 WITHOUT = {
-    "ball_query",
     "dbscan",
     "estimate_normals",
+    "farthest_point_groups",
     "farthest_point_sample",
     "find_voxel_size",
     "flying_pixel_mask",
-    "knn",
     "radius_outlier_mask",
     "ransac_plane",
     "register_depth",
@@ -42,11 +41,14 @@ WITHOUT = {
     "touched_blocks",
 }
 WITH = {
+    "ball_query",
     "chamfer_distance",
     "decimate_depth",
     "deproject_depth",
     "fill_holes",
+    "knn",
     "project_points",
+    "radius_neighbors",
     "resize_depth",
     "voxel_downsample",
 }
@@ -142,6 +144,35 @@ def test_chamfer_distance_has_a_gradient_also_where_the_clouds_touch():
         assert leaf.grad is not None
         assert bool(torch.isfinite(leaf.grad).all())
         assert float(leaf.grad.abs().max()) > 0
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_distances_of_neighbors_have_the_gradient_of_their_formula(columns):
+    points, queries = (torch.rand(count, columns, generator=seeded(count)) for count in (60, 25))
+    queries[:3] = points[:3]  # at distance 0
+    ptr, queries_ptr = torch.tensor([0, 40, 42, 60]), torch.tensor([0, 15, 20, 25])
+    asked = {"queries": queries, "queries_ptr": queries_ptr}
+    found = {
+        "knn": lambda p, q: F.knn(p, ptr, k=4, queries=q, queries_ptr=queries_ptr),
+        "ball": lambda p, q: F.ball_query(p, ptr, radius=0.6, max_neighbors=5, queries=q, queries_ptr=queries_ptr)[:2],
+        "all": lambda p, q: F.radius_neighbors(p, ptr, radius=0.6, queries=q, queries_ptr=queries_ptr)[:2],
+    }
+    for name, search in found.items():
+        leaves = points.clone().requires_grad_(), queries.clone().requires_grad_()
+        index, distance = search(*leaves)
+        assert torch.equal(distance.detach(), search(points, queries)[1]), name
+        there = index < len(points)
+        gradients = torch.autograd.grad(distance[there].square().sum(), leaves)
+        row = index[there]
+        query = there.nonzero()[:, 0]
+        if name == "all":
+            query = F.radius_neighbors(points, ptr, radius=0.6, **asked)[2].diff()
+            query = torch.repeat_interleave(torch.arange(len(queries)), query)
+        offset = 2 * (points[row] - queries[query])
+        wanted = torch.zeros_like(points).index_add(0, row, offset)
+        torch.testing.assert_close(gradients[0], wanted, rtol=1e-4, atol=1e-6)
+        wanted = torch.zeros_like(queries).index_add(0, query, -offset)
+        torch.testing.assert_close(gradients[1], wanted, rtol=1e-4, atol=1e-6)
 
 
 def test_directions_of_length_zero_poison_no_gradient():

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.neighbors import ball_query, knn
+from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
+from pcdata.rng import seeded
 
 
 def brute_force(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor, k: int, radius: float | None = None):
@@ -193,3 +197,57 @@ def test_a_grid_that_does_not_describe_the_points_raises():
             knn(points, k=2, grid=ImageGrid(torch.tensor(pixels), (3, 4), intrinsics))
     restart = ImageGrid(torch.tensor([5, 6, 0, 1]), (3, 4), intrinsics.expand(2, 3, 3))
     knn(points, torch.tensor([0, 2, 4]), k=2, grid=restart)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 5, 6])
+def test_neighbors_in_any_number_of_columns_are_scipys(columns):
+    points, queries = (torch.rand(count, columns, generator=seeded(count)) for count in (300, 40))
+    distance, index = cKDTree(points.double().numpy()).query(queries.double().numpy(), k=7)
+    found, apart = knn(points, k=7, queries=queries)
+    assert torch.equal(found, torch.from_numpy(index))
+    torch.testing.assert_close(apart.double(), torch.from_numpy(distance), rtol=1e-5, atol=1e-6)
+
+
+def test_all_neighbors_within_a_radius_are_scipys_per_query():
+    points, queries = (torch.rand(count, 3, generator=seeded(count)) for count in (900, 60))
+    points[500:] = points[:400]  # repeats, so that tables grow
+    radius = torch.linspace(0.02, 0.6, 60, dtype=torch.float64)
+    index, distance, ptr = radius_neighbors(points, radius=radius, queries=queries)
+    wanted = cKDTree(points.double().numpy()).query_ball_point(
+        queries.double().numpy(), radius.numpy(), return_sorted=True
+    )
+    for query, (start, stop) in enumerate(pairwise(ptr.tolist())):
+        assert sorted(index[start:stop].tolist()) == sorted(wanted[query])
+        assert bool((distance[start:stop].diff() >= 0).all())
+    near, apart, count = ball_query(points, radius=radius, max_neighbors=900, queries=queries)
+    there = near < len(points)
+    assert torch.equal(count, ptr.diff())
+    assert torch.equal(near[there], index)
+    assert torch.equal(apart[there], distance)
+
+
+def test_a_point_is_left_out_of_its_own_neighbors_but_its_repeats_are_not():
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    assert knn(points, k=1, exclude_self=True)[0].tolist() == [[1], [0], [0], [0]]
+    assert knn(points, k=2, exclude_self=True)[0].tolist() == [[1, 2], [0, 2], [0, 1], [0, 1]]
+    index, distance, count = ball_query(points, radius=0.5, max_neighbors=2, exclude_self=True)
+    assert index.tolist() == [[1, 2], [0, 2], [0, 1], [4, 4]]
+    assert count.tolist() == [2, 2, 2, 0]
+    assert distance[3].tolist() == [float("inf")] * 2
+    flat, _, ptr = radius_neighbors(points, radius=0.5, exclude_self=True)
+    assert flat.tolist() == [1, 2, 0, 2, 0, 1]
+    assert ptr.tolist() == [0, 2, 4, 6, 6]
+    for search in (knn, ball_query, radius_neighbors):
+        options = {"k": {"k": 1}, "b": {"radius": 1.0, "max_neighbors": 1}, "r": {"radius": 1.0}}[search.__name__[0]]
+        with pytest.raises(ConfigError, match=rf"^{search.__name__}: exclude_self means nothing"):
+            search(points, queries=points, exclude_self=True, **options)
+
+
+def test_radii_per_query_are_held_to_the_queries():
+    points = torch.rand(9, 3, generator=seeded(0))
+    with pytest.raises(ShapeError, match=r"radius must be one number or one per query \(9,\)"):
+        radius_neighbors(points, radius=torch.ones(8))
+    with pytest.raises(ConfigError, match="radius must be a length"):
+        radius_neighbors(points, radius=torch.zeros(9))
+    with pytest.raises(DTypeError, match="radius must be float"):
+        ball_query(points, radius=torch.ones(9, dtype=torch.int64), max_neighbors=2)

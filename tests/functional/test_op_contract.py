@@ -59,6 +59,22 @@ def with_queries(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "queries": points(count // 2 + 1, seed + 50)}
 
 
+def in_six_dimensions(count: int, seed: int) -> dict[str, Tensor]:
+    return {key: torch.cat([value, value.flip(1)], 1) for key, value in with_queries(count, seed).items()}
+
+
+def with_starts(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "start": torch.tensor([count // 2])}
+
+
+def with_seeds(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "seeds": torch.tensor([seed + 7])}
+
+
+def with_labels(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "labels": torch.randint(-1, 3, (count,), generator=seeded(seed))}
+
+
 def two_clouds(count: int, seed: int) -> dict[str, Tensor]:
     return {"points_a": points(count, seed), "points_b": points(count // 2 + 1, seed + 50)}
 
@@ -106,8 +122,8 @@ class Example:
     """One way to call an operation.
 
     ``gives`` says what each output is, so that outputs of single clouds can be packed as the batch packs them:
-    ``row`` and ``cloud`` values follow one another, ``ptr`` are row pointers, ``index`` are rows of the points (their
-    number stands for none), ``group`` are rows of the output that ``ptr`` cuts.
+    ``row`` and ``cloud`` values follow one another, ``ptr`` are row pointers of clouds and ``rows_ptr`` of rows,
+    ``index`` are rows of the points (their number stands for none), ``group`` are rows of the output that ``ptr`` cuts.
     """
 
     name: str
@@ -126,13 +142,22 @@ EXAMPLES = [
     # Neighborhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
+    Example("farthest_point_sample", with_starts, ("index", "ptr"), {"num_samples": 20}),
+    Example("farthest_point_sample", with_seeds, ("index", "ptr"), {"ratio": 0.3}),
+    Example("farthest_point_sample", with_labels, ("index", "ptr"), {"num_samples": 20}),
+    Example("farthest_point_groups", with_starts, ("index", "ptr", "group", "row"), {"num_samples": 20}),
+    Example("farthest_point_groups", with_seeds, ("index", "ptr", "group", "row"), {"ratio": 0.3}),
     Example("fill_holes", depth_alone, ("row", "row"), {"rule": "nearest"}),
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
     Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
+    Example("knn", in_six_dimensions, ("index", "row"), {"k": 4}),
+    Example("knn", one_cloud, ("index", "row"), {"k": 4, "exclude_self": True}),
     Example("pack_colors", color_image, ("row",)),
     Example("project_points", in_front_of_a_camera, ("row", "row")),
+    Example("radius_neighbors", with_queries, ("index", "row", "rows_ptr"), {"radius": 0.03}),
+    Example("radius_neighbors", one_cloud, ("index", "row", "rows_ptr"), {"radius": 0.06, "exclude_self": True}),
     Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
     Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
     Example("register_depth", beside_a_color_camera, ("row",) * 4, {"color_size": (18, 24)}),
@@ -150,7 +175,7 @@ each_example = pytest.mark.parametrize(
 def row_pointers(example: Example) -> dict[str, str]:
     """Row pointer argument -> the tensor argument whose rows it cuts."""
     specs = {key: parse_spec(text) for key, text in OPERATIONS[example.name].contract.tensors.items()}
-    tensors = {spec.dims[0]: key for key, spec in specs.items() if not spec.is_ptr}
+    tensors = {spec.dims[0]: key for key, spec in reversed(specs.items()) if not spec.is_ptr}
     return {key: tensors[spec.dims[0]] for key, spec in specs.items() if spec.is_ptr}
 
 
@@ -191,6 +216,9 @@ def packed_results(
         values = [result[place] for result in results]
         if kind == "ptr":
             outputs.append(ptr_from_counts([int(value[-1]) for value in values]))
+            continue
+        if kind == "rows_ptr":
+            outputs.append(ptr_from_counts(torch.cat([value.diff() for value in values])))
             continue
         if kind == "index":
             sizes = [len(cloud["points"]) for cloud in clouds]

@@ -80,15 +80,15 @@ def test_the_tree_serves_every_search():
     assert why_unavailable("torch_tree") is None
     served = {name for name, operation in OPERATIONS.items() if operation.serves("torch_tree")}
     searches = {"knn", "ball_query", "chamfer_distance", "statistical_outlier_mask", "radius_outlier_mask"}
-    assert served == searches | {"dbscan", "estimate_normals"}
+    assert served == searches | {"dbscan", "estimate_normals", "radius_neighbors"}
 
 
 def test_looking_at_every_pair_takes_memory_for_a_bounded_number_of_them(monkeypatch):
     import pcdata.functional.nearest as nearest
 
     seen = []
-    distance = nearest.squared_distance
-    monkeypatch.setattr(nearest, "squared_distance", lambda a, b: seen.append(len(a) * len(b)) or distance(a, b))
+    distance = nearest._all_squared
+    monkeypatch.setattr(nearest, "_all_squared", lambda a, b: seen.append(len(a) * len(b)) or distance(a, b))
     points = torch.rand(3000, 3, generator=seeded(3))
     F.knn(points, k=3, backend="torch")
     assert sum(seen) == 3000 * 3000

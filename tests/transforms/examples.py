@@ -79,6 +79,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
+        T.FarthestPointSample(num_points=20, start=70, color_weight=0.1, balance_labels=True),
     ),
     "FillHoles": _of(
         *(T.FillHoles(rule=rule, max_distance=2) for rule in ("left", "farthest", "nearest")),
@@ -123,6 +124,10 @@ EXAMPLES: dict[str, list[Example]] = {
     ],
     "RandomColorJitter": _of(T.RandomColorJitter(), T.RandomColorJitter(brightness=0.9, hue=0.5)),
     "RandomColumn": _of(T.RandomColumn(size=0.15, min_points=3)),
+    "RandomFarthestPointSample": _of(
+        T.RandomFarthestPointSample(num_points=32),
+        T.RandomFarthestPointSample(num_points=100, if_short="repeat", color_weight=0.1, balance_labels=True),
+    ),
     "RandomFlip": _of(T.RandomFlip(), T.RandomFlip(probability=(0.5, 0.5, 0.5), about="centroid")),
     "RandomJitter": [
         Example(T.RandomJitter(), displacement=0.005 * math.sqrt(3)),

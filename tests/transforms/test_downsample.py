@@ -3,11 +3,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pcdata.errors import ConfigError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms import FarthestPointSample, RandomPointCount, RandomSample, VoxelDownsample
+from pcdata.transforms import (
+    FarthestPointSample,
+    RandomFarthestPointSample,
+    RandomPointCount,
+    RandomSample,
+    VoxelDownsample,
+)
 from tests.factories import cloud_in_base
 
 # -- voxels --------------------------------------------------------------------------------------------------------
@@ -93,6 +99,30 @@ def test_farthest_points_come_in_picking_order_from_the_first_point_on():
     index, _ = farthest_point_sample(cloud.points, num_samples=25)
     assert torch.equal(FarthestPointSample(num_points=25)(cloud).extra["row"], index)
     assert int(index[0]) == 0
+
+
+def test_a_start_that_a_cloud_does_not_have_is_its_last_row():
+    result = FarthestPointSample(num_points=3, start=40)(cloud_in_base((120, 33, 150)))
+    assert result.extra["row"][::3].tolist() == [40, 120 + 32, 153 + 40]
+
+
+def test_colors_spread_the_samples_too():
+    cloud = cloud_in_base((60,))
+    features = torch.cat([cloud.points, 2.0 * cloud.colors], 1)
+    index, _ = farthest_point_sample(features, num_samples=9)
+    assert torch.equal(FarthestPointSample(num_points=9, color_weight=2.0)(cloud).extra["row"], index)
+    with pytest.raises(DTypeError, match=r"color_weight is 2\.0 but the cloud has no colors"):
+        FarthestPointSample(num_points=9, color_weight=2.0)(cloud.with_fields(colors=None))
+    with pytest.raises(DTypeError, match="balance_labels is on but the cloud has no labels"):
+        FarthestPointSample(num_points=9, balance_labels=True)(cloud.with_fields(labels=None))
+
+
+def test_a_random_start_is_another_point_every_time():
+    starts = {
+        int(sample(RandomFarthestPointSample, cloud_in_base((120,)), seed, num_points=1).extra["row"])
+        for seed in range(20)
+    }
+    assert len(starts) > 10
 
 
 @pytest.mark.parametrize("cls", SAMPLERS)

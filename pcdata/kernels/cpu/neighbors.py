@@ -7,15 +7,13 @@ same order, the same masks.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 # The operations must be registered before their kernels.
 import pcdata.functional.clusters
 import pcdata.functional.outliers  # noqa: F401
-from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud
 from pcdata.functional.radius import largest_squared, require_cells
@@ -25,41 +23,23 @@ from pcdata.kernels.cpu.native import call, room
 _MAX_ROWS = 2**31 - 1
 
 
-@kernel("knn", "cpu")
-def knn(
-    *,
+@kernel("nearest_rows", "cpu")
+def nearest_rows(
     points: Tensor,
     ptr: Tensor,
     k: int,
-    queries: Tensor | None,
-    queries_ptr: Tensor | None,
-    grid: ImageGrid | None,
-) -> tuple[Tensor, Tensor]:
-    """Run the reference's contract in the core."""
-    if k > _MAX_ROWS:
-        return _reference("knn", points, ptr, k=k, queries=queries, queries_ptr=queries_ptr, grid=grid)
-    index, distance, _ = _neighbors(points, ptr, k, None, queries, queries_ptr, grid, counted=False)
-    return index, distance
-
-
-@kernel("ball_query", "cpu")
-def ball_query(
     *,
-    points: Tensor,
-    ptr: Tensor,
-    radius: float,
-    max_neighbors: int,
-    queries: Tensor | None,
-    queries_ptr: Tensor | None,
-    grid: ImageGrid | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Run the reference's contract in the core."""
-    if max_neighbors > _MAX_ROWS:
-        limits = {"radius": radius, "max_neighbors": max_neighbors}
-        return _reference("ball_query", points, ptr, **limits, queries=queries, queries_ptr=queries_ptr, grid=grid)
-    index, distance, count = _neighbors(points, ptr, max_neighbors, radius, queries, queries_ptr, grid, counted=True)
-    assert count is not None
-    return index, distance, count
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    radius: float | None = None,
+    grid: ImageGrid | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Run the reference's contract in the core; it knows three coordinates."""
+    if k > _MAX_ROWS or points.shape[1] != 3:
+        others = {"queries": queries, "queries_ptr": queries_ptr, "radius": radius, "grid": grid}
+        found: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
+        return found
+    return _neighbors(points, ptr, k, radius, queries, queries_ptr, grid)
 
 
 @kernel("chamfer_distance", "cpu")
@@ -105,9 +85,7 @@ def _neighbors(
     queries: Tensor | None,
     queries_ptr: Tensor | None,
     grid: ImageGrid | None,
-    *,
-    counted: bool,
-) -> tuple[Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor]:
     points, ptr = _rows(points, ptr)
     num_queries = len(points)
     if queries is not None:
@@ -116,13 +94,12 @@ def _neighbors(
         num_queries = len(queries)
     index = room((num_queries, k), torch.int64)
     distance = room((num_queries, k), torch.float32)
-    count = room(num_queries, torch.int64) if counted else None
     call(
         "pc_neighbors",
         *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, _limit(radius)),
-        *(*_grid_arguments(grid), index, distance, count),
+        *(*_grid_arguments(grid), index, distance, None),
     )
-    return index, distance, count
+    return index, distance
 
 
 def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool) -> Tensor:
@@ -143,10 +120,6 @@ def _rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
 def _reachable(count: int, points: Tensor) -> int:
     """Return a number of neighbors that gives the same answer and fits the 31 bits of the core."""
     return min(count, max(1, len(points)))
-
-
-def _reference(operation: str, *args: Any, **kwargs: Any) -> Any:
-    return OPERATIONS[operation].reference(*args, **kwargs)
 
 
 def _limit(radius: float | None) -> float:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import pcdata.functional.planes
 import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
-from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
 from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
@@ -19,14 +19,15 @@ from pcdata.kernels.cpu.native import call, numbers, room
 _MAX_ROWS = 2**31 - 1
 
 
-@kernel("farthest_point_sample", "cpu")
-def farthest_point_sample(points: Tensor, ptr: Tensor, *, num_samples: list[int]) -> tuple[Tensor, Tensor]:
-    """Visit only the points that a pick can change."""
-    if _too_long(ptr):
-        return _reference("farthest_point_sample", points, ptr, num_samples=num_samples)
-    picks, counts = room(sum(num_samples), torch.int64), numbers(num_samples)
-    call("pc_farthest_points", points, ptr, len(num_samples), counts, picks)
-    return picks.add_(torch.repeat_interleave(ptr[:-1], counts)), ptr_from_counts(counts)
+@kernel("farthest_rows", "cpu")
+def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
+    """Visit only the points that a pick can change; the core knows three coordinates."""
+    if points.shape[1] != 3 or _too_long(ptr):
+        rows: Tensor = INNER["farthest_rows"].reference(points, ptr, counts)
+        return rows
+    picks, wanted = room(sum(counts), torch.int64), numbers(counts)
+    call("pc_farthest_points", points.contiguous(), ptr.contiguous(), len(counts), wanted, picks)
+    return picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
 
 
 @kernel("voxel_downsample", "cpu")

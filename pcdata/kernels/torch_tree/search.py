@@ -14,8 +14,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import kernel
+from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
+from pcdata.functional.neighbors import laid_out
 from pcdata.functional.radius import largest_squared
 from pcdata.functional.rows import cloud_of_rows
 from pcdata.kernels.torch_tree.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
@@ -34,8 +36,13 @@ def nearest_chunks(
     queries_ptr: Tensor | None = None,  # (B+1,)
     radius: float | None = None,
 ) -> Iterator[Neighbors]:
-    """Search the tree of the points with groups of queries."""
+    """Search the tree of the points with groups of queries; the tree knows three coordinates."""
     points = points.detach()
+    if points.shape[1] != 3:
+        yield from INNER["nearest_chunks"].reference(
+            points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius
+        )
+        return
     foreign = queries is not None
     leaves: Leaves | None = None
     if queries is None or queries_ptr is None:
@@ -49,6 +56,22 @@ def nearest_chunks(
     if leaves is None:
         tree, leaves, home = _build_together(points, ptr, queries.detach(), queries_ptr, max_copies=k)
     yield from _Search(tree, leaves, home, foreign, k, largest_squared(radius, points.device)).run()
+
+
+@kernel("nearest_rows", "torch_tree")
+def nearest_rows(
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    *,
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    radius: float | None = None,
+    grid: ImageGrid | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Lay out what the tree finds; a grid of pixels would tell it nothing."""
+    chunks = nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius)
+    return laid_out(chunks, len(points if queries is None else queries), k, points.device)
 
 
 def _build_together(

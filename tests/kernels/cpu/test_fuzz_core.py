@@ -188,7 +188,7 @@ def check(name: str, points: Tensor, *args: Any, exact: bool = True, **kwargs: A
         assert ours == theirs, name
         return
     for place, (a, b) in enumerate(zip(ours, theirs, strict=True)):
-        assert not a.requires_grad
+        assert OPERATIONS[name].gradient or not a.requires_grad
         assert a.shape == b.shape, (name, place)
         assert a.dtype == b.dtype, (name, place)
         if exact:
@@ -235,6 +235,8 @@ def fuzz_queries(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> None:
     foreign = {"queries": strided(rng, queries), "queries_ptr": ptr_from_counts(counts)}
     check("knn", points, ptr, k=int(rng.choice([1, 5, 60])), **foreign)
     check("ball_query", points, ptr, radius=float(rng.choice([0.1, 10.0])), max_neighbors=7, **foreign)
+    reach = torch.from_numpy(rng.choice([1e-3, 0.1, 10.0], len(queries)))
+    check("radius_neighbors", points, ptr, radius=reach, **foreign)
     check("chamfer_distance", points, ptr, queries, foreign["queries_ptr"], exact=False)
 
 
@@ -242,6 +244,8 @@ def fuzz_samples(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> None:
     seen = strided(rng, points)
     counts = (ptr[1:] - ptr[:-1]).tolist()
     check("farthest_point_sample", seen, ptr, num_samples=[int(rng.integers(0, count + 1)) for count in counts])
+    start = torch.tensor([int(rng.integers(max(count, 1))) for count in counts])
+    check("farthest_point_groups", seen, ptr, ratio=float(rng.choice([0.05, 1.0])), start=start)
     check("voxel_downsample", seen, ptr, voxel_size=float(rng.choice([1e-3, 0.05, 0.7, 1e3])))
     check("find_voxel_size", seen, ptr, num_points=int(rng.choice([1, 2, 10])))
     if min(counts) >= 3:
