@@ -215,7 +215,13 @@ def files_of(folder: Path, *, leave_out: tuple[str, ...] = ()) -> dict[str, byte
 
 # -- stores ------------------------------------------------------------------------------------------------------------
 
-STORED = {"hdf5": ("none", "lzf", "gzip"), "npz": ("none", "gzip"), "packed": ("none",), "pt": ("none",)}
+STORED = {
+    "hdf5": ("none", "lzf", "gzip"),
+    "npz": ("none", "gzip"),
+    "packed": ("none",),
+    "pt": ("none",),
+    "webdataset": ("none",),
+}
 CONFIG = """\
 depth: [MaskDepth: {near: 0.2, far: 3.0}, Deproject]
 cloud:

@@ -67,7 +67,7 @@ def test_what_fails_in_a_worker_reaches_the_parent_with_its_place(source, num_wo
     assert place(again) == (step, source.ids[1])
 
 
-@pytest.mark.parametrize("format", ["hdf5", "npz", "packed", "pt"])
+@pytest.mark.parametrize("format", ["hdf5", "npz", "packed", "pt", "webdataset"])
 def test_a_broken_file_of_a_dataset_is_named(source, tmp_path, format):
     config = config_from_yaml(f"depth: [Deproject]\noutput: {{format: {format}}}")
     build_dataset(config, source, tmp_path / "out")

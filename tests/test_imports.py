@@ -328,7 +328,9 @@ def test_stores_collates_and_targets_of_ones_own_are_used_by_their_names(tmp_pat
     assert 'collate_fn=COLLATES["counts"]' in script.replace("'", '"')
     assert "--import FILE.py, for others.py" in script
     forget()
-    with pytest.raises(CacheError, match=r"format must be one of hdf5, npz, packed, pt, got 'own'.*--import"):
+    with pytest.raises(
+        CacheError, match=r"format must be one of hdf5, npz, packed, pt, webdataset, got 'own'.*--import"
+    ):
         Manifest.read(out)
 
 

@@ -43,7 +43,7 @@ CHECKS = (
     "color_on_depth",
     "pose_direction_over_time",
 )
-FORMATS = ("hdf5", "npz", "packed", "pt")
+FORMATS = ("hdf5", "npz", "packed", "pt", "webdataset")
 SPLIT_RULES = ("sample", "episode", "folder", "id:REGEX", "column:NAME", "signal:NAME", "meta:NAME")
 PUBLISHED_SPLITS = ("graspnet",)
 WEIGHTINGS = ("constant", "inverse_square", "angle")

@@ -18,7 +18,7 @@ from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.sample_keys import key_of
 from tests.io.forged import first_shard
 
-FORMATS = ["hdf5", "npz", "packed", "pt"]
+FORMATS = ["hdf5", "npz", "packed", "pt", "webdataset"]
 
 
 class Clouds:

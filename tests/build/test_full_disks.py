@@ -35,7 +35,9 @@ def clouds(count: int) -> Clouds:
 PLAIN = "cloud: [Center]\n"
 
 
-@pytest.mark.parametrize("form", ["hdf5", "hdf5, compression: gzip", "npz", "npz, compression: gzip", "packed", "pt"])
+@pytest.mark.parametrize(
+    "form", ["hdf5", "hdf5, compression: gzip", "npz", "npz, compression: gzip", "packed", "pt", "webdataset"]
+)
 @pytest.mark.parametrize("size", [0, 700, 5_000, 30_000])
 def test_a_file_that_cannot_grow_is_one_error_and_leaves_nothing(tmp_path, form, size):
     from pcdata.build import config_from_yaml

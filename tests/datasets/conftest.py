@@ -39,6 +39,6 @@ def config():
 def caches(source, tmp_path_factory) -> dict[str, Path]:
     """A built dataset per format."""
     root = tmp_path_factory.mktemp("caches")
-    for form in ("hdf5", "npz", "packed", "pt"):
+    for form in ("hdf5", "npz", "packed", "pt", "webdataset"):
         build_dataset(config_from_yaml(f"{PIPELINE}output: {{format: {form}}}\n"), source, root / form)
-    return {form: root / form for form in ("hdf5", "npz", "packed", "pt")}
+    return {form: root / form for form in ("hdf5", "npz", "packed", "pt", "webdataset")}

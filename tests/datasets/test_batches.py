@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import pickle
@@ -41,7 +42,7 @@ depth: [Deproject]
 cloud: [ToFrame: {frame: base}, FarthestPointSample: {num_points: 16}]
 augment: [RandomRotation: {degrees: 180}, RandomJitter: {sigma: 0.01}, RandomPointDropout: {low: 0.1, high: 0.5}]
 """
-FORMATS = ("npz", "packed")  # one that reads records one by one, and one that reads them as one
+FORMATS = ("npz", "packed", "webdataset")  # one that reads records one by one, and two that read them as one
 
 
 @pytest.fixture(scope="module")
@@ -245,6 +246,7 @@ def test_a_sample_is_compared_once_for_a_file_and_again_for_another_file_of_its_
 def test_shards_that_were_read_keep_no_file_open(stores):
     dataset = CachedCloudDataset(stores["packed"])
     assert dataset.manifest.index.num_shards > 3
+    gc.collect()  # what earlier tests left
     before = len(os.listdir("/proc/self/fd"))
     dataset.__getitems__(range(len(dataset)))
     assert len(os.listdir("/proc/self/fd")) == before

@@ -19,7 +19,7 @@ from pcdata.transforms import Compose, MaskDepth, RandomJitter, RemoveRadiusOutl
 from tests.io.forged import edit_samples, first_shard
 from tests.messages import told
 
-FORMATS = ["hdf5", "npz", "packed", "pt"]
+FORMATS = ["hdf5", "npz", "packed", "pt", "webdataset"]
 
 
 class FixedSource:

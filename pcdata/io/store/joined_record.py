@@ -23,12 +23,7 @@ def split_info(record: Record) -> tuple[dict[str, Any], str, str]:
 
     Together they are all of them.
     """
-    own: dict[str, Any] = {name: record.info[name] for name in _OWN if name in record.info}
-    common = {name: value for name, value in record.info.items() if name not in _OWN}
-    signals = common.get("signals", [])
-    own["texts"] = [entry.get("texts") for entry in signals]
-    if signals:
-        common["signals"] = [{name: one for name, one in entry.items() if name != "texts"} for entry in signals]
+    common, own = common_and_own(record.info)
     text = record.info_text()
     if Record({}, merged_info(common, own)).info_text() != text:  # not what is usual; told when it is read
         return {}, text, ""
@@ -38,6 +33,17 @@ def split_info(record: Record) -> tuple[dict[str, Any], str, str]:
         else ""
     )
     return common, json.dumps(own, sort_keys=True, separators=(",", ":"), allow_nan=False), history
+
+
+def common_and_own(info: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the facts that a sample has in common with others, and its own."""
+    own: dict[str, Any] = {name: info[name] for name in _OWN if name in info}
+    common = {name: value for name, value in info.items() if name not in _OWN}
+    signals = common.get("signals", [])
+    own["texts"] = [entry.get("texts") for entry in signals]
+    if signals:
+        common["signals"] = [{name: one for name, one in entry.items() if name != "texts"} for entry in signals]
+    return common, own
 
 
 def own_info(text: bytes, history: bytes) -> dict[str, Any]:
