@@ -16,8 +16,8 @@ from pcdata.build.card_answers import CardAnswers
 from pcdata.build.card_facts import CardFacts
 from pcdata.build.card_text import card_text
 from pcdata.build.croissant import croissant_text
+from pcdata.build.written_texts import edited_texts, write_texts
 from pcdata.errors import ConfigError
-from pcdata.files.opening import replacing
 
 README, CROISSANT = "README.md", "croissant.json"
 CARD_FILES = (README, CROISSANT, ANSWERS)
@@ -28,6 +28,7 @@ def write_card(
     answers: Mapping[str, str | None] | None = None,
     *,
     strict: bool = False,
+    overwrite: bool = False,
 ) -> list[str]:
     """Write the card of a dataset anew, as after a split; return what is not known, and how to say it.
 
@@ -35,9 +36,11 @@ def write_card(
         folder: the dataset.
         answers: fields of :class:`~pcdata.build.card_answers.CardAnswers` by name; they are kept in ``card.yaml``.
         strict: write nothing where something is not known.
+        overwrite: also what somebody edited by hand.
 
     Raises:
-        ConfigError: a name or a value that is no answer; with ``strict`` something is not known: names it all.
+        ConfigError: a name or a value that is no answer; with ``strict`` something is not known: names it all; a file
+            of the card was edited by hand.
         CacheError: the dataset is damaged.
         WriteError: a file cannot be written.
     """
@@ -46,13 +49,16 @@ def write_card(
     given = {name: value for name, value in (answers or {}).items() if value is not None}
     if given:
         said = said.with_others(vars(CardAnswers.of("card", given)))
+    if not overwrite and (edited := [name for name in edited_texts(folder) if name in (README, CROISSANT)]):
+        raise ConfigError(
+            f"card: {' and '.join(edited)} of {folder} {'were' if len(edited) > 1 else 'was'} edited by hand, which "
+            "would be lost; keep a copy elsewhere and allow overwriting (--overwrite)"
+        )
     facts = CardFacts.of(folder, said)
     missing = facts.missing()
     if strict and missing:
         raise ConfigError("card: these are not known, and strict wants all of them:\n" + "\n".join(missing))
     if given:
         said.write(folder / ANSWERS)
-    for name, text in ((README, card_text(facts)), (CROISSANT, croissant_text(facts))):
-        with replacing("card", folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_texts(folder, {README: card_text(facts), CROISSANT: croissant_text(facts)})
     return missing

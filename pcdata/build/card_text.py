@@ -135,7 +135,7 @@ def _coordinates(facts: CardFacts) -> list[str]:
 
 def _splits(facts: CardFacts) -> list[str]:
     if facts.splits is None:
-        return ["## Splits", "None yet: `pcdata split DATASET` draws them, and `pcdata card DATASET` tells them here."]
+        return ["## Splits", "None yet: `pcdata split DATASET` draws them and tells them here."]
     splits = facts.splits
     rows = [(name, len(splits.groups[name]), len(splits.ids(name))) for name in splits.names]
     drawn = ", ".join(f"{name}: {value}" for name, value in splits.settings.items())

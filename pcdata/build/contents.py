@@ -9,6 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from pcdata.build.card import CARD_FILES
+from pcdata.build.written_texts import FILE_NAME as TEXTS
+from pcdata.build.written_texts import edited_texts
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError
 from pcdata.io.store.manifest import FILE_NAME, Manifest
@@ -19,7 +21,7 @@ from pcdata.io.store.shards import FOLDER as SHARDS
 from pcdata.io.store.shards import SIGNALS_FOLDER, SIGNALS_KEY, TABLE, shard_folder
 from pcdata.io.store.stores import STORES
 
-_TOP = {FILE_NAME, "pipeline.yaml", "load.py", SPLITS, *CARD_FILES}
+_TOP = {FILE_NAME, "pipeline.yaml", "load.py", SPLITS, TEXTS, *CARD_FILES}
 _LITTER = {"__pycache__", ".DS_Store", "Thumbs.db"}
 _IN_VIEW = re.compile(  # what write_capture writes below raw/KEY of a shard
     r"|view[0-9]+(/intrinsics\.json|/depth(/0\.(png|npy))?|/(labels|masks|color|confidence)(/0\.png)?|/poses(/0\.txt)?)?"
@@ -38,6 +40,7 @@ def check_only_dataset(folder: Path) -> None:
         if not os.path.lexists(folder / FILE_NAME):
             raise CacheError(f"{folder} is not a pcdata dataset, so it is not overwritten; choose another folder")
         foreign = foreign_files(folder, _manifest_of(folder))
+        foreign += [f"{name} (edited by hand)" for name in edited_texts(folder)]
     except OSError as error:
         raise CacheError(f"{folder}: cannot be examined: {error}") from error
     if foreign:

@@ -19,9 +19,10 @@ from pcdata.build.loading_script import loading_script
 from pcdata.build.records import ShardRecord
 from pcdata.build.shard_work import Job, signals_of_shard
 from pcdata.build.source_state import captures_digest
+from pcdata.build.written_texts import write_texts
 from pcdata.datasets.collate import COLLATES
 from pcdata.errors import CacheError, CaptureError, DTypeError, FrameError, ShapeError, write_fault
-from pcdata.files.syncing import sync_file, sync_folder
+from pcdata.files.syncing import sync_folder
 from pcdata.imports import ImportedFile, imported_files, step_names
 from pcdata.io.sources.capture_source import CaptureSource, episodes_of, kinds_of, skipped_of, streams_of
 from pcdata.io.store.cloud_record import record_from_signals
@@ -89,9 +90,7 @@ def complete_dataset(
             },
         )
         script = loading_script(config.loader, config.model, [file.name for file in loading])
-        for name, text in (("pipeline.yaml", config.pipeline.to_yaml()), ("load.py", script)):
-            (dataset / name).write_text(text, encoding="utf-8")
-            sync_file(dataset / name)
+        write_texts(dataset, {"pipeline.yaml": config.pipeline.to_yaml(), "load.py": script})
         manifest.write(dataset)
         for folder in (dataset / FOLDER, dataset):
             sync_folder(folder)

@@ -10,9 +10,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from pcdata.build.card import CROISSANT, README
+from pcdata.build.card_answers import FILE_NAME as ANSWERS
+from pcdata.build.card_answers import CardAnswers
 from pcdata.build.contents import foreign_files
+from pcdata.build.written_texts import FILE_NAME as TEXTS
+from pcdata.build.written_texts import written_texts
 from pcdata.contracts.numbers import whole_number
+from pcdata.datasets.splits import FILE_NAME as SPLITS
+from pcdata.datasets.splits import Splits
 from pcdata.errors import CacheError, ConfigError
+from pcdata.files.opening import read_bytes
+from pcdata.files.strict_json import json_object
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.sample_keys import key_of
 from pcdata.io.store.shards import (
@@ -28,6 +37,7 @@ from pcdata.io.store.shards import (
 from pcdata.io.store.stores import STORES
 from pcdata.progress import Progress
 
+_MAX_BYTES = 1 << 28  # of a card
 _AT_ONCE = 4096  # files that wait for a worker: what is known of them is memory
 
 
@@ -54,23 +64,26 @@ class DatasetVerdict:
 
     Args:
         folder: of the dataset.
-        num_files: that were hashed.
+        num_files: of the shards, that were hashed.
         num_bytes: of these files.
         faults: one for each file that is not what was written; none = all is.
+        notes: what is no fault, in words: texts that were edited by hand, a card that tells of other splits.
     """
 
     folder: Path
     num_files: int
     num_bytes: int
     faults: list[DatasetFault] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def verify_dataset(folder: str | Path, *, workers: int = 1, progress: Progress | None = None) -> DatasetVerdict:
     """Hash every file of a built dataset again, and say which are damaged, missing or foreign.
 
     ``dataset.json`` has a checksum of itself and tells the index, which tells the table of every shard, which tells its
-    files. The texts that a build writes beside (``load.py``, ``pipeline.yaml``) may be edited and are not compared.
-    Where a file holds many samples, each is read to find those that differ.
+    files. Where a file holds many samples, each is read to find those that differ. ``splits.json`` has a checksum of
+    itself. The texts beside (``README.md``, ``croissant.json``, ``load.py``, ``pipeline.yaml``) may be edited: that is
+    noted, and no fault.
 
     Args:
         folder: of the dataset.
@@ -102,6 +115,7 @@ class _Verification:
         self.progress = progress
         self.shards = Shards(folder, manifest.format, manifest.index)
         self.faults: list[DatasetFault] = []
+        self.notes: list[str] = []
         self.tables: dict[int, set[str]] = {}  # the names of the files of every shard whose table is right
 
     def run(self, workers: int) -> DatasetVerdict:
@@ -116,11 +130,13 @@ class _Verification:
                     if shard > done:
                         done = self._tell(shard)
         self._check_signals()
+        self._check_splits()
+        self._check_texts()
         for path in foreign_files(self.folder, self.manifest, self.tables):
             self._add(path, "foreign", "no build wrote it", ())
         self._tell(self.manifest.index.num_shards)
         self.faults.sort(key=lambda fault: fault.path)
-        return DatasetVerdict(self.folder, files, num_bytes, self.faults)
+        return DatasetVerdict(self.folder, files, num_bytes, self.faults, self.notes)
 
     def _planned(self) -> Iterator[tuple[int, str, StoredFile]]:
         """Give the files that the tables of the shards tell of."""
@@ -192,6 +208,43 @@ class _Verification:
             if name in found and found[name] != written:
                 why = "its bytes are not those that were written"
                 self._add(f"{SIGNALS_FOLDER}/{name}", "damaged", why, ())
+
+    def _check_splits(self) -> None:
+        if os.path.lexists(self.folder / SPLITS):
+            try:
+                Splits.read(self.folder, self.manifest.index.ids)
+            except CacheError as error:
+                self._add(SPLITS, "damaged", str(error), ())
+
+    def _check_texts(self) -> None:
+        try:
+            texts = written_texts(self.folder)
+            if not texts:
+                self._add(TEXTS, "missing", "is not there, so edits of the texts beside it cannot be told", ())
+        except CacheError as error:
+            self._add(TEXTS, "damaged", str(error), ())
+            return
+        for name, same in texts.items():
+            if same is None:
+                how = "; 'pcdata card DATASET' writes it anew" if name in (README, CROISSANT) else ""
+                self._add(name, "missing", f"is not there{how}", ())
+            elif not same:
+                self.notes.append(f"{name} was edited by hand")
+        if texts.get(CROISSANT) and self._tells_of_other_splits():
+            self.notes.append(f"the card tells of other splits than {SPLITS}; 'pcdata card DATASET' writes it anew")
+        if os.path.lexists(self.folder / ANSWERS):
+            try:
+                CardAnswers.read(self.folder / ANSWERS)
+            except ConfigError as error:
+                self._add(ANSWERS, "damaged", str(error), ())
+
+    def _tells_of_other_splits(self) -> bool:
+        path = self.folder / SPLITS
+        own = hash_of(path)[1] if path.is_file() else None
+        card = self.folder / CROISSANT
+        data = read_bytes("verify", card, max_bytes=_MAX_BYTES, error=CacheError)
+        content = json_object(str(card), data, error=CacheError)  # as it was written
+        return own != next((one["sha256"] for one in content["distribution"] if one["name"] == SPLITS), None)
 
     def _tell(self, shards: int) -> int:
         """Say how many shards are done."""

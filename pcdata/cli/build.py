@@ -7,7 +7,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
-from pcdata.cli.argument_types import positive
+from pcdata.cli.argument_types import count, positive
 from pcdata.cli.choices import add_model_options, given_preset
 from pcdata.cli.known_names import FORMATS
 from pcdata.cli.options import add_capture_options, given_options, skip_list
@@ -74,7 +74,7 @@ def _add_ways(build: argparse.ArgumentParser) -> None:
     ways = build.add_argument_group("who works, and when to stop")
     ways.add_argument(
         "--workers",
-        type=_count,
+        type=count,
         metavar="N",
         help="processes of one thread each; 0 = none but this one (default: one per core, if there are several shards)",
     )
@@ -98,20 +98,13 @@ def _add_ways(build: argparse.ArgumentParser) -> None:
     ways.add_argument("--num-shards", type=positive, metavar="N", help="of jobs that share the work: how many they are")
     ways.add_argument(
         "--shard-index",
-        type=_count,
+        type=count,
         metavar="K",
         help=f"which of them this is, from 0 (default: {' or '.join(_INDEX)} of the environment)",
     )
     ways.add_argument(
         "--finalize", action="store_true", help="only put a dataset into place, once every shard is finished"
     )
-
-
-def _count(text: str) -> int:
-    """Parse a whole number from 0."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0, got {text!r}")
-    return int(text)
 
 
 def _build(arguments: argparse.Namespace) -> int:

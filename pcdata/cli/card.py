@@ -29,6 +29,7 @@ def add_to(commands: Any) -> None:
     for name, (shown, told) in _ANSWERS.items():
         card.add_argument(f"--{name.replace('_', '-')}", metavar=shown, help=f"{told}; kept in card.yaml of DATASET")
     card.add_argument("--strict", action="store_true", help="fail where something is UNKNOWN, and say how to tell it")
+    card.add_argument("--overwrite", action="store_true", help="replace a card that was edited by hand")
     add_import_option(card)
     card.set_defaults(run=_card)
 
@@ -39,7 +40,7 @@ def _card(arguments: argparse.Namespace) -> None:
     from pcdata.build import write_card
 
     given = {name: getattr(arguments, name) for name in _ANSWERS}
-    missing = write_card(arguments.dataset, given, strict=arguments.strict)
+    missing = write_card(arguments.dataset, given, strict=arguments.strict, overwrite=arguments.overwrite)
     print(f"card     {Path(arguments.dataset) / 'README.md'}")
     if missing:
         print("UNKNOWN  until you say it:", *missing, sep="\n")

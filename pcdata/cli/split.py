@@ -79,16 +79,32 @@ def _split(arguments: argparse.Namespace) -> int:
         if given := [
             f"--{name.replace('_', '-')}" for name in drawing if getattr(arguments, name) not in (None, False)
         ]:
-            raise ConfigError(f"split: --check draws nothing, so {', '.join(given)} say nothing; leave one out")
+            raise ConfigError(
+                f"split: --check only looks at the splits that are there, and {', '.join(given)} would draw some; "
+                "leave out --check to draw them, which looks for leaks too"
+            )
         print(splits_text(Splits.read(arguments.file or arguments.dataset)))
     else:
         print(splits_text(_drawn(arguments)))
+        if arguments.file is None:
+            _write_card(arguments.dataset)
     if arguments.no_check:
         return 0
     with ProgressBar("leaks") as progress:
         report = check_leaks(arguments.dataset, path=arguments.file, progress=progress)
     print(f"\n{leaks_text(report)}")
     return int(not report.is_clean)
+
+
+def _write_card(dataset: str) -> None:
+    """Let the card tell of the new splits, unless somebody edited it."""
+    from pcdata.build import write_card
+    from pcdata.errors import ConfigError
+
+    try:
+        write_card(dataset)
+    except ConfigError as error:
+        print(f"note: the card does not tell of these splits: {error}")
 
 
 def _drawn(arguments: argparse.Namespace) -> Splits:

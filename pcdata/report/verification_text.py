@@ -11,8 +11,9 @@ _SHOWN = 5  # samples of a file
 def verification_text(verdict: DatasetVerdict) -> str:
     """Tell every fault, the samples that it spoils, and what to do."""
     looked = f"{verdict.folder}: {verdict.num_files:,} files of {verdict.num_bytes:,} bytes were hashed"
+    notes = [f"note: {text}" for text in verdict.notes]
     if not verdict.faults:
-        return f"{looked}; all are what was written"
+        return "\n".join([f"{looked}; all are what was written", *notes])
     rows = [[fault.kind, fault.path, fault.why, _samples(fault)] for fault in verdict.faults]
     spoiled = len({sample for fault in verdict.faults for sample in fault.samples})
     bad = any(fault.kind != "foreign" for fault in verdict.faults)
@@ -22,6 +23,7 @@ def verification_text(verdict: DatasetVerdict) -> str:
             "",
             text_table(["what", "file", "why", "samples"], rows),
             *(["", "copy the damaged and missing files again, or build the dataset again"] if bad else []),
+            *notes,
         ]
     )
 

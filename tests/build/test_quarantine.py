@@ -179,6 +179,30 @@ def test_a_worker_that_cannot_get_the_source_says_what_to_do(tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
+class Killed:
+    """Kills the process that unpickles it, but the one that it was made in."""
+
+    def __init__(self, maker):
+        self.maker = maker
+
+    def __reduce__(self):
+        return _killed, (self.maker,)
+
+
+def _killed(maker):
+    if os.getpid() != maker:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Killed(maker)
+
+
+def test_a_worker_killed_while_it_gets_its_job_blocks_nothing(tmp_path):
+    source = Clouds({"a": cloud()})
+    source.fate, source.long = Killed(os.getpid()), os.urandom(1 << 20)  # more than a pipe holds
+    with pytest.raises(CacheError, match=r"ended twice between two captures .*SIGKILL"):
+        build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out", workers=1)
+    assert not list(tmp_path.iterdir())
+
+
 def test_ways_that_do_not_fit_together_are_refused(tmp_path):
     source, config = Clouds({"a": cloud()}), config_from_yaml(CONFIG)
     both = {"part": (0, 1), "finalize": True}

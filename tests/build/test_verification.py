@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from pcdata import PointCloud
-from pcdata.build import build_dataset, config_from_yaml, verify_dataset
+from pcdata.build import build_dataset, config_from_yaml, verify_dataset, written_texts
+from pcdata.build.written_texts import write_texts
 from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.io.store.stores import STORES
@@ -117,3 +118,71 @@ def test_the_command_names_what_is_wrong_and_exits_with_1(datasets, tmp_path, ca
     assert main(["verify", str(tmp_path)]) == 1
     with pytest.raises(ConfigError, match="workers must be 1 or more"):
         verify_dataset(tmp_path / "set", workers=0)
+
+
+def test_splits_that_were_changed_are_damage_and_a_card_edited_by_hand_is_a_note(datasets, tmp_path, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(datasets["packed"], folder)
+    assert main(["split", str(folder), "--no-check"]) == 0
+    assert "| train |" in (folder / "README.md").read_text()
+    verdict = verify_dataset(folder)
+    assert (verdict.faults, verdict.notes) == ([], [])
+    text = (folder / "splits.json").read_text()
+    (folder / "splits.json").write_text(text.replace('"s1"', '"s9"'))
+    assert [one[:2] for one in faults(folder)] == [("splits.json", "damaged")]
+    (folder / "splits.json").unlink()
+    assert verify_dataset(folder).notes == [
+        "the card tells of other splits than splits.json; 'pcdata card DATASET' writes it anew"
+    ]
+    (folder / "splits.json").write_text(text)
+    with open(folder / "README.md", "a") as file:
+        file.write("\nThe left camera was replaced in May.\n")
+    (folder / "load.py").unlink()
+    (folder / "card.yaml").write_text("lisense: mit")
+    verdict = verify_dataset(folder)
+    assert verdict.notes == ["README.md was edited by hand"]
+    assert [(one.path, one.kind) for one in verdict.faults] == [("card.yaml", "damaged"), ("load.py", "missing")]
+    (folder / "texts.sha256").write_text("no hash")
+    assert ("texts.sha256", "damaged", ()) in faults(folder)
+    (folder / "texts.sha256").unlink()
+    assert ("texts.sha256", "missing", ()) in faults(folder)
+
+
+def test_what_was_edited_by_hand_is_replaced_only_where_that_is_allowed(datasets, tmp_path, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(datasets["packed"], folder)
+    written = (folder / "README.md").read_text()
+    (folder / "README.md").write_text(f"{written}\nThe left camera was replaced in May.\n")
+    assert main(["card", str(folder)]) == 2
+    assert "README.md of" in (told := capsys.readouterr().err)
+    assert "--overwrite" in told
+    assert main(["split", str(folder), "--no-check"]) == 0
+    assert "the card does not tell of these splits" in capsys.readouterr().out
+    config = config_from_yaml("cloud: [Center]")
+    with pytest.raises(CacheError, match=r"also holds README.md \(edited by hand\)"):
+        build_dataset(
+            config, Clouds({"a": PointCloud(points=torch.rand(9, 3), frame_id="base")}), folder, overwrite=True
+        )
+    assert "replaced in May" in (folder / "README.md").read_text()
+    assert main(["card", str(folder), "--overwrite"]) == 0
+    assert "replaced in May" not in (folder / "README.md").read_text()
+    assert verify_dataset(folder).notes == []
+
+
+def test_a_writer_killed_at_any_moment_leaves_no_edit(tmp_path, monkeypatch):
+    write_texts(tmp_path, {"README.md": "old", "croissant.json": "old", "load.py": "old"})
+    steps, write = [], written_texts._write
+    for last in range(4):
+        steps.clear()
+
+        def killed(*given, last=last):
+            steps.append(given[1])
+            if len(steps) > last:
+                raise KeyboardInterrupt
+            write(*given)
+
+        monkeypatch.setattr(written_texts, "_write", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write_texts(tmp_path, {"README.md": f"new {last}", "croissant.json": f"new {last}"})
+        assert written_texts.edited_texts(tmp_path) == []
+    assert steps == ["texts.sha256", "README.md", "croissant.json", "texts.sha256"]

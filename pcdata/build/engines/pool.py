@@ -2,6 +2,9 @@
 
 Every worker has a pipe of its own to this process and shares no lock with others, so one that is killed at any moment
 leaves nothing behind that the rest waits for. Workers end by themselves when this process is gone.
+
+What they need is sent when they ask for it, not as an argument of the process: :mod:`multiprocessing` writes arguments
+into a pipe whose other end it holds itself, and waits forever where they are many and the process is killed meanwhile.
 """
 
 from __future__ import annotations
@@ -48,9 +51,10 @@ def work_in_pool(job: Job, shards: Iterable[int], tally: Tally, *, workers: int,
     todo = list(shards)
     schedule = Schedule(todo)
     pool: list[_Worker] = []
+    pickled = _pickled(job)
     try:
         while True:
-            _hand_out(job, schedule, pool, min(workers, len(todo)), tally)
+            _hand_out(job, pickled, schedule, pool, min(workers, len(todo)))
             busy = [worker for worker in pool if worker.task is not None]
             if not busy:
                 break
@@ -71,13 +75,23 @@ def work_in_pool(job: Job, shards: Iterable[int], tally: Tally, *, workers: int,
                 worker.end()
 
 
+def _pickled(job: Job) -> bytes:
+    try:
+        return pickle.dumps(job, pickle.HIGHEST_PROTOCOL)
+    except (TypeError, AttributeError, ValueError, RecursionError, pickle.PicklingError) as error:  # as pickling raises
+        raise ConfigError(
+            f"build_dataset: the source and the steps must be sent to worker processes, and cannot: {error}; "
+            "workers=0 builds in this process"
+        ) from error
+
+
 def _time_left(busy: Iterable[_Worker], timeout: float | None) -> float | None:
     """Return the seconds until the first capture will have taken too long."""
     begun = [worker.since for worker in busy if worker.sample_id is not None]
     return None if timeout is None or not begun else max(min(begun) + timeout - time.monotonic(), 0.0)
 
 
-def _hand_out(job: Job, schedule: Schedule, pool: list[_Worker], most: int, tally: Tally) -> None:
+def _hand_out(job: Job, pickled: bytes, schedule: Schedule, pool: list[_Worker], most: int) -> None:
     """Give every idle worker a task, and start workers while there are more."""
     while (running := sum(worker.task is not None for worker in pool)) < most:
         task = schedule.next(running)
@@ -87,7 +101,7 @@ def _hand_out(job: Job, schedule: Schedule, pool: list[_Worker], most: int, tall
             continue  # by another process, meanwhile
         worker = next((one for one in pool if one.task is None), None)
         if worker is None:
-            worker = _Worker(job)
+            worker = _Worker(pickled)
             pool.append(worker)
         worker.give(task)
 
@@ -100,7 +114,9 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
         _bury(worker, schedule)
         return
     worker.since = time.monotonic()
-    if kind == "ready":
+    if kind == "started":
+        worker.begin()
+    elif kind == "ready":
         worker.is_ready = True
     elif kind == "begins":
         (worker.sample_id,) = told
@@ -120,7 +136,7 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
 def _bury(worker: _Worker, schedule: Schedule) -> None:
     worker.end()
     code = worker.process.exitcode or 0
-    if not worker.is_ready:
+    if not worker.is_ready and code >= 0:
         raise CacheError(
             f"build_dataset: a worker process could not start (exit code {code}; what it said is above). A script "
             'needs `if __name__ == "__main__":` around its call, since workers import it; workers=0 starts none'
@@ -139,31 +155,44 @@ def _signal_name(number: int) -> str:
 class _Worker:
     """One process of the pool, and what it does now."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, pickled: bytes) -> None:
         context: Any = multiprocessing.get_context(START)
         self.pipe, far_end = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far_end, job), name="pcdata-build", daemon=True)
+        self.process = context.Process(target=_serve, args=(far_end,), name="pcdata-build", daemon=True)
         self.task: Task | None = None
         self.sample_id: str | None = None  # the capture that it works on
         self.since = time.monotonic()
         self.is_ready = False
         self.is_alive = True
+        self._pickled: bytes | None = pickled  # the job, until it is sent
         try:
             with _one_thread_each(), deaf_children():
                 self.process.start()
-        except (TypeError, AttributeError, ValueError, pickle.PicklingError) as error:  # as pickling raises them
-            raise ConfigError(
-                f"build_dataset: the source and the steps must be sent to worker processes, and cannot: {error}; "
-                "workers=0 builds in this process"
+        except OSError as error:  # too many processes, or no memory for another one
+            raise CacheError(
+                f"build_dataset: no worker process can be started: {error}; try fewer --workers"
             ) from error
         finally:
             far_end.close()
 
     def give(self, task: Task) -> None:
-        """Let it begin with a task."""
+        """Let it begin with a task, as soon as it has the job."""
         self.task, self.sample_id, self.since = task, None, time.monotonic()
+        if self._pickled is None:
+            self._send_task()
+
+    def begin(self) -> None:
+        """Send the job, which it waits for, and its first task."""
+        assert self._pickled is not None
         with suppress(OSError):  # it has ended: found when it is listened to
-            self.pipe.send(task)
+            self.pipe.send_bytes(self._pickled)
+        self._pickled = None
+        if self.task is not None:
+            self._send_task()
+
+    def _send_task(self) -> None:
+        with suppress(OSError):
+            self.pipe.send(self.task)
 
     def taken(self) -> Task:
         """Return the task that is done."""
@@ -217,11 +246,16 @@ class _Teller:
         self.pipe.send(("ends", sample_id, error))
 
 
-def _serve(pipe: Connection, job: Job) -> None:
+def _serve(pipe: Connection) -> None:
     """Do tasks until there are no more."""
     _end_with_parent()
     torch.set_num_threads(1)
     teller = _Teller(pipe)
+    pipe.send(("started",))
+    try:
+        job: Job = pipe.recv()
+    except EOFError:
+        return
     pipe.send(("ready",))
     while True:
         try:
