@@ -12,7 +12,7 @@ from pcdata.contracts.dispatch import why_unavailable
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
     "points": (400, 34),  # sampling is told its options by the reference, whose step a kernel does
-    "build": (4000, 99),  # of which 700 keep what a build was when it is stopped, and 1,300 write its card
+    "build": (3200, 99),  # of which 600 keep what a build was when it is stopped, and 700 write its card
     "open": (800, 31),  # six arrays of the index, each a file that is checked
 }
 

@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 from pcdata.build.building_folder import BuildingFolder
-from pcdata.build.card import write_card
-from pcdata.build.card_answers import FILE_NAME as ANSWERS
-from pcdata.build.carried import carry_answers, carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.engines.in_process import work_here
 from pcdata.build.finishing import complete_dataset, counts_of
@@ -20,7 +17,6 @@ from pcdata.build.records import BuiltSample, ShardRecord
 from pcdata.build.shard_work import Job
 from pcdata.build.source_state import captures_digest
 from pcdata.build.tally import Tally, all_failed, most_bad
-from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
@@ -212,13 +208,7 @@ def _finish(
                 f"build_dataset: steps drop more than is usual, of which the notes tell; what is finished is kept in "
                 f"{building.kept_at}: mend the steps or leave captures out, or take it as it is without strict"
             )
-        partial = complete_dataset(config, source, job, done, alarms)
-        before = building.carried((SPLITS, ANSWERS))
-        if (before / SPLITS).is_file():
-            for told in carry_splits(before, partial):
-                note(told)
-        carry_answers(before, partial)
-        write_card(partial)
+        complete_dataset(config, source, job, done, alarms, note)
         building.put_into_place(job.plan, done, replaced, note)
     return True
 

@@ -18,6 +18,7 @@ from pcdata.build.card_text import card_text
 from pcdata.build.croissant import croissant_text
 from pcdata.build.written_texts import edited_texts, write_texts
 from pcdata.errors import ConfigError
+from pcdata.io.store.manifest import Manifest
 
 README, CROISSANT = "README.md", "croissant.json"
 CARD_FILES = (README, CROISSANT, ANSWERS)
@@ -54,11 +55,16 @@ def write_card(
             f"card: {' and '.join(edited)} of {folder} {'were' if len(edited) > 1 else 'was'} edited by hand, which "
             "would be lost; keep a copy elsewhere and allow overwriting (--overwrite)"
         )
-    facts = CardFacts.of(folder, said)
+    facts = CardFacts.of(folder, Manifest.read(folder), said)
     missing = facts.missing()
     if strict and missing:
         raise ConfigError("card: these are not known, and strict wants all of them:\n" + "\n".join(missing))
     if given:
         said.write(folder / ANSWERS)
-    write_texts(folder, {README: card_text(facts), CROISSANT: croissant_text(facts)})
+    write_texts(folder, card_texts(facts))
     return missing
+
+
+def card_texts(facts: CardFacts) -> dict[str, str]:
+    """Return the files of a card by name."""
+    return {README: card_text(facts), CROISSANT: croissant_text(facts)}

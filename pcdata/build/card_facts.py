@@ -46,13 +46,12 @@ class CardFacts:
     num_empty: int
 
     @classmethod
-    def of(cls, folder: Path, answers: CardAnswers) -> CardFacts:
+    def of(cls, folder: Path, manifest: Manifest, answers: CardAnswers) -> CardFacts:
         """Read a dataset; without a title it is called by its contents, which are the same under any name.
 
         Raises:
             CacheError: it is damaged.
         """
-        manifest = Manifest.read(folder)
         ids, counts = manifest.index.ids, np.asarray(manifest.index.num_points)
         shards = Shards(folder, manifest.format, manifest.index)
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pcdata.build.card_answers import UNKNOWN
@@ -94,7 +94,7 @@ def _pipeline(facts: CardFacts) -> list[str]:
         "## Pipeline",
         _table(("fact", "value"), rows),
         words,
-        _fenced(yaml_text(_plain(manifest.pipeline)), "yaml"),
+        _fenced(yaml_text(manifest.pipeline), "yaml"),
     ]
     if manifest.steps:
         header = ("points after", "samples", *PERCENTILES)
@@ -183,10 +183,3 @@ def _fenced(text: str, language: str) -> str:
     longest = max((len(run) for run in re.findall("`+", text)), default=0)
     fence = "`" * max(3, longest + 1)
     return f"{fence}{language}\n{text}{fence}"
-
-
-def _plain(value: Any) -> Any:
-    """Return plain containers, which is what YAML can write safely."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(one) for name, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value

@@ -5,6 +5,7 @@ Every step may be done again after a kill: shards are moved one by one, everythi
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,14 +15,20 @@ import numpy as np
 import torch
 
 import pcdata
+from pcdata.build.card import card_texts
+from pcdata.build.card_answers import FILE_NAME as ANSWERS
+from pcdata.build.card_facts import CardFacts
+from pcdata.build.carried import carried_answers, carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.loading_script import loading_script
 from pcdata.build.records import ShardRecord
 from pcdata.build.shard_work import Job, signals_of_shard
 from pcdata.build.source_state import captures_digest
-from pcdata.build.written_texts import write_texts
+from pcdata.build.written_texts import write_new_texts
 from pcdata.datasets.collate import COLLATES
+from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError, CaptureError, DTypeError, FrameError, ShapeError, write_fault
+from pcdata.files.scratch import Note
 from pcdata.files.syncing import sync_folder
 from pcdata.imports import ImportedFile, imported_files, step_names
 from pcdata.io.sources.capture_source import CaptureSource, episodes_of, kinds_of, skipped_of, streams_of
@@ -36,6 +43,7 @@ from pcdata.structures.episodes import kept_episodes
 from pcdata.structures.signal_joining import stacked_signals
 from pcdata.validation.step_losses import Counts, step_statistics
 from pcdata.verdicts import Finding
+from pcdata.yaml_nodes import yaml_text
 
 
 def complete_dataset(
@@ -43,13 +51,17 @@ def complete_dataset(
     source: CaptureSource,
     job: Job,
     records: Mapping[int, ShardRecord],
-    alarms: Sequence[Finding] = (),
-) -> Path:
-    """Make the dataset of a build whose shards are all finished, in its hidden folder, and return that.
+    alarms: Sequence[Finding],
+    note: Note,
+) -> None:
+    """Make the dataset of a build whose shards are all finished, in its hidden folder.
+
+    What it is to replace gives it its splits, and the answers of its card.
 
     Raises:
         CacheError: it cannot be written.
         CaptureError: the captures changed since they were read.
+        ConfigError: the answers of the card are damaged.
     """
     ordered = [records[shard] for shard in range(job.plan.num_shards)]
     _check_captures(source, job, ordered)
@@ -62,12 +74,14 @@ def complete_dataset(
             for one in record.samples
         ]
         signals = _write_signals(config, job, ordered)
-        loading, imports = _imports(config, source)
+        sections = config.pipeline.sections()
+        loading, imports = _imports(config, source, sections)
+        opened = {name: value for name, value in getattr(source, "opened", {}).items() if name != "skip_refused"}
         manifest = Manifest(
             format=config.output.format,
             compression=config.output.compression,
-            fingerprint=config.pipeline.stored_fingerprint(),
-            pipeline=config.pipeline.sections(),
+            fingerprint=job.plan.settings["steps"],
+            pipeline=sections,
             samples=samples,
             keep_raw=config.output.keep_raw,
             compact=config.output.compact,
@@ -80,7 +94,7 @@ def complete_dataset(
             steps=tuple(step_statistics(counts_of(records))),
             alarms=tuple(finding.to_json() for finding in alarms),
             model=_model_of(config),
-            source={name: value for name, value in getattr(source, "opened", {}).items() if name != "skip_refused"},
+            source=json.loads(json.dumps(opened)),  # lists, as it will be read
             imports=[file.to_json() for file in imports],
             versions={
                 "pcdata": pcdata.__version__,
@@ -89,9 +103,12 @@ def complete_dataset(
                 "python": platform.python_version(),
             },
         )
-        script = loading_script(config.loader, config.model, [file.name for file in loading])
-        write_texts(dataset, {"pipeline.yaml": config.pipeline.to_yaml(), "load.py": script})
         manifest.write(dataset)
+        before = job.folder.carried((SPLITS, ANSWERS))
+        carry_splits(before, dataset, manifest, note)
+        facts = CardFacts.of(dataset, manifest, carried_answers(before, dataset))
+        script = loading_script(config.loader, config.model, [file.name for file in loading])
+        write_new_texts(dataset, {"pipeline.yaml": yaml_text(sections), "load.py": script, **card_texts(facts)})
         for folder in (dataset / FOLDER, dataset):
             sync_folder(folder)
     except OSError as error:
@@ -139,9 +156,10 @@ def _signals(job: Job, records: Sequence[ShardRecord]) -> Iterator[Mapping[str, 
         yield from signals_of_shard(job, job.folder.work_place(record), record)
 
 
-def _imports(config: BuildConfig, source: CaptureSource) -> tuple[list[ImportedFile], list[ImportedFile]]:
+def _imports(
+    config: BuildConfig, source: CaptureSource, sections: Mapping[str, Any]
+) -> tuple[list[ImportedFile], list[ImportedFile]]:
     """Return the files of one's own that loading the dataset needs, and those that building it needed."""
-    sections = config.pipeline.sections()
     steps = {name for file in imported_files() for name in file.transforms}
     steps &= step_names(sections) if steps else set()
     kinds = {*kinds_of(source)}

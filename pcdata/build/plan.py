@@ -86,7 +86,7 @@ def plan_of(config: BuildConfig, source: CaptureSource) -> Plan:
     """Return the plan for a configuration and its captures; no capture is loaded."""
     ids = tuple(source.ids)
     size = shard_size_of(len(ids), config.output.shard_size)
-    steps = step_names(config.pipeline.split()[0].sections())
+    steps = step_names(config.pipeline.split()[0].sections()) if imported_files() else set()
     kinds = {*kinds_of(source)}
     needed = [
         file.sha256

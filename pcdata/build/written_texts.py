@@ -7,6 +7,7 @@ the new ones, and afterwards with the new ones alone: whenever a writer is kille
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +23,23 @@ _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_.-]+)")
 _MAX_BYTES = 1 << 16
 
 
+def write_new_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write the texts of a dataset that is being made, by the name of their file, and remember what was written.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    contents = {name: text.encode() for name, text in texts.items()}
+    hashes = {name: [hashlib.sha256(content).hexdigest()] for name, content in contents.items()}
+    for name, content in {**contents, FILE_NAME: _lines(hashes)}.items():
+        with open(folder / name, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+
+
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write texts by the name of their file, force them to disk, and remember what was written.
+    """Write texts of a dataset anew, force them to disk, and remember what was written.
 
     Raises:
         WriteError: one cannot be written.

@@ -324,7 +324,7 @@ def test_a_target_below_a_file_is_a_cache_error(tmp_path, source, configure):
 def test_a_shard_of_an_hdf5_dataset_is_one_file_with_a_group_per_scene(tmp_path, source, configure):
     build_dataset(configure(), source, tmp_path / "out")
     assert sorted(os.listdir(tmp_path / "out")) == [
-        "README.md", "croissant.json", "dataset.json", "index", "load.py", "pipeline.yaml", "shards",
+        "README.md", "croissant.json", "dataset.json", "index", "load.py", "pipeline.yaml", "shards", "texts.sha256",
     ]  # fmt: skip
     assert sorted(os.listdir(first_shard(tmp_path / "out"))) == ["clouds.h5", "files.tsv"]
     with h5py.File(first_shard(tmp_path / "out") / "clouds.h5", "r") as file:

@@ -79,7 +79,8 @@ def test_the_bytes_are_the_same_whichever_way_a_dataset_was_built(tmp_path, form
     build(tmp_path / "plain", form)
     wanted = tree(tmp_path / "plain")
     assert {name.split("/")[0] for name in wanted} == {
-        "README.md", "croissant.json", "dataset.json", "pipeline.yaml", "load.py", "index", "shards", "signals", "texts.sha256",
+        "README.md", "croissant.json", "texts.sha256", "dataset.json", "pipeline.yaml", "load.py", "index", "shards",
+        "signals",
     }  # fmt: skip
     for workers in (1, 2):
         build(tmp_path / f"pool{workers}", form, workers=workers)

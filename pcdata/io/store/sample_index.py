@@ -350,9 +350,9 @@ class SampleIndex(Sequence[Sample]):
             raise CacheError(f"a sample lies in shard {int(self.shards[-1])}, but there are {len(tables)}")
         told = {}
         (folder / FOLDER).mkdir()
-        given = {**self.arrays, _TABLES: np.frombuffer(b"".join(tables), np.uint8).reshape(-1, 32)}
+        self._take({**self.arrays, _TABLES: np.frombuffer(b"".join(tables), np.uint8).reshape(-1, 32)})
         for name, (dtype, row) in FILES.items():
-            content = npy_bytes(np.ascontiguousarray(given[name], dtype).reshape(-1, *row))
+            content = npy_bytes(np.ascontiguousarray(self.arrays[name], dtype).reshape(-1, *row))
             with open(folder / FOLDER / name, "xb") as file:
                 file.write(content)
                 file.flush()
