@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -113,7 +112,6 @@ def complete_dataset(
             sync_folder(folder)
     except OSError as error:
         raise CacheError(f"{job.folder.target}: cannot be written: {write_fault(error)}") from error
-    return dataset
 
 
 def counts_of(records: Mapping[int, ShardRecord]) -> dict[str, Counts]:
