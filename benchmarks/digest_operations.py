@@ -77,7 +77,11 @@ CLOUD_OPERATIONS = {
         {"distance": 0.01, "num_hypotheses": 100},
         {"distance": 0.01, "seed": 5, "up": (0.0, 0.0, 1.0), "max_tilt": 0.3},
     ],
-    "voxel_downsample": [{"voxel_size": 0.04}, {"voxel_size": 0.021}],
+    "voxel_downsample": [
+        {"voxel_size": 0.04},
+        {"voxel_size": 0.021},
+        {"voxel_size": [[0.04, 0.06, 0.11]], "origin": (0.03, 0.1, -0.2), "min_points": 3},
+    ],
 }
 IMAGE_OPERATIONS = {
     "decimate_depth": [{"factor": 3}, {"factor": 2, "rule": "mean", "max_jump": 0.3}],

@@ -96,6 +96,32 @@ def checked_lengths(where: str, name: str, arguments: Mapping[str, Any]) -> Tens
     return lengths
 
 
+def checked_edges(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+    """Require lengths as :func:`checked_lengths`, or one per axis too, (1 or B, 3): bodies get (B,) or (B, 3)."""
+    ptr: Tensor = arguments["ptr"]
+    edges = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+    num_clouds = len(ptr) - 1
+    if edges.ndim != 2:
+        return checked_lengths(where, name, arguments)
+    if edges.shape not in {(1, 3), (num_clouds, 3)}:
+        raise ShapeError(f"{where}: {name} per axis must be (1, 3) or ({num_clouds}, 3), got {tuple(edges.shape)}")
+    if not bool((torch.isfinite(edges) & (edges > 0)).all()):
+        raise ConfigError(f"{where}: {name} must be positive, got {edges.tolist()}")
+    return edges.expand(num_clouds, 3)
+
+
+def checked_places(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+    """Require one finite point (3,) for every cloud, or one per cloud (B, 3); bodies get (B, 3) float64."""
+    ptr: Tensor = arguments["ptr"]
+    places = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+    num_clouds = len(ptr) - 1
+    if places.shape not in {(3,), (num_clouds, 3)}:
+        raise ShapeError(f"{where}: {name} must be (3,) or ({num_clouds}, 3), got {tuple(places.shape)}")
+    if not bool(torch.isfinite(places).all()):
+        raise ConfigError(f"{where}: {name} must be finite, got {places.tolist()}")
+    return places.expand(num_clouds, 3)
+
+
 def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr: Tensor) -> list[int]:
     """Return one count per cloud from one number or (B,) numbers.
 

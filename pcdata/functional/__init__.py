@@ -26,9 +26,11 @@ from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_downsample,
     voxel_majority,
+    voxel_maximum,
     voxel_mean,
     voxel_mean_direction,
     voxel_minimum,
+    voxel_nearest,
 )
 from pcdata.geometry.lens import distort_normalized, undistort_normalized
 
@@ -70,7 +72,9 @@ __all__ = [
     "undistort_normalized",
     "voxel_downsample",
     "voxel_majority",
+    "voxel_maximum",
     "voxel_mean",
     "voxel_mean_direction",
     "voxel_minimum",
+    "voxel_nearest",
 ]

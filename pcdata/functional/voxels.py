@@ -1,20 +1,21 @@
 """Thinning clouds on a voxel grid, and averaging whatever the points carry over the same voxels.
 
-The grid is Open3D's: per cloud, it starts half a voxel below the lowest corner, and a point's voxel is
-``floor((point - origin) / voxel_size)`` in float64.
+The grid is Open3D's unless an origin is given: per cloud, it starts half a voxel below the lowest corner. A point's
+voxel is ``floor((point - origin) / voxel_size)`` in float64.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.numbers import checked_count, checked_lengths
+from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
 from pcdata.errors import DTypeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import (
     cloud_of_rows,
@@ -36,12 +37,14 @@ _MAX_VOXELS_PER_AXIS = 2.0**53
 SIZE_TOLERANCE = 1e-6
 
 
-@op(points="N 3", ptr="ptr N B", voxel_size=checked_lengths)
+@op(points="N 3", ptr="ptr N B", voxel_size=checked_edges, origin=checked_places, min_points=checked_count)
 def voxel_downsample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
     *,
-    voxel_size: float | Sequence[float] | Tensor,
+    voxel_size: float | Sequence[float] | Sequence[Sequence[float]] | Tensor,
+    origin: Any = None,  # (3,) or (B, 3) numbers
+    min_points: int = 1,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # means (M, 3) float32, ptr (B+1,), inverse (N,) int64
     """Replace the points of each voxel by their mean; ``inverse[i]`` is the row of ``means`` that point i went into.
@@ -53,26 +56,36 @@ def voxel_downsample(
     Args:
         points: the clouds, in any unit of length.
         ptr: row pointers.
-        voxel_size: edge length in the unit of the points; one, or one per cloud (B,).
+        voxel_size: edge length in the unit of the points; one, one per cloud (B,), or per axis too: (1, 3) or (B, 3).
+        origin: a corner of a voxel, (3,) or one per cloud (B, 3): grids that share it have the same voxels in every
+            cloud. None = half a voxel below the lowest corner of each cloud.
+        min_points: voxels with fewer points are left out; ``inverse`` is -1 for their points.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
-        ConfigError: a voxel size that is not positive.
+        ConfigError: a voxel size that is not positive, or min_points below 1.
         UnitError: an extent of 2^53 voxels or more.
     """
     assert ptr is not None  # @op fills it
-    assert isinstance(voxel_size, Tensor)  # and makes it one size per cloud
+    assert isinstance(voxel_size, Tensor)  # and makes it one size per cloud, (B,) or (B, 3)
     with torch.no_grad():
-        cloud, origin, scaled = _scale_to_grid(points, ptr, voxel_size)
+        edges = voxel_size if voxel_size.ndim == 2 else voxel_size[:, None]
+        cloud, start, scaled = _scale_to_grid(points, ptr, edges, origin)
         voxel = scaled.floor()
-        inverse, first = _group_in_row_order(_voxel_keys(cloud, voxel, len(ptr) - 1))
+        above = voxel - voxel.amin(0) if origin is not None and len(voxel) else voxel
+        inverse, first = _group_in_row_order(_voxel_keys(cloud, above, len(ptr) - 1))
         offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
         count = group_count(inverse, len(first))
         mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
         owner = cloud[first]
-        means = (origin[owner] + (voxel[first] + mean_offset) * voxel_size[owner, None]).float()
+        means = (start[owner] + (voxel[first] + mean_offset) * edges[owner]).float()
+        if min_points > 1:
+            full = count >= min_points
+            inverse = torch.where(full, full.cumsum(0) - 1, -1)[inverse]
+            means, owner = means[full], owner[full]
     if torch.is_grad_enabled() and points.requires_grad:
-        plain = voxel_mean(points, inverse, len(first))
+        kept = inverse >= 0
+        plain = voxel_mean(points[kept], inverse[kept], len(means))
         means = means + (plain - plain.detach())  # the value keeps every bit
     return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
 
@@ -120,6 +133,27 @@ def find_voxel_size(
         count = torch.where(leaves_enough, found, count)
         too_large = torch.where(open_ & ~leaves_enough, middle, too_large)
     return enough
+
+
+def voxel_nearest(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor,  # (B+1,)
+    inverse: Tensor,  # (N,) int64, as voxel_downsample returns it, no -1
+    num_voxels: int,
+    *,
+    voxel_size: Tensor,  # (B,) or (B, 3) float64
+    origin: Tensor | None = None,  # (B, 3) float64, as voxel_downsample was given
+) -> Tensor:  # (M,) int64 rows
+    """Return the point nearest to the center of each voxel, the lowest row of equals; N for an empty voxel."""
+    edges = voxel_size if voxel_size.ndim == 2 else voxel_size[:, None]
+    cloud, _, scaled = _scale_to_grid(points.detach(), ptr, edges, origin)
+    offset = (scaled - scaled.floor() - 0.5) * edges[cloud]
+    x, y, z = offset.square().unbind(1)
+    apart = (x + y) + z
+    least = torch.full((num_voxels,), torch.inf, dtype=torch.float64, device=points.device)
+    least.scatter_reduce_(0, inverse, apart, "amin")
+    nearest = (apart == least[inverse]).nonzero().squeeze(1)
+    return torch.cat([nearest, nearest.new_tensor([len(points)])])[group_first(inverse[nearest], num_voxels)]
 
 
 def voxel_mean(
@@ -174,13 +208,27 @@ def voxel_majority(
 
 
 def voxel_minimum(
-    values: Tensor,  # (N,) integer
+    values: Tensor,  # (N,) numbers
     inverse: Tensor,  # (N,) int64
     num_voxels: int,
 ) -> Tensor:  # (M,) in the dtype of the values
     """Return the lowest value of each voxel; 0 for an empty voxel."""
-    lowest = torch.zeros(num_voxels, dtype=torch.int64, device=values.device)
-    return lowest.scatter_reduce_(0, inverse, values.long(), "amin", include_self=False).to(values.dtype)
+    return _extreme(values, inverse, num_voxels, "amin")
+
+
+def voxel_maximum(
+    values: Tensor,  # (N,) numbers
+    inverse: Tensor,  # (N,) int64
+    num_voxels: int,
+) -> Tensor:  # (M,) in the dtype of the values
+    """Return the highest value of each voxel; 0 for an empty voxel."""
+    return _extreme(values, inverse, num_voxels, "amax")
+
+
+def _extreme(values: Tensor, inverse: Tensor, num_voxels: int, reduce: str) -> Tensor:
+    wide = values if values.is_floating_point() else values.long()
+    found = torch.zeros(num_voxels, dtype=wide.dtype, device=values.device)
+    return found.scatter_reduce(0, inverse, wide, reduce, include_self=False).to(values.dtype)
 
 
 def _square_root(values: Tensor) -> Tensor:
@@ -193,7 +241,7 @@ def _count_voxels(points: Tensor, ptr: Tensor, sizes: Tensor, open_: Tensor) -> 
     if not bool(open_.all()):
         counts = torch.where(open_, counts_from_ptr(ptr), 0)
         points, ptr = points[open_[cloud_of_rows(ptr)]], ptr_from_counts(counts)
-    cloud, _, scaled = _scale_to_grid(points, ptr, sizes)
+    cloud, _, scaled = _scale_to_grid(points, ptr, sizes[:, None])
     return _distinct_per_cloud(cloud, scaled.floor(), len(sizes))[open_]
 
 
@@ -213,16 +261,23 @@ def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor
     return group_count(cloud[group_first(rank, distinct)], num_clouds)
 
 
-def _scale_to_grid(points: Tensor, ptr: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each row's cloud (N,), the grids' origins (B, 3), and the points in voxels from there (N, 3); float64."""
+def _scale_to_grid(
+    points: Tensor, ptr: Tensor, edges: Tensor, origin: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each row's cloud (N,), the grids' origins (B, 3), and the points in voxels from there (N, 3); float64.
+
+    The edges are (B, 1), or (B, 3) where each axis has its own.
+    """
     cloud = cloud_of_rows(ptr)
     wide = points.double()
-    origin = segment_min(wide, ptr) - sizes[:, None] / 2
-    scaled = (wide - origin[cloud]) / sizes[cloud, None]
-    if len(points) and float(scaled.max()) >= _MAX_VOXELS_PER_AXIS:
-        worst = int(cloud[scaled.amax(1).argmax()])
+    if origin is None:
+        origin = segment_min(wide, ptr) - edges / 2
+    scaled = (wide - origin[cloud]) / edges[cloud]
+    if len(points) and float(scaled.abs().max()) >= _MAX_VOXELS_PER_AXIS:
+        row = int(scaled.abs().amax(1).argmax())
+        worst, widest = int(cloud[row]), float(scaled[row].abs().max())
         raise UnitError(
-            f"voxel_downsample: cloud {worst} spans {float(scaled.max()):.3g} voxels of {float(sizes[worst]):g}, more "
+            f"voxel_downsample: cloud {worst} spans {widest:.3g} voxels of {float(edges[worst].min()):g}, more "
             "than 2^53; is the voxel size in the unit of the points, and are there stray points?"
         )
     return cloud, origin, scaled

@@ -16,8 +16,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.errors import DTypeError
 from pcdata.functional.rows import group_first, transform_directions, transform_points
-from pcdata.functional.voxels import voxel_majority, voxel_mean, voxel_mean_direction, voxel_minimum
+from pcdata.functional.voxels import (
+    voxel_majority,
+    voxel_maximum,
+    voxel_mean,
+    voxel_mean_direction,
+    voxel_minimum,
+)
 
 METRE = "m"
 CAMERA_FRAME = "camera"  # of each camera of a capture
@@ -45,7 +52,8 @@ def _minimum(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
 
 
 def _column_by_column(decide: Average, rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
-    columns = rows.reshape(len(rows), math.prod(rows.shape[1:])).long()
+    columns = rows.reshape(len(rows), math.prod(rows.shape[1:]))
+    columns = columns if rows.is_floating_point() else columns.long()
     decided = [decide(column, group, num_groups) for column in columns.unbind(1)]
     return torch.stack(decided, dim=1).to(rows.dtype).reshape(num_groups, *rows.shape[1:])
 
@@ -151,10 +159,36 @@ def kind_of(name: str, kinds: Mapping[str, Kind]) -> Kind:
     return FIELDS[name].kind if name in FIELDS else kinds[name]
 
 
-def averaged(name: str, rows: Tensor, kind: Kind, group: Tensor, num_groups: int) -> Tensor:
-    """Reduce the rows of one field group by group, as the field or else its kind says."""
+def averaged(name: str, rows: Tensor, kind: Kind, group: Tensor, num_groups: int, how: str | None = None) -> Tensor:
+    """Reduce the rows of one field group by group: by one of REDUCTIONS, or as the field or else its kind says."""
     own = FIELDS[name].average if name in FIELDS else None
-    return (own or KINDS[kind].average)(rows, group, num_groups)
+    return (REDUCTIONS[how] if how else own or KINDS[kind].average)(rows, group, num_groups)
+
+
+def _floats_alone(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    if not rows.is_floating_point():
+        raise DTypeError(f"the mean of {rows.dtype} is not taken: choose 'vote', 'first', 'min' or 'max'")
+    return _mean_or_vote(rows, group, num_groups)
+
+
+def _maximum(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    return _column_by_column(voxel_maximum, rows, group, num_groups)
+
+
+def _vote(rows: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    if rows.is_floating_point():
+        raise DTypeError(f"a vote among {rows.dtype} has no sense: choose 'mean', 'first', 'min' or 'max'")
+    return _mean_or_vote(rows, group, num_groups)
+
+
+# How several rows may become one where a caller does not leave it to their kind.
+REDUCTIONS: dict[str, Average] = {
+    "first": _first,
+    "max": _maximum,
+    "mean": _floats_alone,
+    "min": _minimum,
+    "vote": _vote,
+}
 
 
 def fillers(fields: Mapping[str, Tensor], kinds: Mapping[str, Kind]) -> dict[str, int]:

@@ -228,18 +228,31 @@ class PointCloud(CloudBatch):
         """Replace all per-point fields at once, and any other attributes, by ones that are known to fit."""
         return derived(self, **attributes(rows), **others)
 
-    def averaged(self, group: Tensor, ptr: Tensor, *, points: Tensor) -> PointCloud:
+    def averaged(
+        self, group: Tensor, ptr: Tensor, *, points: Tensor, reduce: Mapping[str, str | Tensor] | None = None
+    ) -> PointCloud:
         """Replace the rows of every group by one row: each field's average, as its kind says.
 
         Args:
             group: (N,) int64, the group of each row; groups lie within a cloud and none is empty.
             ptr: (B+1,) int64, which groups are whose.
             points: (G, 3) float32, the points that stand for the groups.
+            reduce: instead, by field: "mean", "vote", "first", "min" or "max" of its rows, or the row (G,) to take.
+
+        Raises:
+            DTypeError: a mean of integers, a vote among floats, or a field that the clouds do not have.
         """
-        fields = self.fields()
+        fields, reduce = self.fields(), reduce or {}
+        if missing := reduce.keys() - fields.keys():
+            raise DTypeError(f"PointCloud.averaged: no field {sorted(missing)}; the clouds have {sorted(fields)}")
         del fields["points"]
-        count = len(points)
-        rows = {name: averaged(name, value, self.kind(name), group, count) for name, value in fields.items()}
+        rows = {}
+        for name, value in fields.items():
+            how = reduce.get(name)
+            if isinstance(how, Tensor):
+                rows[name] = value[how]
+            else:
+                rows[name] = averaged(name, value, self.kind(name), group, len(points), how)
         return self._with_rows({"points": points, **rows}, ptr=ptr, layout=None)
 
     def transformed(self, matrix: Tensor, *, frame_id: str | None = None, unit: str | None = None) -> PointCloud:

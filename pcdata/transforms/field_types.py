@@ -24,6 +24,8 @@ Vec3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]  # row-major, acts on column vectors
 
+# What the values of several points become, where not as their kind says.
+Reduction = Literal["mean", "vote", "first", "nearest", "min", "max"]
 # What a sampler does with a cloud that has fewer points than asked.
 IfShort = Literal["error", "repeat", "tile", "zeros", "keep"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,24 +12,32 @@ from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.families import SelectTransform
-from pcdata.transforms.field_types import Positive, Unit
+from pcdata.transforms.field_types import Count, Positive, Unit, Vec3
 
 
-def voxel_cells(points: Tensor, voxel_size: float) -> Tensor:
-    """Return the (N, 3) int64 cells ``floor(x / voxel_size)`` of a grid through the origin."""
-    return torch.floor(points / voxel_size).long()
+def voxel_cells(
+    points: Tensor, voxel_size: float | tuple[float, ...], origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> Tensor:
+    """Return the (N, 3) int64 cells ``floor((x - origin) / voxel_size)``, in float32."""
+    # A number stays one: torch multiplies by its reciprocal, as in the loaders that this must agree with.
+    size = voxel_size if isinstance(voxel_size, float) else points.new_tensor(voxel_size)
+    return torch.floor((points - points.new_tensor(origin) if any(origin) else points) / size).long()
 
 
-class VoxelSample(SelectTransform):
-    """Keep the first point of every occupied voxel of a grid through the origin; nothing is averaged.
+class _OnePerVoxel(SelectTransform, abstract=True):
+    """A step that keeps one point of every occupied voxel; nothing is averaged.
 
     Args:
-        voxel_size: edge length, in `unit`.
-        unit: of voxel_size; a cloud in another one is refused.
+        voxel_size: edge length, in `unit`; one, or one per axis.
+        unit: of voxel_size and origin; a cloud in another one is refused.
+        origin: a corner of a voxel.
+        min_points: voxels with fewer points lose them all.
     """
 
-    voxel_size: Positive
+    voxel_size: Positive | tuple[Positive, Positive, Positive]
     unit: Unit = "m"
+    origin: Vec3 = (0.0, 0.0, 0.0)
+    min_points: Count = 1
 
     def unit_needed(self) -> str:
         """The unit of the voxel size."""
@@ -37,22 +46,42 @@ class VoxelSample(SelectTransform):
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the row with the lowest rank in each voxel; rows of the result are in their old order."""
         owner = cloud_of_rows(cloud.ptr)
-        voxel = _numbered(torch.cat([owner[:, None], voxel_cells(cloud.points, self.voxel_size)], dim=1))
+        cells = voxel_cells(cloud.points, self.voxel_size, self.origin)
+        voxel = _numbered(torch.cat([owner[:, None], cells], dim=1))
         rank = self.ranks(cloud, streams)
         count = int(voxel.max()) + 1 if len(voxel) else 0
         best = torch.full((count,), cloud.num_points, dtype=torch.int64, device=cloud.device)
         best.scatter_reduce_(0, voxel, rank, "amin")
         mask = rank == best[voxel]
+        if self.min_points > 1:
+            mask &= (torch.bincount(voxel, minlength=count) >= self.min_points)[voxel]
         counts = torch.bincount(owner[mask], minlength=cloud.num_clouds)
         return mask, ptr_from_counts(counts)
 
     def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
         """(N,) int64: of the points in one voxel the lowest stays; distinct within a cloud."""
-        return torch.arange(cloud.num_points, dtype=torch.int64, device=cloud.device)
+        raise NotImplementedError
 
 
-class RandomVoxelSample(VoxelSample):
-    """Keep a random point of every occupied voxel of a grid through the origin (Pointcept's GridSample in training)."""
+class VoxelSample(_OnePerVoxel):
+    """Keep one point of every occupied voxel of a stated grid, as it is: the first, or the nearest to the center."""
+
+    keep: Literal["first", "nearest"] = "first"
+
+    def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
+        """The order of the rows, or of their distances to the centers of their voxels."""
+        rows = torch.arange(cloud.num_points, dtype=torch.int64, device=cloud.device)
+        if self.keep == "first":
+            return rows
+        size = cloud.points.new_tensor(self.voxel_size)
+        cells = voxel_cells(cloud.points, self.voxel_size, self.origin)
+        offset = cloud.points - cloud.points.new_tensor(self.origin) - (cells + 0.5) * size
+        x, y, z = offset.square().unbind(1)
+        return torch.empty_like(rows).scatter_(0, ((x + y) + z).argsort(stable=True), rows)
+
+
+class RandomVoxelSample(_OnePerVoxel):
+    """Keep a random point of every occupied voxel of a stated grid (Pointcept's GridSample in training)."""
 
     is_random = True
 

@@ -18,10 +18,12 @@ from pcdata.contracts.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailab
 from pcdata.contracts.numbers import (
     checked_count,
     checked_counts,
+    checked_edges,
     checked_fraction,
     checked_image_size,
     checked_length,
     checked_lengths,
+    checked_places,
     checked_positive,
     checked_word,
 )
@@ -165,6 +167,12 @@ EXAMPLES = [
     Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
     Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),
+    Example(
+        "voxel_downsample",
+        one_cloud,
+        ("row", "ptr", "group"),
+        {"voxel_size": [[0.04, 0.06, 0.11]], "origin": (0.03, 0.1, -0.2), "min_points": 3},
+    ),
 ]
 
 each_example = pytest.mark.parametrize(
@@ -229,7 +237,8 @@ def packed_results(
             ]
         if kind == "group":
             made = [int(result[example.gives.index("ptr")][-1]) for result in results]
-            values = [value + start for value, start in zip(values, ptr_from_counts(made).tolist())]
+            starts = ptr_from_counts(made).tolist()
+            values = [torch.where(value < 0, value, value + start) for value, start in zip(values, starts)]
         outputs.append(torch.cat(values))
     return outputs
 
@@ -352,6 +361,13 @@ WRONG = {
     checked_word: [("other", ConfigError), (None, ConfigError)],
     checked_image_size: [((4,), ConfigError), ((0, 4), ConfigError), ((4, 4, 4), ConfigError)],
     checked_counts: [(-1, ConfigError), (1.5, DTypeError), ([1], ShapeError), (1000, TooFewPointsError)],
+    checked_places: [([0.0, 1.0], ShapeError), ([0.0, 1.0, math.nan], ConfigError)],
+    checked_edges: [
+        (0.0, ConfigError),
+        ([[0.1, 0.1]], ShapeError),
+        ([[0.1, 0.1, 0.1]] * 2, ShapeError),
+        ([[0.1, 0.0, 0.1]], ConfigError),
+    ],
     checked_lengths: [
         (0.0, ConfigError),
         (math.inf, ConfigError),

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
 import numpy as np
@@ -16,7 +17,9 @@ from pcdata.functional.voxels import (
     voxel_majority,
     voxel_mean,
     voxel_mean_direction,
+    voxel_nearest,
 )
+from pcdata.rng import seeded
 
 
 def cloud(count: int, seed: int = 0) -> torch.Tensor:
@@ -204,3 +207,56 @@ def test_duplicates_do_not_count_as_points_to_find():
 
 def test_one_point_fits_any_voxel():
     assert float(find_voxel_size(torch.ones(1, 3), num_points=1)) > 0
+
+
+def by_hand(points, size, origin):
+    """Voxel -> rows, in the order of their lowest row."""
+    voxels: dict[tuple[int, ...], list[int]] = {}
+    for row, cell in enumerate(np.floor((points.double().numpy() - origin) / size).astype(int).tolist()):
+        voxels.setdefault(tuple(cell), []).append(row)
+    return voxels
+
+
+def test_a_stated_grid_with_edges_per_axis_holds_the_points_that_it_says():
+    points, size, origin = (
+        torch.rand(300, 3, generator=seeded(1)),
+        np.array([0.2, 0.3, 0.5]),
+        np.array([0.05, -0.1, 7.0]),
+    )
+    voxels = by_hand(points, size, origin)
+    means, ptr, inverse = voxel_downsample(points, voxel_size=size[None], origin=origin)
+    assert int(ptr[-1]) == len(voxels)
+    for number, rows in enumerate(voxels.values()):
+        assert inverse[rows].tolist() == [number] * len(rows)
+        torch.testing.assert_close(means[number], points[rows].mean(0), atol=1e-6, rtol=0)
+    full = {cell: rows for cell, rows in voxels.items() if len(rows) >= 5}
+    few, _, where = voxel_downsample(points, voxel_size=size[None], origin=origin, min_points=5)
+    assert torch.equal(few, means[[number for number, rows in enumerate(voxels.values()) if len(rows) >= 5]])
+    assert sorted((where >= 0).nonzero().squeeze(1).tolist()) == sorted(itertools.chain(*full.values()))
+
+
+def test_clouds_that_share_a_grid_share_its_voxels():
+    points = torch.rand(100, 3, generator=seeded(2)) - 0.5
+    both, ptr = torch.cat([points, points[::3] + 1e-9]), torch.tensor([0, 100, 134])
+    means, means_ptr, _ = voxel_downsample(both, ptr, voxel_size=0.25, origin=(0.0, 0.0, 0.0))
+    cells = [set(map(tuple, torch.floor(means[a:b] / 0.25).int().tolist())) for a, b in itertools.pairwise(means_ptr)]
+    assert cells[1] <= cells[0]
+
+
+def test_the_point_nearest_to_the_center_of_each_voxel_is_found():
+    points, size = torch.rand(300, 3, generator=seeded(3)), torch.tensor([[0.2, 0.3, 0.5]], dtype=torch.float64)
+    ptr, origin = torch.tensor([0, 300]), torch.tensor([[0.1, 0.0, -0.3]], dtype=torch.float64)
+    means, _, inverse = voxel_downsample(points, voxel_size=size, origin=origin)
+    found = voxel_nearest(points, ptr, inverse, len(means), voxel_size=size, origin=origin)
+    for number, (cell, rows) in enumerate(by_hand(points, size.numpy(), origin.numpy()).items()):
+        center = origin[0] + (torch.tensor(cell) + 0.5) * size[0]
+        assert int(found[number]) == rows[int((points[rows].double() - center).square().sum(1).argmin())]
+
+
+def test_the_gradient_of_means_leaves_out_the_points_of_voxels_left_out():
+    points = torch.rand(60, 3, generator=seeded(4)).requires_grad_()
+    means, _, inverse = voxel_downsample(points, voxel_size=0.4, min_points=3)
+    means.sum().backward()
+    size = torch.bincount(inverse[inverse >= 0])
+    wanted = torch.where(inverse < 0, 0.0, 1.0 / size[inverse.clamp(min=0)])
+    torch.testing.assert_close(points.grad, wanted[:, None].expand(-1, 3))

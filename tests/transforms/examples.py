@@ -156,7 +156,10 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
-    "RandomVoxelSample": _of(T.RandomVoxelSample(voxel_size=0.05)),
+    "RandomVoxelSample": _of(
+        T.RandomVoxelSample(voxel_size=0.05),
+        T.RandomVoxelSample(voxel_size=(0.05, 0.1, 0.3), origin=(0.02, 0.0, 0.01), min_points=2),
+    ),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
@@ -187,13 +190,28 @@ EXAMPLES: dict[str, list[Example]] = {
     ],
     "VoxelDownsample": [
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
+        Example(
+            T.VoxelDownsample(
+                voxel_size=(0.03, 0.05, 0.2), origin=(0.01, 0.0, -0.3), min_points=2, reduce={"colors": "max"}
+            ),
+            displacement=0.21,
+        ),
+        Example(
+            T.VoxelDownsample(
+                voxel_size=0.05, reduce=dict.fromkeys(("points", "anchor", "labels", "weight", "normals"), "nearest")
+            ),
+            displacement=0.05 * math.sqrt(3),
+        ),
         Example(T.VoxelDownsample(num_points=40), displacement=0.1 * math.sqrt(3)),
         Example(
             T.VoxelDownsample(voxel_size=0.1, unit="normalized"), normalized_cloud, displacement=0.1 * math.sqrt(3)
         ),
     ],
     "VoxelSample": [
-        *_of(T.VoxelSample(voxel_size=0.05)),
+        *_of(
+            T.VoxelSample(voxel_size=0.05),
+            T.VoxelSample(voxel_size=(0.05, 0.1, 0.3), origin=(0.02, 0.0, 0.01), min_points=2, keep="nearest"),
+        ),
         Example(T.VoxelSample(voxel_size=0.2, unit="normalized"), normalized_cloud),
     ],
 }

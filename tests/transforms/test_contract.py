@@ -289,6 +289,8 @@ def changed_values(value: Any) -> list[Any]:
         return [T.Center()]
     if value is None:
         return [0.7, 3, "base", (0.0, 0.0, 1.0), "reliable"]
+    if isinstance(value, dict):
+        return [{**value, "colors": "first"}, {**value, "colors": "max"}]
     items = list(value)
     if not items or isinstance(items[0], T.Transform):
         return [[*items, 1], [*items, T.Center()]]

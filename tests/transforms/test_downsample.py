@@ -5,6 +5,7 @@ import torch
 
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.sampling import farthest_point_sample
+from pcdata.functional.voxels import voxel_downsample
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms import (
@@ -76,6 +77,28 @@ def test_either_a_size_or_a_count():
     for fields in ({}, {"voxel_size": 0.1, "num_points": 10}):
         with pytest.raises(ConfigError, match="give either voxel_size or num_points"):
             VoxelDownsample(**fields)
+
+
+def test_fields_are_reduced_as_asked():
+    cloud = cloud_in_base((200,))
+    _, _, group = voxel_downsample(cloud.points, voxel_size=0.1)
+    result = VoxelDownsample(
+        voxel_size=0.1, reduce={"colors": "max", "labels": "first", "weight": "min", "points": "first"}
+    )(cloud)
+    for voxel in range(result.num_points):
+        rows = (group == voxel).nonzero().squeeze(1)
+        assert torch.equal(result.colors[voxel], cloud.colors[rows].amax(0))
+        assert torch.equal(result.points[voxel], cloud.points[rows[0]])
+        assert result.labels[voxel] == cloud.labels[rows[0]]
+        assert torch.equal(result.extra["weight"][voxel], cloud.extra["weight"][rows].amin(0))
+    with pytest.raises(DTypeError, match=r"the mean of torch.int64 is not taken"):
+        VoxelDownsample(voxel_size=0.1, reduce={"labels": "mean"})(cloud)
+    with pytest.raises(DTypeError, match=r"no field \['colours'\]; the clouds have"):
+        VoxelDownsample(voxel_size=0.1, reduce={"colours": "max"})(cloud)
+    with pytest.raises(ConfigError, match="points are reduced by mean, first or nearest, not max"):
+        VoxelDownsample(voxel_size=0.1, reduce={"points": "max"})
+    with pytest.raises(ConfigError, match="no origin, no min_points"):
+        VoxelDownsample(num_points=10, min_points=2)
 
 
 # -- sampling ------------------------------------------------------------------------------------------------------

@@ -31,17 +31,20 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
 
 
 @kernel("voxel_downsample", "cpu")
-def voxel_downsample(points: Tensor, ptr: Tensor, *, voxel_size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Number voxels in a hash table; sums are integers, so threads change nothing."""
-    if _too_long(ptr):
-        return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)
+def voxel_downsample(
+    points: Tensor, ptr: Tensor, *, voxel_size: Tensor, origin: Tensor | None, min_points: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Number voxels in a hash table; sums are integers, so threads change nothing. The core knows Open3D's grid."""
+    given = {"voxel_size": voxel_size, "origin": origin, "min_points": min_points}
+    if _too_long(ptr) or origin is not None or voxel_size.ndim == 2 or min_points > 1:
+        return _reference("voxel_downsample", points, ptr, **given)
     # As many rows as there could be: those not written never become memory.
     means, inverse = room(points.shape, points.dtype), room(len(points), torch.int64)
     counts, spans_too_many = room(len(ptr) - 1, torch.int64), room(1, torch.int64)
     arrays = points, ptr, len(ptr) - 1, voxel_size, means, inverse, counts, spans_too_many
     call("pc_voxel_downsample", *arrays)
     if spans_too_many:
-        return _reference("voxel_downsample", points, ptr, voxel_size=voxel_size)  # knows what to say
+        return _reference("voxel_downsample", points, ptr, **given)  # knows what to say
     means_ptr = ptr_from_counts(counts)
     # Not clone(): see pcdata.contracts.tensors on torch's threads.
     return torch.from_numpy(means[: int(means_ptr[-1])].numpy().copy()), means_ptr, inverse
