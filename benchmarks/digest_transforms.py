@@ -79,6 +79,7 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "DecimateDepth": _of("DecimateDepth", {"factor": 2}, {"factor": 5, "max_jump": 0.5}, {"factor": 3, "rule": "mean"}),
     "Deproject": _of("Deproject", {}),
+    "DescribeShape": _of("DescribeShape", {"radius": 0.05, "features": ("planarity", "surface_variation")}),
     "EstimateNormals": _of("EstimateNormals", {"radius": 0.05}, {"max_neighbors": 8, "orient": "none"}),
     "FarthestPointSample": _of(
         "FarthestPointSample", {"num_points": 32}, *({"num_points": 140, "if_short": how} for how in SHORT)

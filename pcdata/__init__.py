@@ -35,6 +35,7 @@ _HOMES = {
         "CropWorkspace",
         "DecimateDepth",
         "Deproject",
+        "DescribeShape",
         "EstimateNormals",
         "FarthestPointSample",
         "FillHoles",

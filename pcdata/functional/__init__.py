@@ -1,7 +1,8 @@
 """Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
-decimated, resized and filled depth, disparity, Chamfer distance, distances of neighbors. None flow through decisions
+decimated, resized and filled depth, disparity, Chamfer distance, distances and
+covariances of neighbors. None flow through decisions
 (indices, masks, labels, planes, sizes, which points are neighbors), nor through estimated normals, ``register_depth``,
 ``spatial_filter`` and TSDF volumes.
 """
@@ -17,6 +18,7 @@ from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import chamfer_distance
+from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
@@ -35,6 +37,7 @@ from pcdata.functional.voxels import (
 from pcdata.geometry.lens import distort_normalized, undistort_normalized
 
 __all__ = [
+    "SHAPE_FEATURES",
     "DepthAverage",
     "ImageGrid",
     "RegisteredDepth",
@@ -56,6 +59,7 @@ __all__ = [
     "find_voxel_size",
     "flying_pixel_mask",
     "knn",
+    "neighborhood_covariance",
     "orient_normals",
     "pixel_rays",
     "project_points",
@@ -66,6 +70,7 @@ __all__ = [
     "ransac_plane",
     "register_depth",
     "resize_depth",
+    "shape_features",
     "spatial_filter",
     "statistical_outlier_mask",
     "temporal_filter",

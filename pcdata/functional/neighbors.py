@@ -222,7 +222,7 @@ def radius_neighbors(
             if not everyone or queries is not None:
                 bounds = torch.searchsorted(query, asked_ptr.contiguous())
                 own = {"queries": asked[query].detach(), "queries_ptr": bounds}
-            index, distance = _search(
+            index, distance = search(
                 points,
                 ptr,
                 width,
@@ -261,7 +261,7 @@ def _neighbors(
 ) -> tuple[Tensor, Tensor]:
     _require_own_queries(where, exclude_self, queries)
     own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
-    index, distance = _search(points, ptr, k + exclude_self, own, radius, grid, backend)
+    index, distance = search(points, ptr, k + exclude_self, own, radius, grid, backend)
     if exclude_self:
         itself = index == torch.arange(len(points), dtype=torch.int64, device=points.device)[:, None]
         itself[:, -1] |= ~itself.any(1)  # more repeats than were asked for: the last one is too many
@@ -273,7 +273,7 @@ def _neighbors(
     return index, distance
 
 
-def _search(
+def search(
     points: Tensor,
     ptr: Tensor,
     k: int,

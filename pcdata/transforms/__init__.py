@@ -30,6 +30,7 @@ from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_jitter import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 from pcdata.transforms.sensor_noise import RandomSensorNoise
+from pcdata.transforms.shape import DescribeShape
 from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
 from pcdata.transforms.unreliable import MarkUnreliableDepth
 from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
@@ -44,6 +45,7 @@ __all__ = [
     "CropWorkspace",
     "DecimateDepth",
     "Deproject",
+    "DescribeShape",
     "EstimateNormals",
     "FarthestPointSample",
     "FillHoles",

@@ -76,7 +76,8 @@ class Transform(nn.Module):
     def make_params(self, data: Any, streams: Streams) -> Params:
         """Decide: all that is random or derived from the data; only steps that say ``is_random`` draw from ``streams``.
 
-        Every value has leading dimension B, except ``index``, ``ptr`` and those named after a per-point field.
+        Every value has leading dimension B, except ``index``, ``ptr``, ``per_point`` and those named after a per-point
+        field.
         """
         return {}
 
@@ -326,7 +327,7 @@ def _small(params: Params, num: int) -> dict[str, NDArray[Any]]:
     kept: dict[str, NDArray[Any]] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in ("index", "ptr", *FIELDS)
+        is_per_cloud = name not in ("index", "ptr", "per_point", *FIELDS)
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
             kept[name] = value.detach().cpu().numpy()
     return kept

@@ -47,6 +47,7 @@ WITH = {
     "deproject_depth",
     "fill_holes",
     "knn",
+    "neighborhood_covariance",
     "project_points",
     "radius_neighbors",
     "resize_depth",

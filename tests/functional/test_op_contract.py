@@ -156,6 +156,7 @@ EXAMPLES = [
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("knn", in_six_dimensions, ("index", "row"), {"k": 4}),
     Example("knn", one_cloud, ("index", "row"), {"k": 4, "exclude_self": True}),
+    Example("neighborhood_covariance", with_queries, ("row", "row", "row"), {"radius": 0.05, "max_neighbors": 12}),
     Example("pack_colors", color_image, ("row",)),
     Example("project_points", in_front_of_a_camera, ("row", "row")),
     Example("radius_neighbors", with_queries, ("index", "row", "rows_ptr"), {"radius": 0.03}),

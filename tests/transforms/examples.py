@@ -75,6 +75,10 @@ EXAMPLES: dict[str, list[Example]] = {
         make=frame_with_counts,
     ),
     "Deproject": _of(T.Deproject(), make=frame_with_counts),
+    "DescribeShape": _of(
+        T.DescribeShape(radius=0.05),
+        T.DescribeShape(features=("linearity", "planarity"), radius=None, max_neighbors=9),
+    ),
     "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(max_neighbors=8, orient="none")),
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),

@@ -63,9 +63,12 @@ def test_every_registered_transform_has_an_example():
 def test_it_does_something_on_its_example(example):
     data = example.make(COUNTS)
     results = [run(example, data, seed) for seed in range(5)]
-    watched = ("depth", "confidence", "points", "colors", "normals", "labels", "meta")
-    seen = [{name: value for name, value in tree(result).items() if name in watched} for result in results]
-    before = {name: value for name, value in tree(data).items() if name in watched}
+    watched = ("depth", "confidence", "points", "colors", "normals", "labels", "meta", "extra")
+
+    def looked_at(value: Any) -> dict[str, Any]:
+        return {name: part for name, part in tree(value).items() if name in watched}
+
+    seen, before = [looked_at(result) for result in results], looked_at(data)
     assert any(differences(before, after) for after in seen)
 
 
@@ -284,6 +287,7 @@ def changed_values(value: Any) -> list[Any]:
             "floor",
             "never",
             "normalized",
+            "planarity",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]

@@ -93,8 +93,8 @@ def test_fields_are_reduced_as_asked():
         assert torch.equal(result.extra["weight"][voxel], cloud.extra["weight"][rows].amin(0))
     with pytest.raises(DTypeError, match=r"the mean of torch.int64 is not taken"):
         VoxelDownsample(voxel_size=0.1, reduce={"labels": "mean"})(cloud)
-    with pytest.raises(DTypeError, match=r"no field \['colours'\]; the clouds have"):
-        VoxelDownsample(voxel_size=0.1, reduce={"colours": "max"})(cloud)
+    with pytest.raises(DTypeError, match=r"no field \['hue'\]; the clouds have"):
+        VoxelDownsample(voxel_size=0.1, reduce={"hue": "max"})(cloud)
     with pytest.raises(ConfigError, match="points are reduced by mean, first or nearest, not max"):
         VoxelDownsample(voxel_size=0.1, reduce={"points": "max"})
     with pytest.raises(ConfigError, match="no origin, no min_points"):
