@@ -105,11 +105,12 @@ class _AzureKinectSource(RecordingSource):
         (height, width), (top, left) = _PARTS[place][size]
         cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = self._calibration[place][0]
         try:
-            return pinhole(
-                size,
-                (fx * width, fy * height, cx * width - left - 0.5, cy * height - top - 0.5),
+            whole = pinhole(
+                (height, width),
+                (fx * width, fy * height, cx * width - 0.5, cy * height - 0.5),
                 distortion=(k1, k2, p1, p2, k3, k4, k5, k6),
             )
+            return whole if whole.size == size else whole.cropped(top, left, size)
         except PcdataError as error:
             raise IntrinsicsError(f"{self}: {_CALIBRATION}: {error}") from error
 

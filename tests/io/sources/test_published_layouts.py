@@ -486,6 +486,7 @@ def test_an_azure_kinect_recording_has_the_intrinsics_of_its_mode(tmp_path: Path
     assert (frame.depth == torch.tensor(801 * 0.001, dtype=torch.float32)).all()
     (fx, _, cx), (_, _, cy), _ = frame.camera.intrinsics[0].tolist()
     assert (fx, cx, cy) == pytest.approx((0.49 * 512, 256 - 96 - 0.5, 256 - 90 - 0.5))
+    assert frame.camera.is_window  # its center is 12 of 288 rows from that of the sensor
     k1, k2, p1, p2, k3, k4, k5, k6 = frame.camera.distortion[0].tolist()
     assert [k1, k2, k3, k4, k5, k6, 0, 0, p2, p1] == made.K4A_LENS[4:]
     assert frame.provenance["serial"] == "0123"
