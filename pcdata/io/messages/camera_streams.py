@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError, add_note
-from pcdata.io.messages.camera_descriptions import described
+from pcdata.io.messages.camera_descriptions import described, how_intrinsics
 from pcdata.io.messages.clock import Clock
 from pcdata.io.messages.image_topics import (
     ImageTopic,
@@ -30,6 +30,7 @@ from pcdata.structures import Camera
 ROLES = ("labels", "mask", "confidence")
 RECORDED = "stated in the recording"
 _MILLIMETRE = 0.001  # REP 118
+Pinhole = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +91,9 @@ class Choice:
     camera_info: Mapping[str, str] | None = None
     registered: bool = False
     color_from_depth: Tensor | None = None  # (4, 4) float64, where tf does not tell it
-    metres_per_unit: float | None = None
-    intrinsics: tuple[float, float, float, float] | None = None
-    clock: Clock = "header"
+    metres_per_unit: float | Mapping[str, float] | None = None  # of the one camera, or by topic of images
+    intrinsics: Pinhole | Mapping[str, Pinhole] | None = None
+    clock: Clock | None = None
 
 
 def chosen_cameras(
@@ -106,15 +107,25 @@ def chosen_cameras(
         UnitError, IntrinsicsError: what an image needs is stated nowhere.
     """
     depths = _depths(where, log, images, said, choice.depth)
-    if choice.intrinsics is not None and len(depths) > 1:
-        raise ConfigError(f"{where}: intrinsics are of one camera, and {len(depths)} are read")
+    if choice.intrinsics is not None and not isinstance(choice.intrinsics, Mapping) and len(depths) > 1:
+        raise ConfigError(
+            f"{where}: intrinsics are of one camera, and {len(depths)} are read; say of which: "
+            f"{how_intrinsics(depths[0][1].topic.name)}"
+        )
+    for option, given in (("intrinsics", choice.intrinsics), ("metres_per_unit", choice.metres_per_unit)):
+        if isinstance(given, Mapping) and (unknown := {*given} - {*images}):
+            raise ConfigError(
+                f"{where}: {option}: no topic of images is called {min(unknown)!r:.200}; there are {', '.join(images)}"
+            )
     found = []
     for number, (name, image) in enumerate(depths):
         try:
-            found.append(_stream(where, log, images, said, choice, name, image, number))
+            found.append(_stream(where, log, images, said, choice, name, image, number, is_only=len(depths) == 1))
         except PcdataError as error:
             add_note(error, f"camera {name!r}: depth topic {image.topic.name}")
             raise
+    if choice.color is None and any(one.color is None for one in found):  # all views have color, or none
+        return [replace(one, color=None, color_camera=None) for one in found]
     return found
 
 
@@ -168,12 +179,17 @@ def _stream(
     name: str,
     image: ImageTopic,
     number: int,
+    *,
+    is_only: bool,
 ) -> CameraStream:
     own = image.topic.name.split("/")[1] if image.topic.name.count("/") > 1 else ""
     facts = said.cameras.get(own, {})
-    unit, float_unit, unit_source = _units(where, image, facts, choice.metres_per_unit)
+    unit, float_unit, unit_source = _units(where, image, facts, _said_of(image, choice.metres_per_unit))
     is_window = facts.get("is_window") is True
-    camera, infos, rectified = described(where, log, image, choice.camera_info, choice.intrinsics, is_window=is_window)
+    intrinsics = _said_of(image, choice.intrinsics)
+    camera, infos, rectified = described(
+        where, log, image, choice.camera_info, intrinsics, is_window=is_window, is_only=is_only
+    )
     color = _color(where, log, images, choice, image, number)
     color_camera = None
     if color is not None and not same_pixels(color, image):
@@ -183,7 +199,8 @@ def _stream(
                 f"pixels than the depth ({pixels(image)}, frame {image.frame!r}); registered=True (--registered) "
                 "registers the depth to them"
             )
-        color_camera, color_infos, _ = described(where, log, color, choice.camera_info, None)
+        intrinsics = _said_of(color, choice.intrinsics) if isinstance(choice.intrinsics, Mapping) else None
+        color_camera, color_infos, _ = described(where, log, color, choice.camera_info, intrinsics)
         if color_camera is None:
             assert color_infos is not None
             raise IntrinsicsError(
@@ -205,6 +222,10 @@ def _stream(
         log.topics.get(f"/{own}/pose_matrix") if facts else None,
         facts,
     )
+
+
+def _said_of(image: ImageTopic, given: Any) -> Any:
+    return given.get(image.topic.name) if isinstance(given, Mapping) else given
 
 
 def _units(where: str, image: ImageTopic, said: Mapping[str, Any], given: float | None) -> tuple[float, float, str]:

@@ -15,6 +15,7 @@ from pcdata.errors import IntrinsicsError, PcdataError
 from pcdata.geometry.lens import COEFFICIENT_COUNTS
 from pcdata.structures import Camera
 
+SAY_INTRINSICS = "say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX FY CX CY)"
 # By model: how many coefficients it has, in OpenCV's order.
 _POLYNOMIALS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "Brown Conrady": (4, 5)}
 
@@ -43,7 +44,13 @@ def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float
 
 
 def camera_of(
-    where: str, info: Any, size: tuple[int, int], *, rectified: bool = False, is_window: bool = False
+    where: str,
+    info: Any,
+    size: tuple[int, int],
+    *,
+    rectified: bool = False,
+    is_window: bool = False,
+    how: str = SAY_INTRINSICS,
 ) -> Camera:
     """Return the camera of an image.
 
@@ -53,6 +60,7 @@ def camera_of(
         size: of the image, (height, width).
         rectified: the image is undistorted already, so the projection matrix is of it and no lens.
         is_window: cut from a larger image, so the principal point may lie outside.
+        how: what helps where it is not calibrated.
 
     Raises:
         IntrinsicsError: it is not calibrated, of another size, or has a lens that is not OpenCV's.
@@ -60,7 +68,6 @@ def camera_of(
     matrix = [float(value) for value in (info.p if hasattr(info, "p") else info.P)] if rectified else _k(info)
     k = [matrix[0], matrix[1], matrix[2], *matrix[3 + rectified : 6 + rectified]]  # a projection has four columns
     fx, skew, cx, below, fy, cy = k
-    how = "say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX FY CX CY)"
     if fx == 0 or fy == 0:
         raise IntrinsicsError(f"{where} states no focal length: the camera was not calibrated; {how}")
     if not all(map(math.isfinite, k)):

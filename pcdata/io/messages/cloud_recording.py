@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
-from pcdata.io.messages.clock import Clock, on_clock
+from pcdata.io.messages.camera_streams import Choice
+from pcdata.io.messages.clock import on_clock
 from pcdata.io.messages.decoding import decoded
 from pcdata.io.messages.image_topics import told
 from pcdata.io.messages.log_file import Topic
@@ -30,15 +31,17 @@ class CloudRecording:
     said = Statement()
     skipped: Mapping[int, str] = {}
 
-    def __init__(self, where: str, log: MessageLog, name: str, clock: Clock, metres_per_unit: float | None) -> None:
+    def __init__(self, where: str, log: MessageLog, name: str, choice: Choice) -> None:
         self.where, self.file = where, log.files[0].path
         if name not in log.topics:
             raise ConfigError(f"{where}: there is no topic {name!r:.200}{near_matches(name, log.topics)}")
         if log.topics[name] not in cloud_topics(log):
             raise CaptureError(f"{where}: topic {told(log.topics[name])} has no clouds (PointCloud2)")
         topic = log.topics[name]
-        self._topic = on_clock(log, [topic], clock)[topic]
-        self._metres_per_unit = metres_per_unit
+        if isinstance(choice.metres_per_unit, Mapping):
+            raise ConfigError(f"{where}: metres_per_unit of clouds must be one number, got {choice.metres_per_unit}")
+        self._topic = on_clock(log, [topic], choice.clock)[topic]
+        self._metres_per_unit = choice.metres_per_unit
         self.times = self._topic.times
         self.streams = [
             {

@@ -17,9 +17,9 @@ from pcdata.io.messages.camera_streams import (
     Choice,
     chosen_cameras,
 )
-from pcdata.io.messages.clock import Clock, has_header, on_clock
+from pcdata.io.messages.clock import LATE, Clock, has_header, lateness, on_clock
 from pcdata.io.messages.decoding import decoded, plain_type
-from pcdata.io.messages.image_topics import ImageTopic, image_topics, told
+from pcdata.io.messages.image_topics import ImageTopic, image_topics, same_pixels, told
 from pcdata.io.messages.log_file import Topic
 from pcdata.io.messages.message_log import MessageLog
 from pcdata.io.messages.signal_choice import chosen_signals
@@ -31,7 +31,6 @@ from pcdata.io.sources.synchronized import Joined, allow_more, joined
 
 _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 _STATIC = "tf_static"
-_LATE = 1.0  # seconds between header and recording that no transport takes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,19 +101,40 @@ class JoinedTopics:
                 f"{self._where}: views of one frame must have one size, but: {named}; read one camera at a time"
             )
 
-    def _check_clocks(self, log: MessageLog, clock: Clock) -> None:
-        """Require that messages without a header, which have the time of recording, are on the clock of the depth."""
+    def _check_clocks(self, log: MessageLog, clock: Clock | None) -> None:
+        """Require that all is on the clock of the depth, also what has no header and so the time of recording."""
         depth = self.cameras[0].images.topic
+        if clock == "recorded" or not has_header(depth):
+            return
+        if clock is None:
+            self._check_lateness(depth)
         bare = [one for one in self.signals if not has_header(one.topic)]
-        if clock == "recorded" or not bare or not has_header(depth):
+        if not bare:
             return
         apart = (float(np.median(log.topics[depth.name].times)) - float(np.median(self.times))) / 1e9
-        if abs(apart) > _LATE:
+        if abs(apart) > LATE:
             raise CaptureError(
                 f"{self._where}: messages of {bare[0].topic.name} have no header, so only the time of recording, and "
                 f"the headers of {depth.name} are {abs(apart):.3g} s {'before' if apart > 0 else 'after'} that: two "
                 f"clocks; clock='recorded' (--clock recorded) joins all by the times of recording, or {_left_out(bare)}"
             )
+
+    def _check_lateness(self, depth: Topic) -> None:
+        """Require that headers are as late as those of the depth are, by the recorder that saw both, and go on."""
+        how = "clock='recorded' (--clock recorded) joins all by the times of recording"
+        for one in (image for camera in self.cameras for image in (camera.images, camera.color) if image is not None):
+            if len(one.topic) > 1 and one.topic.times[0] == one.topic.times[-1]:
+                told = f"the headers of all {len(one.topic)} messages of {one.topic.name} hold one time"
+                raise CaptureError(f"{self._where}: {told}; {how}")
+        expected = self._late.get(depth.name)
+        for name, late in self._late.items():
+            if expected is not None and late is not None and abs(late - expected) > LATE:
+                raise CaptureError(
+                    f"{self._where}: the headers of {name} are {abs(late - expected):.3g} s "
+                    f"{'behind' if late > expected else 'ahead of'} those of {depth.name}, by when both were recorded: "
+                    f"two clocks; {how}; where they are right, and only come so late, clock='header' (--clock header) "
+                    "takes them as they stand"
+                )
 
     def _way_out(self) -> str:
         """Say what can be done where no depth image has all its partners."""
@@ -183,6 +203,10 @@ class JoinedTopics:
     def _counted(self) -> list[str]:
         """Say in words what of the joined streams was dropped, and what lacked a partner."""
         lines = []
+        for camera in self.cameras:
+            topic = camera.images.topic
+            if again := len(topic) - len(np.unique(topic.times)):
+                lines.append(f"depth {topic.name}: {again} of {len(topic)} images have the time of another")
         for stream in self.streams[1:]:
             name = f"{stream['role']} {stream['topic']}"
             if stream["dropped"] and stream["rule"] == "nearest":  # of faster streams most are passed over
@@ -211,7 +235,7 @@ class JoinedTopics:
         """Return the topic of the camera's poses, where the recording states those that are wanted."""
         return camera.poses if self.frame_id is not None and self.frame_id == self.said.frame_id else None
 
-    def _read_times(self, log: MessageLog, clock: Clock) -> FrameTree | None:
+    def _read_times(self, log: MessageLog, clock: Clock | None) -> FrameTree | None:
         """Put all topics that are read on the clock, and return the tree of tf where it is needed: in one pass."""
         spatial = [one.name for one in self.signals if one.frame not in (None, "camera")]
         if self.frame_id is None and (spatial or self._joining.poses):
@@ -231,12 +255,13 @@ class JoinedTopics:
         frames = [topic for topic in log.topics.values() if plain_type(topic.type) in _TF] if ways else []
         takers = {
             topic: builder.taker(
-                static=topic.name.rpartition("/")[2] == _STATIC, times=topic.times if clock == "recorded" else None
+                static=topic.name.rpartition("/")[2] == _STATIC, recorded=topic.times, by_recorder=clock == "recorded"
             )
             for topic in frames
         }
         topics = [*(topic for one in self.cameras for topic in one.topics), *(one.topic for one in self.signals)]
         clocked = on_clock(log, topics, clock, takers)
+        self._late = {one.name: lateness(one.times, clocked[one].times) for one in topics if has_header(one)}
         self.cameras = [one.on(clocked) for one in self.cameras]
         self.signals = [replace(one, topic=clocked[one.topic]) for one in self.signals]
         try:
@@ -244,6 +269,7 @@ class JoinedTopics:
                 return None
             tree = builder.tree().only(ways)
             self._contradictions = builder.contradictions(tree.edges)
+            self._late |= builder.lateness(tree.edges)
             return tree
         except CaptureError as error:
             colors = [one.color.frame for one in self.cameras if one.color is not None and one.color_camera is not None]
@@ -306,7 +332,10 @@ class JoinedTopics:
             use = ""
             if topic.name in images and images[topic.name].form.role == "color":
                 has_color = any(camera.color is not None for camera in self.cameras)
-                use = f"; color={topic.name} reads it" if has_color else f"; color of other pixels: {READ_COLOR}"
+                same = any(same_pixels(images[topic.name], camera.images) for camera in self.cameras)
+                use = "; not all cameras that are read have color of their pixels, and views have it all or none"
+                if has_color or not same:
+                    use = f"; color={topic.name} reads it" if has_color else f"; color of other pixels: {READ_COLOR}"
             lines.append(told(topic) + use)
         return lines
 

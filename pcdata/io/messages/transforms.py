@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError
 from pcdata.geometry import rigid
+from pcdata.io.messages.clock import lateness
 from pcdata.io.messages.decoding import stamp
 from pcdata.io.sources.synchronized import Trajectory, joined
 
@@ -175,18 +176,20 @@ class TreeBuilder:
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._topics = 0
+        self._recorded: list[NDArray[np.int64]] = []  # by topic, of each of its messages
         self._moving: dict[Edge, _Rows] = {}
         self._static: dict[Edge, tuple[tuple[int, int], list[float]]] = {}
         self._restated: dict[Edge, int] = {}  # static transforms that another message of the pair contradicts
 
-    def taker(self, *, static: bool, times: NDArray[np.int64] | None = None) -> Callable[[int, Any], None]:
+    def taker(
+        self, *, static: bool, recorded: NDArray[np.int64], by_recorder: bool = False
+    ) -> Callable[[int, Any], None]:
         """Return what takes the messages of a topic, each with its number in it.
 
-        ``times`` are those of recording, where they count and not the stamp of each transform.
+        ``recorded`` are the times of recording, which count ``by_recorder``, and not the stamp of each transform.
         """
-        topic = self._topics
-        self._topics += 1
+        topic = len(self._recorded)
+        self._recorded.append(recorded)
 
         def take(number: int, message: Any) -> None:
             order = (topic, number)
@@ -198,7 +201,7 @@ class TreeBuilder:
                 numbers = [float(value) for value in (shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w)]
                 if not static:
                     self._moving.setdefault(edge, _Rows()).add(
-                        order, stamp(one) if times is None else int(times[number]), numbers
+                        order, int(recorded[number]) if by_recorder else stamp(one), numbers
                     )
                     continue
                 if edge in self._static and not _same_pose(self._static[edge][1], numbers):
@@ -222,6 +225,14 @@ class TreeBuilder:
                     "counts: record one of those who publish it"
                 )
         return told
+
+    def lateness(self, edges: Collection[Edge]) -> dict[str, float | None]:
+        """Return by how many seconds some pairs of frames that move were recorded after their times."""
+        return {
+            f"tf from {child!r} to {parent!r}": rows.lateness(self._recorded)
+            for (parent, child), rows in self._moving.items()
+            if (parent, child) in edges and (parent, child) not in self._static
+        }
 
     def tree(self) -> FrameTree:
         """Return the tree.
@@ -259,6 +270,13 @@ class _Rows:
         times, table = times[order], table[order]
         again = np.flatnonzero(times[1:] == times[:-1])
         return len({int(times[one]) for one in again if not _same_pose(table[one], table[one + 1])})
+
+    def lateness(self, recorded: Sequence[NDArray[np.int64]]) -> float | None:
+        topic, number = np.array(self._order, np.int64).reshape(-1, 2).T
+        times = np.empty(len(topic), np.int64)
+        for one in np.unique(topic).tolist():
+            times[topic == one] = recorded[one][number[topic == one]]
+        return lateness(times, np.array(self._times, np.int64))
 
     def first_of_each_time(self) -> tuple[list[int], NDArray[np.float64]]:
         """Return the times in order, and the (N, 7) numbers of the first pose of each."""

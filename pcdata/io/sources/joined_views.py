@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.errors import ShapeError
+from pcdata.files.sample_names import name_some
 from pcdata.structures import Camera, DepthFrame
 from pcdata.structures.signal_joining import agreed_signals
 
@@ -25,6 +27,15 @@ def join_views(frames: Sequence[DepthFrame], provenance: Mapping[str, Any]) -> D
         FrameError: a signal in "camera", of which there are several then.
     """
     first = frames[0]
+    names = [str(name) for name in provenance.get("cameras", range(len(frames)))]
+    for role in ("colors", "labels", "confidence", "mask", "world_from_camera"):
+        lacking = [name for name, frame in zip(names, frames) if getattr(frame, role) is None]
+        if lacking and len(lacking) < len(frames):
+            having = name_some(set(names) - set(lacking))
+            raise ShapeError(
+                f"join_views: cameras {name_some(lacking)} have no {role}, {having} have, and "
+                f"all views of a sample have the same: read one camera, or leave {role} out"
+            )
     return DepthFrame(
         depth=torch.cat([frame.depth for frame in frames]),
         camera=_join_cameras([frame.camera for frame in frames]),
@@ -42,7 +53,6 @@ def join_views(frames: Sequence[DepthFrame], provenance: Mapping[str, Any]) -> D
 
 
 def _join(images: Sequence[Tensor | None]) -> Tensor | None:
-    """Join what is there; fewer than there are views, and the frame refuses them."""
     present = [image for image in images if image is not None]
     return torch.cat(present) if present else None
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,10 +131,24 @@ class _LeRobotSource(Source):
                 self.frame_id = frame or self._facts.frame_id
             chosen = chosen_cameras(where, camera, found)
             self._told += [f"depth of camera {one.camera}" for one in found if one not in chosen]
+            if any(one.color is None for one in chosen):  # views of a sample have color all, or none
+                self._told += [
+                    f"color {one.color} of camera {one.camera}, since not all cameras that are read have color"
+                    for one in chosen
+                    if one.color is not None
+                ]
+                chosen = [replace(one, color=None) for one in chosen]
             for stream in chosen:
                 self._views.append(
                     self._view(where, stream, metres_per_unit, intrinsics, direction, is_only=len(found) == 1)
                 )
+            if any(view.pose is None for view in self._views):  # of poses the same
+                self._told += [
+                    f"poses {view.pose.column} of camera {view.stream.camera}, since those of others are not known"
+                    for view in self._views
+                    if view.pose is not None
+                ]
+                self._views = [replace(view, pose=None) for view in self._views]
             check_sizes(where, [view.stream for view in self._views])
         self._signals = signal_columns(where, self._index, self._facts, self._used(), stated)
         ids = [f"{one.number:06d}-{step:06d}" for one in self._index.episodes for step in range(one.length)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -95,9 +96,10 @@ def lens_of(
     beside = intrinsics_beside(where, path, inside, stream)
     if beside is not None:
         return lens_of_numbers(*beside)
+    of_it = f"--option 'intrinsics={{{json.dumps(stream.camera)}: [FX, FY, CX, CY]}}'"
     raise IntrinsicsError(
         f"{where}: nothing states the intrinsics of camera {stream.camera!r}; say intrinsics={{{stream.camera!r}: "
-        f"(fx, fy, cx, cy)}} in pixels" + (" (--intrinsics FX FY CX CY)" if is_only else " (--option intrinsics=...)")
+        f"(fx, fy, cx, cy)}} in pixels ({'--intrinsics FX FY CX CY' if is_only else of_it})"
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, PcdataError
@@ -33,6 +33,7 @@ from pcdata.io.sources.source import Source
 from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
 from pcdata.structures.episodes import checked_episodes, joined_episodes, kept_episodes
 
+_Value = TypeVar("_Value")
 _SUFFIXES = tuple(container.suffix for container in CONTAINERS)
 
 
@@ -63,13 +64,13 @@ class _RosSource(Source):
         cloud: str | None = None,
         registered: bool = False,
         color_from_depth: Sequence[float] | None = None,
-        metres_per_unit: float | None = None,
+        metres_per_unit: float | Mapping[str, float] | None = None,
         invalid_values: Collection[int] = (),
-        intrinsics: tuple[float, float, float, float] | None = None,
+        intrinsics: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
         frame_id: str | None = None,
         poses: Mapping[str, str] | None = None,
         signals: Mapping[str, Any] | None = None,
-        clock: Clock = "header",
+        clock: Clock | None = None,
         max_time_apart: float = 0.034,
         max_gap: float = 0.1,
         links_to: LinkTargets = (),
@@ -85,14 +86,16 @@ class _RosSource(Source):
                 there is no depth.
             registered: register depth to color images of another camera.
             color_from_depth: the depth-to-color matrix, 16 numbers row by row, where tf does not tell it.
-            metres_per_unit: length of one stored unit; None = that of the encoding: 16UC1 millimetres, 32FC1 metres.
+            metres_per_unit: length of one stored unit, or of several topics of depth, by topic; None = that of the
+                encoding: 16UC1 millimetres, 32FC1 metres.
             invalid_values: stored whole numbers besides 0 that mean "no reading".
-            intrinsics: (fx, fy, cx, cy) in pixels, where no message describes the one camera.
+            intrinsics: (fx, fy, cx, cy) in pixels, where no message describes the one camera; or by topic of images.
             frame_id: a frame of tf that poses shall lead to, such as "base_link"; None = no poses.
             poses: by the name of a signal, the frame of tf whose pose in ``frame_id`` it is.
             signals: by the name of a stream, its topic without the first slash: kind, and maybe frame, rule ("nearest",
                 "linear", "slerp", "step") and max_gap; or None, to leave it out. Joints are read without being named.
-            clock: "header", when a message was taken; or "recorded".
+            clock: "header", when a message was taken; or "recorded"; None = that of the headers, where those of all
+                streams are of one clock that goes on, by the times of recording.
             max_time_apart: seconds between images of one sample; the default is one frame at 30 Hz.
             max_gap: seconds from a depth image to the farther of two messages that are interpolated.
             links_to: folders outside that links in the capture may lead to.
@@ -115,8 +118,8 @@ class _RosSource(Source):
             color_from_depth=None
             if color_from_depth is None
             else check_motion(where, "color_from_depth", color_from_depth),
-            metres_per_unit=None if metres_per_unit is None else check_metres_per_unit(where, metres_per_unit),
-            intrinsics=None if intrinsics is None else check_pinhole(where, intrinsics),
+            metres_per_unit=_by_topic(where, metres_per_unit, check_metres_per_unit),
+            intrinsics=_by_topic(where, intrinsics, check_pinhole),
             clock=_clock(where, clock),
         )
         joining = Joining(
@@ -136,7 +139,7 @@ class _RosSource(Source):
             if topic is None:
                 self._recordings[name] = JoinedRecording(at, log, choice, joining)
             else:
-                self._recordings[name] = CloudRecording(at, log, topic, choice.clock, choice.metres_per_unit)
+                self._recordings[name] = CloudRecording(at, log, topic, choice)
             self._paths[name] = part
         self._numbers: dict[str, tuple[str, int]] = {}
         skipped: dict[str, str] = {}
@@ -298,7 +301,15 @@ def _mapping(where: str, option: str, given: Any) -> Mapping[str, str] | None:
     return given
 
 
-def _clock(where: str, given: Any) -> Clock:
-    if given not in CLOCKS:
+def _by_topic(where: str, given: Any, check: Callable[[str, Any], _Value]) -> _Value | dict[str, _Value] | None:
+    """Return what is said of one camera, or of several, by the topics of their images."""
+    if isinstance(given, Mapping):
+        return {str(topic): check(where, value) for topic, value in given.items()}
+    return None if given is None else check(where, given)
+
+
+def _clock(where: str, given: Any) -> Clock | None:
+    if given is not None and given not in CLOCKS:
         raise ConfigError(f"{where}: clock must be one of {', '.join(CLOCKS)}, got {given!r:.100}")
-    return given
+    known: Clock | None = given
+    return known

@@ -70,11 +70,68 @@ def test_joints_on_another_clock_are_named_and_joined_by_the_recorder_s(tmp_path
         time = EPOCH + number * STEP
         entries.append(("/joint_states", time, make.joints(time + HOUR, a=float(number))))
     path = written(tmp_path / "a.mcap", entries, make)
-    with pytest.raises(CaptureError, match=r"its times begin 3\.6e\+03 s after the last depth image.*clock='recorded'"):
+    with pytest.raises(
+        CaptureError, match=r"joint_states are 3\.6e\+03 s ahead of those of /cam/depth.*clock='recorded'"
+    ):
         open_source(path)
+    with pytest.raises(CaptureError, match=r"its times begin 3\.6e\+03 s after the last depth image.*clock='recorded'"):
+        open_source(path, clock="header")
     source = open_source(path, clock="recorded")
     assert [float(source.signals(name)["joint_states/position"].values) for name in source.ids] == [0, 1, 2, 3]
     assert len(open_source(path, signals={"joint_states/position": None})) == 4
+
+
+@pytest.mark.parametrize("stream", ["color", "joints", "tf"])
+def test_streams_on_another_clock_are_refused_where_they_would_meet_images_of_another_moment(
+    stream: str, tmp_path: Path
+) -> None:
+    make, entries, second = Types(2), list[Entry](), 10**9
+    for number in range(8):
+        time = EPOCH + number * second
+        off = time + 3 * second  # the clock of one stream is three images ahead
+        entries += [
+            ("/cam/depth/image_raw", time + 1, make.image(time, depth_of(number), "16UC1")),
+            ("/cam/depth/camera_info", time + 1, make.camera_info(time)),
+            (
+                "/cam/color/image_raw",
+                time + 1,
+                make.image(off if stream == "color" else time, color_of(number), "rgb8"),
+            ),
+            ("/joint_states", time + 1, make.joints(off if stream == "joints" else time, a=float(number))),
+            (
+                "/tf",
+                time + 1,
+                make.transform(off if stream == "tf" else time, "base", "camera_optical", (number, 0, 0)),
+            ),
+        ]
+    path = written(tmp_path / "a.mcap", entries, make)
+    with pytest.raises(CaptureError, match=r"are 3 s ahead of those of /cam/depth/image_raw.*clock='recorded'"):
+        open_source(path, frame_id="base")
+    source = open_source(path, frame_id="base", clock="recorded")
+    found = [source.load(name) for name in source.ids]
+    assert [float(frame.signals["joint_states/position"]) for frame in found] == list(range(8))
+    assert [float(frame.world_from_camera[0, 0, 3]) for frame in found] == list(range(8))
+    assert [frame.provenance["color_seconds_later"] for frame in found] == [0] * 8
+    assert len(open_source(path, frame_id="base", clock="header")) == 5  # as they stand
+
+
+def test_a_clock_that_is_set_back_does_not_lay_one_run_into_another(tmp_path: Path) -> None:
+    make = Types(2)
+    path = written(tmp_path / "a.mcap", depths(make, [(number % 4 * 2 + 1) * 10**9 for number in range(8)]), make)
+    with pytest.raises(CaptureError, match=r"go back by 6 s at message 4 of 8.*clock='recorded'"):
+        open_source(path)
+    assert open_source(path, clock="recorded").ids == [f"{number:06d}" for number in range(8)]
+    assert len(open_source(path, clock="header")) == 8
+
+
+def test_a_clock_that_stands_still_is_refused_and_images_of_one_time_are_told(tmp_path: Path) -> None:
+    make = Types(2)
+    still = written(tmp_path / "still.mcap", depths(make, [EPOCH] * 4), make)
+    with pytest.raises(CaptureError, match=r"all 4 messages of /cam/depth/image_raw hold one time.*clock='recorded'"):
+        open_source(still)
+    assert len(open_source(still, clock="recorded")) == 4
+    twice = written(tmp_path / "twice.mcap", depths(make, [STAMPS[0], STAMPS[1], STAMPS[1], STAMPS[3]]), make)
+    assert "depth /cam/depth/image_raw: 1 of 4 images have the time of another" in open_source(twice).unread()
 
 
 def test_tf_is_on_the_clock_that_is_asked_for(tmp_path: Path) -> None:

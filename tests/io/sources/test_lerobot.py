@@ -437,3 +437,34 @@ def test_episodes_that_were_not_downloaded_are_left_out_and_told(tmp_path: Path)
     assert source.ids == IDS[2:]
     assert torch.equal(source.load(IDS[2]).depth, metres(2))
     assert "1 episodes whose rows are not there" in source.unread()
+
+
+def test_what_not_all_cameras_have_is_told_and_read_of_one_camera_alone(tmp_path: Path) -> None:
+    depth = [(tenths(step) * 0.0001).astype(np.float32) for step in range(STEPS)]
+    root = made.dataset(
+        tmp_path / "set",
+        {
+            **{f"observation.depth.{name}": number("float32", HEIGHT, WIDTH) for name in ("left", "right")},
+            **{f"observation.intrinsic.{name}": number("float32", 3, 3) for name in ("left", "right")},
+            "observation.images.left": {"dtype": "image", "shape": [HEIGHT, WIDTH, 3], "names": IMAGE_NAMES},
+            "left_camera_pose": number("float32", 4, 4),
+        },
+        {
+            **{f"observation.depth.{name}": depth for name in ("left", "right")},
+            **{f"observation.intrinsic.{name}": [K] * STEPS for name in ("left", "right")},
+            "observation.images.left": [made.png(made.color(step)) for step in range(STEPS)],
+            "left_camera_pose": [POSE] * STEPS,
+        },
+    )
+    source = open_source(root)
+    both = source.load(source.ids[0])
+    assert both.num_views == 2
+    assert (both.colors, both.world_from_camera) == (None, None)
+    assert [line.split(" of camera left")[0] for line in source.unread() if "of camera left" in line] == [
+        "color observation.images.left",
+        "poses left_camera_pose",
+    ]
+    left = open_source(root, camera="left")
+    frame = left.load(left.ids[0])
+    assert frame.colors is not None
+    assert frame.world_from_camera is not None

@@ -325,6 +325,30 @@ def test_several_depth_cameras_are_listed_and_read_as_views_or_one_by_one(tmp_pa
         open_source(path, depth="/right/depth/image")
 
 
+def test_what_one_camera_lacks_is_said_of_that_camera(tmp_path: Path) -> None:
+    names = ["/left/depth/image_raw", "/right/depth/image_raw"]
+    entries = [one for one in two_cameras() if one[0] != "/right/depth/camera_info"]
+    pixels = color_of(0)
+    entries.append(("/left/color/image_raw", EPOCH, ROS2.image(EPOCH, pixels, "rgb8")))
+    path = mcap(tmp_path, entries)
+    with pytest.raises(IntrinsicsError, match=r'say intrinsics=\{"/right/depth/image_raw": \[FX, FY, CX'):
+        open_source(path, depth=names)
+    with pytest.raises(ConfigError, match=r'of one camera, and 2 are read; say of which: intrinsics=\{"/left/depth'):
+        open_source(path, depth=names, intrinsics=(30, 31, 8, 6))
+    with pytest.raises(
+        ConfigError, match=r"metres_per_unit: no topic of images is called '/up'; there are /left/color"
+    ):
+        open_source(path, depth=names, metres_per_unit={"/up": 0.001})
+    source = open_source(
+        path, depth=names, intrinsics={names[1]: (30, 31, 8, 6)}, metres_per_unit={names[1]: 0.0001}, clock="header"
+    )
+    frame = source.load("000002")
+    assert frame.camera.intrinsics[:, 0, 0].tolist() == [20, 30]
+    torch.testing.assert_close(frame.depth, torch.stack([metres(depth_of(2)), metres(depth_of(52)) / 10]))
+    assert frame.colors is None
+    assert any("not all cameras that are read have color" in line for line in source.unread())
+
+
 def test_what_holds_no_depth_is_told_with_its_topics(tmp_path: Path) -> None:
     with pytest.raises(
         CaptureError, match=r"(?s)no topic holds depth.*/joint_states \(sensor_msgs/msg/JointState, 20 mess"
