@@ -36,12 +36,13 @@ def work_on_ray(job: Job, shards: Iterable[int], tally: Tally, *, tasks: int, ti
 
     Raises:
         MissingExtraError: Ray is not installed.
+        CacheError: no Ray can be reached or started.
         PcdataError: the build must stop; what is committed stays.
     """
     ray: Any = extras.require("ray")
     is_ours = not ray.is_initialized()
     if is_ours:
-        ray.init(log_to_driver=False, logging_level="warning")
+        _start(ray)
     running: dict[Any, Task] = {}
     try:
         most = tasks or max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -64,6 +65,16 @@ def work_on_ray(job: Job, shards: Iterable[int], tally: Tally, *, tasks: int, ti
                     ray.cancel(task_running, force=True)
             if is_ours:
                 ray.shutdown()
+
+
+def _start(ray: Any) -> None:
+    try:
+        ray.init(log_to_driver=False, logging_level="warning")
+    except Exception as error:  # of many types: no such cluster, another version, a machine that is too busy
+        raise CacheError(
+            f"build_dataset: no Ray can be reached or started: {str(error) or type(error).__name__:.500}; see RAY_ADDRESS "
+            "and 'ray status', or build with --engine pool"
+        ) from error
 
 
 def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: Tally) -> None:

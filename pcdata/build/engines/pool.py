@@ -69,6 +69,9 @@ def work_in_pool(job: Job, shards: Iterable[int], tally: Tally, *, workers: int,
             pool[:] = [worker for worker in pool if worker.is_alive]
         for worker in pool:
             worker.dismiss()
+        until = time.monotonic() + _GRACE  # they end side by side
+        for worker in pool:
+            worker.process.join(max(0.0, until - time.monotonic()))
     finally:
         with shielded():
             for worker in pool:
@@ -204,7 +207,6 @@ class _Worker:
         """Let it end by itself."""
         with suppress(OSError):
             self.pipe.send(None)
-        self.process.join(_GRACE)
 
     def end(self) -> None:
         """End it, at once."""
