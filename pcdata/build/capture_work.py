@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pcdata.build.config import BuildConfig
+from pcdata.build.origins import Origin, origin_of
 from pcdata.build.records import BuiltSample
 from pcdata.errors import CacheError, CaptureError, ConfigError, WriteError
 from pcdata.files.inputs import Inputs, recording
@@ -26,6 +27,7 @@ class Made:
     record: Record
     signals: Mapping[str, Signal]
     sample: BuiltSample
+    origin: Origin
 
 
 class CaptureWork:
@@ -63,7 +65,7 @@ class CaptureWork:
             cloud.num_points,
             record.digest(),
         )
-        return Made(capture, record, _one_each(cloud), sample)
+        return Made(capture, record, _one_each(cloud), sample, origin_of(cloud))
 
 
 def keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:

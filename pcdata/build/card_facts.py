@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pcdata.build.card_answers import UNKNOWN, CardAnswers
+from pcdata.build.origins import OTHERS
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.datasets.splits import Splits
 from pcdata.io.store.cloud_record import cloud_from_record
@@ -17,9 +17,6 @@ from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.shards import Shards, hash_of
 from pcdata.structures import PointCloud
 from pcdata.validation.step_losses import PERCENTILES
-
-_SENSOR = ("sensor", "sensor_name", "serial", "registered_to")  # in the provenance of a capture
-_DEPTH_ERROR = "depth_error_mm"  # there too: what a codec may have changed
 
 # What people must say, and how.
 _ASKED = {
@@ -77,24 +74,25 @@ class CardFacts:
 
     @property
     def sensor(self) -> str:
-        """The depth camera: as somebody said, else as the first capture tells."""
-        said = self.provenance
-        told = ", ".join(f"{name} {said[name]}" for name in _SENSOR if said.get(name) is not None)
-        return self.answers.sensor or told or UNKNOWN
+        """The depth camera: as somebody said, else as the captures tell, with counts where they differ."""
+        return self.answers.sensor or self.told("sensor")
 
     @property
     def depth_error(self) -> str:
         """What the way from the sensor to here may have changed in the depth."""
-        bound = self.provenance.get(_DEPTH_ERROR)
-        return f"at most {bound} mm (as the codec of the source states)" if bound is not None else UNKNOWN
+        return self.told("depth")
 
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        """What the first capture says of its origin."""
-        found = self.first.meta[0].get("provenance") if self.first.meta else None
-        return found if isinstance(found, dict) else {}
+    def told(self, fact: str) -> str:
+        """Return what the captures say of one fact, with the number of samples where they differ."""
+        counts: dict[str, int] = {}
+        for origin in self.manifest.origins:
+            words = str(origin.get(fact) or UNKNOWN) if OTHERS not in origin else f"{origin[OTHERS]} other kinds"
+            counts[words] = counts.get(words, 0) + int(origin.get("samples", 0))
+        if len(counts) < 2:
+            return next(iter(counts), UNKNOWN)
+        return "; ".join(f"{words} ({count:,} samples)" for words, count in counts.items())
 
     def missing(self) -> list[str]:
         """Name what is not known, each with the way to say it."""
-        known = {**vars(self.answers), "sensor": None if self.sensor == UNKNOWN else self.sensor}
+        known = {**vars(self.answers), "sensor": None if UNKNOWN in self.sensor else self.sensor}
         return [f"  {name}: {how}, or {name} in card.yaml" for name, how in _ASKED.items() if known[name] is None]

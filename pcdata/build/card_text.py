@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pcdata.build.card_answers import UNKNOWN
 from pcdata.build.card_facts import CardFacts
 from pcdata.build.escaped_text import as_markdown
+from pcdata.build.origins import OTHERS, counted
 from pcdata.validation.step_losses import PERCENTILES
 from pcdata.yaml_nodes import yaml_text
 
@@ -97,9 +98,10 @@ def _pipeline(facts: CardFacts) -> list[str]:
         _fenced(yaml_text(manifest.pipeline), "yaml"),
     ]
     if manifest.steps:
-        header = ("points after", "samples", *PERCENTILES)
-        counts = [(one.get("step"), *(one.get(name) for name in header[1:])) for one in manifest.steps]
-        parts += ["### Counts after each step", _table(header, counts)]
+        header = ("step", "samples", "median before", *(f"{name} after" for name in PERCENTILES))
+        names = ("step", "samples", "before", *PERCENTILES)
+        counts = [["" if one.get(name) is None else one[name] for name in names] for one in manifest.steps]
+        parts += ["### Points before and after each step", _table(header, counts)]
     if manifest.alarms:
         told = [f"- {as_markdown(one.get('name'))}: {as_markdown(one.get('found'))}" for one in manifest.alarms]
         parts += ["### Steps that drop more than is usual", "\n".join(told)]
@@ -120,17 +122,42 @@ def _points(facts: CardFacts) -> list[str]:
 def _coordinates(facts: CardFacts) -> list[str]:
     cloud = facts.first
     rows = [
-        ("frame of the points", cloud.frame_id),
-        ("unit", cloud.unit),
-        ("frames that the first sample knows", ", ".join(cloud.frames) or "none"),
         ("axes of cameras", "x right, y down, z forward (OpenCV)"),
         ("depth that is no reading", "0, and left out"),
     ]
-    parts = ["## Frames and units", _table(("fact", "value"), rows)]
+    header = ("samples", "points in", "unit", "captured in", "other frames, known from there", "fields")
+    parts = [
+        "## Frames and units",
+        _table(("fact", "value"), rows),
+        _table(header, [*map(_frames, _by_frames(facts))]),
+    ]
     if signals := cloud.recorded_signals:
         told = [(name, one.kind, one.frame or "none") for name, one in signals.items()]
         parts += ["Signals:", _table(("signal", "kind", "frame"), told)]
     return parts
+
+
+def _by_frames(facts: CardFacts) -> list[dict[str, Any]]:
+    """Return the origins of the samples, whatever they say of sensor and depth."""
+    return counted(
+        {name: value for name, value in origin.items() if name not in ("sensor", "depth")}
+        for origin in facts.manifest.origins
+    )
+
+
+def _frames(origin: Mapping[str, Any]) -> tuple[object, ...]:
+    """Return the row of the samples of one origin: their frames are a tree whose root is that of the capture."""
+    if OTHERS in origin:
+        return (origin.get("samples"), f"{origin[OTHERS]} other kinds", "", "", "", "")
+    fields = origin.get("fields")
+    return (
+        origin.get("samples"),
+        origin.get("frame"),
+        origin.get("unit"),
+        origin.get("source_frame"),
+        ", ".join(map(str, origin.get("frames") or ())) or "none",
+        ", ".join(f"{name} {kind}" for name, kind in fields.items()) if isinstance(fields, Mapping) else "",
+    )
 
 
 def _splits(facts: CardFacts) -> list[str]:
@@ -156,7 +183,9 @@ def _left_out(facts: CardFacts) -> list[str]:
 
 def _files(facts: CardFacts) -> list[str]:
     manifest = facts.manifest
-    raw = "lie beside the clouds, below `raw/` of each shard" if manifest.keep_raw else "are not in the dataset"
+    raw = "lie beside the clouds, below `raw/` of each shard"
+    if not manifest.keep_raw:
+        raw = "stay in the source, under the ids of the samples"
     words = (
         f"Clouds are stored as {as_markdown(manifest.format)}, compression {as_markdown(manifest.compression)}, in "
         f"{manifest.index.num_shards:,} shards; depth images, color and calibration {raw}. `python load.py` loads them "

@@ -20,6 +20,7 @@ from pcdata.build.card_facts import CardFacts
 from pcdata.build.carried import carried_answers, carry_splits
 from pcdata.build.config import BuildConfig
 from pcdata.build.loading_script import loading_script
+from pcdata.build.origins import commonest
 from pcdata.build.records import ShardRecord
 from pcdata.build.shard_work import Job, signals_of_shard
 from pcdata.build.source_state import captures_digest
@@ -91,6 +92,7 @@ def complete_dataset(
             quarantined={name: why for record in ordered for name, why in record.quarantined.items()},
             streams=tuple(streams_of(source)),
             steps=tuple(step_statistics(counts_of(records))),
+            origins=tuple(commonest(one for record in ordered for one in record.origins)),
             alarms=tuple(finding.to_json() for finding in alarms),
             model=_model_of(config),
             source=json.loads(json.dumps(opened)),  # lists, as it will be read

@@ -43,6 +43,7 @@ class ShardRecord:
     quarantined: Mapping[str, str] = field(default_factory=dict)  # id -> error
     signals: Mapping[str, str] = field(default_factory=dict)  # as a manifest has them, of this shard
     files: Mapping[str, int] = field(default_factory=dict)  # bytes of each
+    origins: list[dict[str, Any]] = field(default_factory=list)  # where the samples come from, with counts
 
     @property
     def folder_name(self) -> str:

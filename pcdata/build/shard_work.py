@@ -17,6 +17,7 @@ from typing import Protocol
 from pcdata.build.building_folder import SHARD, SIGNALS, BuildingFolder
 from pcdata.build.capture_work import CaptureWork, keep_raw
 from pcdata.build.config import BuildConfig
+from pcdata.build.origins import Origin, counted
 from pcdata.build.plan import Plan
 from pcdata.build.records import BuiltSample, ShardRecord
 from pcdata.build.source_state import captures_digest
@@ -91,6 +92,7 @@ class _ShardWork:
         self.job, self.shard, self.watch = job, shard, watch
         self.quarantined = dict(given_up)
         self.failed_once: set[str] = set()
+        self.origins: list[Origin] = []  # of the samples that are stored
 
     def run(self) -> ShardRecord:
         """Work until every capture is stored or quarantined."""
@@ -112,6 +114,7 @@ class _ShardWork:
                     {name: self.quarantined[name] for name in order},
                     told,
                     folder.sizes_on_disk(scratch / SHARD),
+                    counted(self.origins),
                 )
                 folder.commit(scratch, record)
                 return record
@@ -125,6 +128,7 @@ class _ShardWork:
         samples: list[BuiltSample] = []
         signals: list[Mapping[str, Signal]] = []
         failed: dict[str, str] = {}
+        self.origins.clear()
         with closing(STORES[job.format](scratch / SHARD, job.compression)) as store:
             for sample_id in ids:
                 if sample_id in self.quarantined:
@@ -145,6 +149,7 @@ class _ShardWork:
                     raise
                 inputs.check_latest("build_dataset")
                 samples.append(made.sample)
+                self.origins.append(made.origin)
                 signals.append(made.signals)
                 self.watch.ends(sample_id, None)
             inputs.check("build_dataset")

@@ -86,10 +86,16 @@ def judge_step_losses(counts: Mapping[str, Counts]) -> list[Finding]:
 def step_statistics(counts: Mapping[str, Counts]) -> list[dict[str, Any]]:
     """Return how many points every step left, as plain numbers: the smallest, the largest and percentiles.
 
-    Chains of different steps follow each other; ``samples`` tells how many captures went through each.
+    Chains of different steps follow each other; ``samples`` tells how many captures went through each, ``before`` the
+    median before the step, where points are known.
     """
     return [
-        {"step": step, "samples": len(ids), **_percentiles(table[:, place])}
+        {
+            "step": step,
+            "samples": len(ids),
+            "before": _percentiles(table[:, place - 1])["median"] if place else None,
+            **_percentiles(table[:, place]),
+        }
         for names, (ids, table) in _chains(counts).items()
         for place, step in enumerate(names)
     ]

@@ -12,9 +12,11 @@ import yaml
 from pcdata import PointCloud, build_dataset, split_dataset
 from pcdata.build import config_from_yaml, write_card
 from pcdata.build.escaped_text import as_markdown
+from pcdata.build.origins import commonest
 from pcdata.cli.main import main
 from pcdata.errors import ConfigError
 from pcdata.files.whole_folders import is_free
+from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.shards import hash_of
 
 EVIL = [
@@ -80,7 +82,7 @@ def test_a_build_writes_a_card_of_what_happened(folder):
         "size_categories": ["n<1K"],
         "tags": ["point-cloud", "depth", "robotics", "3d", "pcdata"],
     }
-    assert "| Center | 4 | 3 | 3 | 5 | 6 | 6 |" in text
+    assert "| Center | 4 | (empty) | 3 | 3 | 5 | 6 | 6 |" in text
     assert "| 4 | 3 | 3 | 5 | 6 | 6 | 0 |" in text
     assert "| sensor | UNKNOWN |" in text
     assert not list(folder.glob("*.tmp*"))
@@ -166,6 +168,29 @@ def test_names_of_samples_sensors_and_errors_cannot_write_into_the_card(tmp_path
     rows = [line for line in body.splitlines() if line.startswith("| bad")]
     assert len(rows) == 1
     assert rows[0].count("|") == 3
+
+
+def test_sensors_that_differ_are_listed_with_the_samples_of_each(tmp_path):
+    class Several(Clouds):
+        def load(self, sample_id):
+            cloud, place = super().load(sample_id), self.ids.index(sample_id)
+            said = {"sensor": "D435", "serial": place // 3, "metres_per_unit": 0.001} if place < 5 else {}
+            return cloud.with_meta([{"provenance": said}])
+
+    config = config_from_yaml("cloud: [Center]\noutput: {format: npz, shard_size: 2}")
+    build_dataset(config, Several("abcdef"), tmp_path / "set")
+    text = (tmp_path / "set" / "README.md").read_text()
+    told = "sensor D435, serial 0 (3 samples); sensor D435, serial 1 (2 samples); UNKNOWN (1 samples)"
+    assert f"| sensor | {told} |" in text
+    assert "read exactly, in the steps of 1 mm that it was stored in (5 samples); UNKNOWN (1 samples)" in text
+    assert "| 6 | base/centered | m | base | none | points float32 |" in text
+    assert any("sensor" in line for line in write_card(tmp_path / "set"))  # one is not known
+    assert (tmp_path / "set" / "README.md").read_text() == text
+    build_dataset(config, Several(f"s{n}" for n in range(60)), tmp_path / "more")
+    origins = Manifest.read(tmp_path / "more").origins
+    assert [one["samples"] for one in origins] == [3, 2, 55]
+    kinds = commonest([{"sensor": f"{n}", "samples": 1 + (n == 7)} for n in range(60)])
+    assert (kinds[7]["samples"], kinds[-1], len(kinds)) == (2, {"others": 10, "samples": 10}, 51)
 
 
 @pytest.mark.filterwarnings("ignore")  # of what those packages use in turn

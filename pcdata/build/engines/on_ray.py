@@ -72,8 +72,8 @@ def _start(ray: Any) -> None:
         ray.init(log_to_driver=False, logging_level="warning")
     except Exception as error:  # of many types: no such cluster, another version, a machine that is too busy
         raise CacheError(
-            f"build_dataset: no Ray can be reached or started: {str(error) or type(error).__name__:.500}; see RAY_ADDRESS "
-            "and 'ray status', or build with --engine pool"
+            f"build_dataset: no Ray can be reached or started: {str(error) or type(error).__name__:.500}; see "
+            "RAY_ADDRESS and 'ray status', or build with --engine pool"
         ) from error
 
 

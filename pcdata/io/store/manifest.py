@@ -55,6 +55,7 @@ class Manifest:
     signals_files: Mapping[str, Any] = field(default_factory=dict)  # bytes and sha256 of each; filled in when written
     streams: Sequence[Mapping[str, Any]] = ()  # of the recordings: how each was joined, and what that left
     steps: Sequence[Mapping[str, Any]] = ()  # points after each step, over all samples: see step_statistics
+    origins: Sequence[Mapping[str, Any]] = ()  # what the captures say of sensor, depth and frames: see build.origins
     alarms: Sequence[Mapping[str, Any]] = ()  # steps that drop too much, and captures that are outliers of the rest
     schema: str = SCHEMA
 
@@ -132,7 +133,7 @@ class Manifest:
                 )
             samples = SampleIndex.read(Path(folder), content.pop("index"), content.pop("num_samples"))
             listed: dict[str, Any] = {"samples": samples}
-            for name in ("imports", "streams", "steps", "alarms"):
+            for name in ("imports", "streams", "steps", "origins", "alarms"):
                 if isinstance(content.get(name), list):
                     listed[name] = tuple(content.pop(name))
             if "episodes" in content:
@@ -198,7 +199,7 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"signals must have a digest or a fault, got {manifest.signals!r:.100}")
     if not all(isinstance(told, dict) and set(told) == {"bytes", "sha256"} for told in manifest.signals_files.values()):
         raise CacheError(f"signals_files must give bytes and sha256 of each, got {manifest.signals_files!r:.100}")
-    for name in ("streams", "steps", "alarms"):
+    for name in ("streams", "steps", "origins", "alarms"):
         entries = getattr(manifest, name)
         if not isinstance(entries, tuple) or not all(isinstance(one, dict) for one in entries):
             raise CacheError(f"{name} must list objects, got {entries!r:.100}")
