@@ -104,6 +104,7 @@ _HOMES = {
         "CountedSampler",
         "DevicePipeline",
         "EpisodeWindows",
+        "StreamedCloudDataset",
         "collate_fixed",
         "collate_packed",
         "collate_padded",

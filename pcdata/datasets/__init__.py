@@ -18,6 +18,7 @@ from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.datasets.samples import SampleDataset
 from pcdata.datasets.split_dataset import split_dataset
 from pcdata.datasets.splits import Splits
+from pcdata.datasets.streamed import StreamedCloudDataset
 from pcdata.datasets.window_batch import WindowBatch
 from pcdata.datasets.windows import EpisodeWindows
 
@@ -32,6 +33,7 @@ __all__ = [
     "RepeatedEpochWarning",
     "SampleDataset",
     "Splits",
+    "StreamedCloudDataset",
     "WindowBatch",
     "collate_fixed",
     "collate_packed",

@@ -21,6 +21,7 @@ from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.sample_index import SampleIndex
 from pcdata.io.store.shards import SIGNALS_KEY, Shards, shard_folder
+from pcdata.io.store.url_dataset import UrlShards, fetch, opened_folder
 from pcdata.rng import Streams
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.episodes import kept_episodes
@@ -39,7 +40,8 @@ class CachedCloudDataset(SampleDataset):
     is read.
 
     Args:
-        folder: the dataset's folder.
+        folder: the dataset's folder; or, where its format is ``webdataset``, its URL (``s3://bucket/set``, by fsspec),
+            which :class:`StreamedCloudDataset` goes through with few requests: here every sample is one.
         pipeline: the pipeline you expect; a cache made by other deterministic steps is refused. None = trust the
             cache's own.
         augment: what runs on the stored clouds: "stored" = the random suffix of the pipeline, None = nothing, or any
@@ -48,6 +50,7 @@ class CachedCloudDataset(SampleDataset):
         repeats: how often every sample is in the dataset, each time with other random draws.
         split: the samples of one split alone, such as "train"; see :func:`pcdata.split_dataset`. None = all.
         splits: the file that says which those are; None = ``splits.json`` of the dataset.
+        storage_options: of a URL, what fsspec's file system takes, such as ``{"anon": True}``.
 
     Raises:
         CacheError: damaged, hostile or incomplete files, another pipeline's cache, or no splits of these samples.
@@ -64,6 +67,7 @@ class CachedCloudDataset(SampleDataset):
         repeats: int = 1,
         split: str | None = None,
         splits: str | Path | None = None,
+        storage_options: Mapping[str, Any] | None = None,
     ) -> None:
         if isinstance(augment, str) and augment != "stored":
             raise ConfigError(f"augment must be 'stored', None or a transform, got {augment!r}")
@@ -72,15 +76,16 @@ class CachedCloudDataset(SampleDataset):
                 f"pipeline must be a Compose, not {type(pipeline).__name__}; of a configuration file it is "
                 "pcdata.load_config(path).pipeline"
             )
-        self.folder = Path(folder)
-        self.manifest = Manifest.read(folder)
+        self.folder, server = opened_folder("CachedCloudDataset", folder, storage_options)
+        self._name = str(self.folder if server is None else server)
+        self.manifest = Manifest.read(self.folder)
         stored = self._stored_pipeline()
         self._warn_of_other_files()
         wanted = stored if pipeline is None else pipeline
         fingerprint = wanted.stored_fingerprint()
         if fingerprint != self.manifest.fingerprint:
             raise CacheError(
-                f"{folder}: the cache was made by other deterministic steps than the ones given "
+                f"{self._name}: the cache was made by other deterministic steps than the ones given "
                 f"(fingerprint {self.manifest.fingerprint[:12]}, expected {fingerprint[:12]}): "
                 f"{wanted.difference(stored)}; rebuild it with this pipeline, or load it with its own"
             )
@@ -89,6 +94,8 @@ class CachedCloudDataset(SampleDataset):
         ids: Sequence[str] = self.manifest.index.ids
         self.split = split
         self.splits = self.folder / SPLITS if splits is None else Path(splits)
+        if split is not None and splits is None and server is not None:
+            fetch(server, self.folder, SPLITS)
         self._rows: Sequence[int] = range(len(ids))  # of the samples in the index
         if split is not None:
             self._rows = Splits.read(self.splits, ids).rows(split, ids)
@@ -96,7 +103,10 @@ class CachedCloudDataset(SampleDataset):
         elif splits is not None:
             raise ConfigError(f"splits {str(splits)!r} say nothing without split, such as split='train'")
         super().__init__(ids, transform, seed, repeats)
-        self._shards = Shards(self.folder, self.manifest.format, self.manifest.index)
+        form, index = self.manifest.format, self.manifest.index
+        self._shards = (
+            Shards(self.folder, form, index) if server is None else UrlShards(server, self.folder, form, index)
+        )
         self._touched = _FirstTouch(self.manifest.index)
 
     def _stored_pipeline(self) -> Compose:
@@ -126,7 +136,7 @@ class CachedCloudDataset(SampleDataset):
             others = {mine[name].name for name in one["transforms"] if name in mine}
             if others and one["sha256"] not in known:
                 warnings.warn(
-                    f"{self.folder}: was built with another {one['file']} (sha256 {one['sha256'][:12]}) than the "
+                    f"{self._name}: was built with another {one['file']} (sha256 {one['sha256'][:12]}) than the "
                     f"{', '.join(sorted(others))} that is imported; rebuild it if its steps have changed",
                     PcdataWarning,
                     stacklevel=4,
@@ -151,10 +161,10 @@ class CachedCloudDataset(SampleDataset):
         """
         told = self.manifest.signals
         if "fault" in told:
-            raise ShapeError(f"{self.folder}: its samples have no signals in common: {told['fault']}; build it again")
+            raise ShapeError(f"{self._name}: its samples have no signals in common: {told['fault']}; build it again")
         if "digest" not in told:
             return {}
-        record, path = self._shards.signals(), self._shards.signals_store().path_of(SIGNALS_KEY)
+        record, path = self._shards.signals(), self._shards.signals_store().place_of(SIGNALS_KEY)
         if record.digest() != told["digest"]:
             raise CacheError(f"{path}: the signals differ from what was written; rebuild the dataset")
         try:
@@ -168,12 +178,12 @@ class CachedCloudDataset(SampleDataset):
 
     def _load(self, index: int) -> PointCloud:
         row = self._rows[index]
-        record = None
-        if self._compared([row]):
-            record = self._shards.read_joined([row]) or self._shards.read(row)
-        else:
-            record = self._shards.read(row)
-            self._check_digest(row, record.digest())
+        with self._shards.held([row]):
+            if self._compared([row]):
+                record = self._shards.read_joined([row]) or self._shards.read(row)
+            else:
+                record = self._shards.read(row)
+                self._check_digest(row, record.digest())
         try:
             cloud = cloud_from_record(record)
         except CacheError as error:
@@ -198,7 +208,7 @@ class CachedCloudDataset(SampleDataset):
             raise self._fault(row, " differs from what was written")
 
     def _fault(self, row: int, what: str) -> CacheError:
-        path = self._shards.path_of(row)
+        path = self._shards.place_of(row)
         error = CacheError(f"{path}: sample {self.manifest.index.ids[row]!r}{what}; rebuild the dataset")
         locate(error, path=path)
         return error
@@ -206,7 +216,8 @@ class CachedCloudDataset(SampleDataset):
     def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
         """Return the clouds of some samples as one batch; None where that of one by one would be another."""
         rows = [self._rows[number] for number in numbers]
-        record = self._shards.read_joined(rows, batch_memory) if self._compared(rows) else None
+        with self._shards.held(rows):
+            record = self._shards.read_joined(rows, batch_memory) if self._compared(rows) else None
         if record is None:
             single = [self._load(number) for number in numbers]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
@@ -250,7 +261,7 @@ class CachedCloudDataset(SampleDataset):
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f" of {self.split}"
-        return f"CachedCloudDataset({str(self.folder)!r}, {len(self)} samples{split}, {self.manifest.format})"
+        return f"CachedCloudDataset({self._name!r}, {len(self)} samples{split}, {self.manifest.format})"
 
 
 class _FirstTouch:

@@ -9,6 +9,7 @@ import torch
 from torch.utils.data import get_worker_info
 
 from pcdata.datasets.samples import DRAWS, SampleDataset
+from pcdata.datasets.streamed import StreamedCloudDataset
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
@@ -48,6 +49,8 @@ class DevicePipeline:
     ) -> None:
         _refuse_workers()
         dataset = getattr(loader, "dataset", None)
+        if isinstance(dataset, StreamedCloudDataset):
+            dataset = dataset.dataset
         if not isinstance(dataset, SampleDataset):
             raise DTypeError(
                 f"DevicePipeline: loader must be a DataLoader of a dataset of pcdata, got {type(loader).__name__} of "

@@ -21,6 +21,7 @@ from pcdata.datasets.windows import EpisodeWindows
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, ShapeError, near_matches
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.structure import Structure
+from pcdata.structures.unbatched import Unbatched
 
 Mode = Literal["limits", "gaussian"]
 
@@ -66,7 +67,7 @@ def fit_normalizers(
     ``if_short: zeros`` added does not.
 
     Args:
-        data: a dataset, or batches as a loader gives them; it is gone through once.
+        data: a dataset, a stream of one, or batches as a loader gives them; it is gone through once.
         names: "points", per-point fields and signals; None = the points and every signal that is numbers.
         mode: "limits" maps the range of each channel to -1..1; "gaussian" the mean to 0 and the standard deviation
             to 1. A channel that stays within 1e-4 is moved to the middle and not scaled.
@@ -93,7 +94,8 @@ def fit_normalizers(
 
 def _once(data: Any) -> Iterator[Any]:
     if not isinstance(data, EpisodeWindows):
-        yield from data
+        for one in data:
+            yield from one.batches if isinstance(one, Unbatched) else (one,)
         return
     for episode in data.episodes:
         if episode.id not in data.skipped:

@@ -104,10 +104,16 @@ def _parsed(head: bytes) -> tuple[bytes, int, bytes]:
     if len(head) != BLOCK:
         raise CacheError("the archive ends early")
     name, told, kind = head[:_LONGEST].rstrip(b"\0"), head[124:136], head[156:157]
-    if _SIZE.fullmatch(told) is not None and kind in (_FILE, _PAX):
-        size = int(told[:-1], 8)
-        if head == _header(name, size, kind):
-            return name, size, kind
+    # As a comparison with _header(name, size, kind), which takes longer.
+    if (
+        head[100:124] == _BEFORE_SIZE
+        and head[136:148] == _TIME
+        and head[157:] == _TAIL
+        and kind in (_FILE, _PAX)
+        and _SIZE.fullmatch(told) is not None
+        and head[148:156] == b"%06o\0 " % (sum(head[:_LONGEST]) + sum(told) + kind[0] + _FIXED_SUM)
+    ):
+        return name, int(told[:-1], 8), kind
     if kind in _KINDS and head[257:262] == b"ustar":
         raise CacheError(f"member {name!r:.200} is {_KINDS[kind]}, which no dataset holds")
     raise CacheError(f"{name!r:.200} does not begin a member as pcdata writes it: damaged, or written by other means")

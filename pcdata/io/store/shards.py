@@ -12,7 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -152,6 +152,10 @@ class Shards:
         shard = int(self._index.shards[number])
         return STORES[self._form](shard_folder(self.folder, shard)).path_of(key_of(self._index.ids[number]))
 
+    def place_of(self, number: int) -> str:
+        """Return what messages call the file that holds the record of a sample: its path, or its URL."""
+        return str(self.path_of(number))
+
     def read(self, number: int) -> Record:
         """Read the record of a sample.
 
@@ -204,12 +208,28 @@ class Shards:
         """
         store = self._stores.get(shard)
         if store is None:
-            store = STORES[self._form](shard_folder(self.folder, shard))
-            if store.holds_file and len(self._stores) >= _MOST_OPEN:
-                self._stores.pop(next(iter(self._stores))).close()
-            self._check_sizes(shard)
-            self._stores[shard] = store
+            store = self._stores[shard] = self._opened(shard)
         return store
+
+    reads_ahead = False  # whether :meth:`hold` does anything
+
+    def hold(self, numbers: Sequence[int], until: int | None = None) -> None:
+        """Read the records of some samples ahead, as often as each is let go; see :meth:`pcdata.io.Store.hold`."""
+
+    def let_go(self, numbers: Sequence[int]) -> None:
+        """Forget records that were held."""
+
+    @contextmanager
+    def held(self, numbers: Sequence[int]) -> Iterator[None]:
+        """Hold some records while they are asked for several times."""
+        if not self.reads_ahead:
+            yield
+            return
+        self.hold(numbers)
+        try:
+            yield
+        finally:
+            self.let_go(numbers)
 
     def signals(self) -> Record:
         """Read the record of the signals of all samples.
@@ -234,6 +254,13 @@ class Shards:
         stores, self._stores = self._stores, {}
         for store in stores.values():
             store.close()
+
+    def _opened(self, shard: int) -> Store:
+        store = STORES[self._form](shard_folder(self.folder, shard))
+        if store.holds_file and len(self._stores) >= _MOST_OPEN:
+            self._stores.pop(next(iter(self._stores))).close()
+        self._check_sizes(shard)
+        return store
 
     def _check_sizes(self, shard: int) -> None:
         folder = shard_folder(self.folder, shard)

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, ClassVar, Literal
 
 from pcdata.errors import CacheError, ConfigError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
+from pcdata.files.urls import UrlFolder
 from pcdata.files.zip_archive import ZipArchive
 from pcdata.io.store.cloud_record import Record, Room
 from pcdata.registry import Registry
@@ -39,9 +40,25 @@ class Store:
         self.folder = Path(folder)
         self.compression = compression
 
+    @classmethod
+    def at_url(cls, server: UrlFolder, name: str) -> Store:
+        """Return the store that reads a shard below a URL.
+
+        Raises:
+            CacheError: such a store reads files alone.
+        """
+        raise CacheError(
+            f"{server}: format {cls.format} is read from folders alone: copy the dataset to one, or build it with "
+            "output: {format: webdataset}"
+        )
+
     def path_of(self, key: str) -> Path:
         """Return the file that holds a record."""
         return self.folder / "clouds" / f"{key}{self.suffix}"
+
+    def place_of(self, key: str) -> str:
+        """Return what messages call the file that holds a record: its path, or its URL."""
+        return str(self.path_of(key))
 
     def write(self, key: str, record: Record) -> None:
         """Add one record; keys are file-name safe and unique.
@@ -79,6 +96,18 @@ class Store:
             CacheError: as for :meth:`read`.
         """
         return None
+
+    def hold(self, keys: Sequence[str], until: str | None = None) -> None:
+        """Read some records ahead, where that saves anything, as often as :meth:`let_go` forgets each.
+
+        All up to ``until`` will be asked for soon.
+
+        Raises:
+            CacheError: as for :meth:`read`.
+        """
+
+    def let_go(self, keys: Sequence[str]) -> None:
+        """Forget records that were held."""
 
     def identity(self) -> tuple[int, ...] | None:
         """Return what tells the file that this process reads, and keeps, from others of its name.
@@ -162,7 +191,7 @@ def synced(path: Path) -> Iterator[Any]:
 
 
 @contextmanager
-def damage_named(path: Path) -> Iterator[None]:
+def damage_named(path: Path | str) -> Iterator[None]:
     """Turn whatever a damaged file makes a library raise into one error that names the file."""
     try:
         yield
@@ -174,7 +203,7 @@ def damage_named(path: Path) -> Iterator[None]:
         raise told from error
 
 
-def _damage(path: Path, error: Exception) -> CacheError:
+def _damage(path: Path | str, error: Exception) -> CacheError:
     if isinstance(error, CacheError):
         if str(path) in str(error):  # complete in itself: the file may be fine
             return error

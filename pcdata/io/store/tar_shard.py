@@ -12,6 +12,7 @@ import hashlib
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -111,7 +112,8 @@ class TarShard:
         self._is_mapped = is_mapped
         keys, self._ends, self._sums = _read_index(size, ranges)
         self._places = {key: place for place, key in enumerate(keys)}
-        self._held: dict[int, memoryview] = {}
+        self._held: dict[int, list[Any]] = {}  # how often, and the bytes
+        self._answer: tuple[int, Any] = 0, b""  # where it begins, and what of it may still be asked for
         if len(self._places) != len(keys) or "" in self._places:
             raise CacheError("two samples have one key, or one has none")
 
@@ -123,37 +125,61 @@ class TarShard:
         """
         place = self._place(key)
         held = self._held.get(place)
-        return memoryview(self._ranges(*self._range(place))) if held is None else held
+        if held is not None:
+            return held[1]
+        part = memoryview(self._ranges(*self._range(place)))
+        if not self._is_mapped:
+            self._check(place, part)
+        return part
 
-    def hold(self, keys: Iterable[str]) -> None:
-        """Read some samples ahead, in the order of the archive and many with one request, and keep them.
+    def hold(self, keys: Iterable[str], until: str | None = None) -> None:
+        """Read some samples ahead and keep each as often as it is let go; those that follow each other at once.
+
+        With ``until`` the others up to that one will be asked for soon: an answer has as many as are in 8 MiB.
 
         Raises:
             CacheError: one is missing, cannot be had, or is not what was written.
         """
         if self._is_mapped:
             return
-        wanted = sorted({self._place(key) for key in keys} - self._held.keys())
-        first = 0
-        while first < len(wanted):
-            begin, end = self._range(wanted[first])
-            stop = first + 1
-            while stop < len(wanted) and self._range(wanted[stop])[1] <= begin + _AT_ONCE:
-                stop += 1
-            end = self._range(wanted[stop - 1])[1]
-            content = memoryview(self._ranges(begin, end))
-            for place in wanted[first:stop]:
-                own = self._range(place)
-                # Copied: a part of the answer would keep all of it.
-                part = memoryview(bytes(content[own[0] - begin : own[1] - begin]))
-                self._check(place, part)
-                self._held[place] = part
-            first = stop
+        wanted = Counter(map(self._place, keys))
+        places = sorted(wanted)
+        for number, place in enumerate(places):
+            if place not in self._held:
+                last = self._last_at_once(places[number:]) if until is None else self._place(until)
+                self._held[place] = [0, self._part(place, last)]
+            self._held[place][0] += wanted[place]
 
     def let_go(self, keys: Iterable[str]) -> None:
         """Forget samples that were held."""
-        for key in keys:
-            self._held.pop(self._place(key), None)
+        for place in map(self._place, keys):
+            if place in self._held:
+                self._held[place][0] -= 1
+                if self._held[place][0] < 1:
+                    del self._held[place]
+
+    def _last_at_once(self, places: list[int]) -> int:
+        """Return the last of the samples that follow the first without a gap."""
+        return next((one for one, other in zip(places, [*places[1:], -1]) if other != one + 1), places[0])
+
+    def _part(self, place: int, last: int) -> memoryview:
+        """Return a sample's bytes, out of an answer that goes on, up to the ``last`` sample, where it fits."""
+        begin, end = self._range(place)
+        if not self._answer[0] <= begin < end <= self._answer[0] + len(self._answer[1]):
+            self._answer = 0, b""  # not two at a time
+            stop = int(np.searchsorted(self._ends[: last + 1], begin + _AT_ONCE, "right"))
+            self._answer = begin, self._ranges(begin, max(end, int(self._ends[stop - 1]) if stop else 0))
+        first, answer = self._answer
+        part = memoryview(bytes(answer[begin - first : end - first]))  # a view would keep the whole answer
+        if end - first == len(answer):
+            self._answer = 0, b""
+        self._check(place, part)
+        return part
+
+    def _check(self, place: int, part: memoryview) -> None:
+        if zlib.crc32(part) != int(self._sums[place]):
+            begin, end = self._range(place)
+            raise CacheError(f"its bytes {begin} to {end} are not those that were written; copy it again")
 
     def _place(self, key: str) -> int:
         place = self._places.get(key)
@@ -163,11 +189,6 @@ class TarShard:
 
     def _range(self, place: int) -> tuple[int, int]:
         return int(self._ends[place - 1]) if place else 0, int(self._ends[place])
-
-    def _check(self, place: int, part: memoryview) -> None:
-        if zlib.crc32(part) != int(self._sums[place]):
-            begin, end = self._range(place)
-            raise CacheError(f"its bytes {begin} to {end} are not those that were written; copy it again")
 
 
 def _read_index(size: int, ranges: Ranges) -> tuple[list[str], NDArray[np.int64], NDArray[np.uint32]]:

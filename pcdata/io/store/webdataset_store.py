@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
 from pcdata.files.mapping import identity_of, map_file
-from pcdata.files.npy import PREFIX, header_length, npy_bytes, parse_header
+from pcdata.files.npy import PREFIX, NpyHeader, header_length, npy_bytes, parse_header
 from pcdata.files.tar_members import read_members
+from pcdata.files.urls import UrlFolder
 from pcdata.io.store.cloud_record import DERIVED, Record, Room, parse_info
 from pcdata.io.store.joined_record import common_and_own, joined_record, own_info
 from pcdata.io.store.store import Compression, Store, damage_named, register_store, writing
 from pcdata.io.store.tar_shard import TarShard, TarWriter
 
+_FILE = "clouds.tar"
+_USUAL = 128  # bytes of the header of a .npy array
 _ALIGNED = 64  # bytes: a line of the processor's cache
 _ARRAY, _INFO, _HISTORY = ".npy", "json", "history.json"
 
@@ -41,13 +44,27 @@ class _WebDatasetStore(Store):
 
     def __init__(self, folder: str | Path, compression: Compression = "none") -> None:
         super().__init__(folder, compression)
-        self.path = self.folder / "clouds.tar"
+        self.path = self.folder / _FILE
+        self._place = str(self.path)
+        self._server: tuple[UrlFolder, str] | None = None  # and the name of the archive there
         self._writer: TarWriter | None = None
         self._shard: TarShard | None = None
+
+    @classmethod
+    def at_url(cls, server: UrlFolder, name: str) -> _WebDatasetStore:
+        """Return the store that reads an archive below a URL."""
+        store = cls(name)
+        store._server = server, f"{name}/{_FILE}"
+        store._place = f"{server}/{name}/{_FILE}"
+        return store
 
     def path_of(self, key: str) -> Path:
         """Return the one file that holds all records."""
         return self.path
+
+    def place_of(self, key: str) -> str:
+        """Return its path, or its URL."""
+        return self._place
 
     def write(self, key: str, record: Record) -> None:
         """Add one record; the file is whole after :meth:`close`."""
@@ -66,13 +83,13 @@ class _WebDatasetStore(Store):
 
     def read(self, key: str) -> Record:
         """Read one record; its arrays are the caller's own."""
-        with damage_named(self.path):
+        with damage_named(self._place):
             own = memoryview(bytearray(self.opened().sample(key)))
             return _Parts.of(key, own).record()
 
     def digest(self, key: str) -> str:
         """Return the digest of one record, computed where it lies."""
-        with damage_named(self.path):
+        with damage_named(self._place):
             return _Parts.of(key, self.opened().sample(key)).record().digest()
 
     @classmethod
@@ -85,25 +102,40 @@ class _WebDatasetStore(Store):
                 assert isinstance(store, _WebDatasetStore)
                 parts.append(_Parts.of(key, store.opened().sample(key)))
         except Exception:
-            with damage_named(records[len(parts)][0].path_of("")):
+            with damage_named(records[len(parts)][0].place_of("")):
                 raise
-        with damage_named(records[0][0].path_of("")):
+        with damage_named(records[0][0].place_of("")):
             return _joined(parts, room)
+
+    def hold(self, keys: Sequence[str], until: str | None = None) -> None:
+        """Read some records ahead, from a server with few requests."""
+        with damage_named(self._place):
+            self.opened().hold(keys, until)
+
+    def let_go(self, keys: Sequence[str]) -> None:
+        """Forget records that were held."""
+        self.opened().let_go(keys)
 
     def identity(self) -> tuple[int, ...] | None:
         """Return what tells the archive from another of its name."""
-        with damage_named(self.path):
+        with damage_named(self._place):
             return self.opened().identity
 
     def opened(self) -> TarShard:
         """Return the archive, opened once in every process."""
         if self._writer is not None:
-            raise CacheError(f"{self.path}: is being written; close the store, then read")
+            raise CacheError(f"{self._place}: is being written; close the store, then read")
         if self._shard is None:
             self._shard = self._open()
         return self._shard
 
     def _open(self) -> TarShard:
+        if self._server is not None:
+            server, name = self._server
+            status = server.status(name)
+            return TarShard(
+                status.size, lambda begin, end: server.read(name, begin, end), status.identity, is_mapped=False
+            )
         with self._opened(self.path) as file:
             content = map_file(file)
             return TarShard(len(content), lambda begin, end: content[begin:end], identity_of(file))
@@ -179,8 +211,9 @@ def _facts(record: Record) -> tuple[str, str]:
 
 def _array(name: str, content: memoryview) -> NDArray[Any]:
     try:
-        length = header_length(bytes(content[:PREFIX]))
-        header = _npy_header(bytes(content[:length]), len(content))
+        header = _npy_header(bytes(content[:_USUAL]), len(content))
+        if header is None:
+            header = parse_header(bytes(content[: header_length(bytes(content[:PREFIX]))]), len(content))
     except CacheError as error:
         raise CacheError(f"member {name!r:.300}: {error}") from error
     if not header.nbytes:
@@ -189,8 +222,10 @@ def _array(name: str, content: memoryview) -> NDArray[Any]:
     return np.ndarray(header.shape, header.dtype, content, header.begin, order=order)
 
 
-# Most samples of a dataset have the same few headers, and parsing one takes longer than all else.
-_npy_header = functools.lru_cache(1024)(parse_header)
+@functools.lru_cache(1024)  # most samples have the same few headers, and parsing one takes longer than all else
+def _npy_header(start: bytes, size: int) -> NpyHeader | None:
+    """Return what a header of the usual length says; None = it has another."""
+    return parse_header(start, size) if header_length(start[:PREFIX]) == _USUAL else None
 
 
 def _joined(parts: Sequence[_Parts], room: Room | None) -> Record | None:
