@@ -116,7 +116,14 @@ def pinhole_of_matrix(where: str, matrix: Any, of_size: Size | None = None) -> C
         raise IntrinsicsError(
             f"{where}: must be fx 0 cx / 0 fy cy / 0 0 1, got {rows}; is it transposed, or a projection matrix?"
         )
-    return partial(pinhole, numbers=(fx, fy, cx, cy), of_size=of_size)
+    return partial(_pinhole_at, where=where, numbers=(fx, fy, cx, cy), of_size=of_size)
+
+
+def _pinhole_at(size: Size, where: str, numbers: tuple[float, float, float, float], of_size: Size | None) -> Camera:
+    try:
+        return pinhole(size, numbers, of_size=of_size)
+    except PcdataError as error:
+        raise IntrinsicsError(f"{where}: {error}") from error
 
 
 def numbers_of(text: str) -> list[float]:

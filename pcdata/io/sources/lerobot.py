@@ -109,6 +109,7 @@ class _LeRobotSource(Source):
         self._episode_by_number = {one.number: one for one in self._index.episodes}
         firsts = itertools.accumulate((one.length for one in self._index.episodes), initial=0)
         self._first_of = dict(zip(self._episode_by_number, firsts))
+        self.path = path  # a first image may be read before all is known, to name the units that it fits
         self._pictures = Pictures(where, path, self._inside)
         self._rows = Handles(4)
         frame = check_name(where, "frame_id", frame_id)

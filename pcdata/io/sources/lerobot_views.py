@@ -65,7 +65,7 @@ class Lens:
                 "image; flip it when recording"
             )
         rows[0][0], rows[1][1] = abs(fx), abs(fy)
-        camera = pinhole_of_matrix(f"{where}: column {self.column}", rows)
+        camera = pinhole_of_matrix(f"column {self.column}", rows)
         if self.distortion is None and not self.is_window:
             return camera(size), _turn(fx < 0)
         lens = None if self.distortion is None else torch.from_numpy(np.array(row[self.distortion], np.float64))[None]

@@ -39,8 +39,8 @@ def one_unit(file: Path, stated: float | None, given: float | None) -> float:
     unit = one_value(file, "metres_per_unit", stated, given, error=UnitError)
     if unit is None:
         raise UnitError(
-            f'{file}: the unit of depth must be stated: add "metres_per_unit": 0.001 (for millimetres) to the file, or '
-            "pass metres_per_unit"
+            f'{file}: the unit of depth must be stated: add "metres_per_unit" to the file, 0.001 for millimetres, 1 '
+            "for metres, as floats mostly are; or pass it (--metres-per-unit M)"
         )
     return check_metres_per_unit(str(file), unit)
 

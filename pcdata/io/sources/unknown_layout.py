@@ -12,6 +12,7 @@ from pcdata.errors import CaptureError, PcdataError
 from pcdata.files.opening import open_input
 from pcdata.files.sample_names import name_some
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from pcdata.io.sources.demonstration_file import opened
 from pcdata.io.sources.hand_eye_names import hand_eye_folders, hand_eye_tool
 from pcdata.io.sources.listing import entries, is_folder
 from pcdata.io.sources.registry import LAYOUTS
@@ -46,7 +47,7 @@ def unknown_layout(path: Path) -> CaptureError:
     if path.is_file() and (fault := _fault_of_file(path)):
         return CaptureError(f"open_source: {path}: {fault}")
     start = f"open_source: {path}: no known layout; found {_contents(path)}."
-    for way in (_by_its_folder, _captures_inside, _robot_poses, _without_calibration, _images_alone):
+    for way in (_by_its_folder, _captures_inside, _recording_inside, _robot_poses, _without_calibration, _images_alone):
         if told := way(path):
             return CaptureError(f"{start} {told}. docs/captures.md lists the layouts")
     known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
@@ -70,6 +71,13 @@ def _fault_of_file(path: Path) -> str:
     if path.suffix.lower() in _IMAGES:
         told = _by_its_folder(path) or _images_alone(path) or "Give the folder of images and their calibration"
         return f"is {kind}, and one image is no capture. {told}"
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        where = f"open_source: {path}"
+        try:
+            with opened(where, path):
+                pass
+        except CaptureError as error:
+            return str(error).removeprefix(f"{where}: ")
     return ""
 
 
@@ -93,6 +101,14 @@ def _captures_inside(path: Path) -> str:
             names = name_some(entry.relative_to(path).as_posix() for entry in found)
             return f"Captures by themselves are {names}: {_command(found[0])}{_for_all(path, inside, found)}"
         level = [entry for entry in inside if is_folder(entry)]
+    return ""
+
+
+def _recording_inside(path: Path) -> str:
+    """Say what is wrong with a file in a folder that would be a recording."""
+    for entry in _entries(path):
+        if entry.suffix.lower() not in _IMAGES and entry.is_file() and (fault := _fault_of_file(entry)):
+            return f"{entry.name}: {fault}"
     return ""
 
 

@@ -468,3 +468,18 @@ def test_what_not_all_cameras_have_is_told_and_read_of_one_camera_alone(tmp_path
     frame = left.load(left.ids[0])
     assert frame.colors is not None
     assert frame.world_from_camera is not None
+
+
+@pytest.mark.parametrize("storage", ["array", "image"])
+def test_the_unit_of_whole_numbers_in_rows_is_asked_for_with_those_that_fit(tmp_path: Path, storage: str) -> None:
+    if storage == "array":
+        root = made.arrays("uint16", tenths)(tmp_path / "set")
+    else:
+        root = made.images(tmp_path / "set", unit="")
+        info = json.loads((root / "meta/info.json").read_text())
+        info["features"]["observation.images.wrist_depth"]["info"] = {}
+        (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(UnitError, match=r"may be .*metres_per_unit=0\.0001 \(half within"):
+        open_source(root)
+    depth = open_source(root, metres_per_unit=0.0001).load("000000-000000").depth
+    assert torch.equal(depth[0], torch.from_numpy((tenths(0) * 0.0001).astype(np.float32)))

@@ -136,3 +136,14 @@ def test_every_command_is_given_again_with_what_is_needed(
         if main(followed) == 0:
             return
     raise AssertionError("the command that is told does not work")
+
+
+def test_an_hdf5_file_that_is_cut_short_is_told_so(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "demo.hdf5"
+    with h5py.File(path, "w") as file:
+        file["data/demo_0/obs/front_depth"] = np.ones((3, 8, 8, 1), np.float32)
+    path.write_bytes(path.read_bytes()[:-500])
+    for given in (path, tmp_path):
+        with pytest.raises(CaptureError, match=r"demo\.hdf5: cannot be read .*truncated.*[Cc]opy"):
+            open_source(given)
