@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from pcdata.build.building_folder import BuildingFolder
+from pcdata.build.building_url import BuildingUrl
 from pcdata.build.config import BuildConfig
 from pcdata.build.engines.in_process import work_here
 from pcdata.build.finishing import complete_dataset, counts_of
@@ -19,6 +20,7 @@ from pcdata.build.source_state import captures_digest
 from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
+from pcdata.files.urls import is_in_process, is_url, path_of
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
@@ -32,7 +34,7 @@ ENGINES: tuple[Engine, ...] = ("pool", "ray")
 class BuildReport:
     """What a build did."""
 
-    folder: Path
+    folder: Path | str  # str = a URL
     samples: list[BuiltSample] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     quarantined: dict[str, str] = field(default_factory=dict)  # id of a capture that failed twice -> why
@@ -72,7 +74,7 @@ def build_dataset(
     Args:
         config: pipeline, storage and loader settings; see :func:`pcdata.load_config`.
         source: the captures; see :func:`pcdata.open_source`.
-        folder: where the dataset goes.
+        folder: where the dataset goes: a folder, or a URL such as ``"s3://bucket/set"``.
         overwrite: replace a dataset that is there already; anything else is never replaced.
         restart: delete an unfinished build of the folder, of these or of other settings, and begin anew.
         workers: processes, of one thread each; 0 = this process, which a capture that crashes or hangs then takes with
@@ -99,10 +101,11 @@ def build_dataset(
     """
     _check_arguments(config, source)
     _check_ways(workers, timeout, engine, part, finalize)
-    # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
-    folder = Path(os.path.realpath(Path(folder).expanduser()))
-    report = BuildReport(folder, skipped=skipped_of(source))
-    building = BuildingFolder(folder)
+    building = building_at(folder)
+    if isinstance(building, BuildingUrl) and is_in_process(folder) and (workers or engine != "pool"):
+        raise ConfigError(f"build_dataset: {folder} is in the memory of this process: build it with workers=0")
+    report = BuildReport(building.target.url if isinstance(building, BuildingUrl) else building.target)
+    report.skipped.update(skipped_of(source))
     building.check_target(overwrite)
     plan = plan_of(config, source)
     limit = most_bad(max_bad, len(plan.ids))
@@ -134,6 +137,21 @@ def build_dataset(
             config, source, job, done, part, replaced, overwrite=overwrite, strict=strict, note=tell
         )
     return _told(report, [done[shard] for shard in shards if shard in done], plan.num_shards, len(done), is_complete)
+
+
+def building_at(folder: str | Path) -> BuildingFolder | BuildingUrl:
+    """Return where the unfinished build of a dataset is: in a folder, or at any URL that fsspec opens.
+
+    Raises:
+        ConfigError: there is no such kind of URL.
+        MissingExtraError: what opens it is not installed.
+    """
+    if isinstance(folder, str):
+        if is_url(folder):
+            return BuildingUrl(folder)
+        folder = path_of(folder)
+    # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
+    return BuildingFolder(Path(os.path.realpath(folder.expanduser())))
 
 
 def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:
@@ -213,7 +231,7 @@ def _finish(
     return True
 
 
-def _tell_kept(error: BaseException, building: BuildingFolder, plan: Plan) -> None:
+def _tell_kept(error: BaseException, building: BuildingFolder | BuildingUrl, plan: Plan) -> None:
     kept = building.finished(plan)
     if any(record.samples for record in kept.values()):
         add_note(

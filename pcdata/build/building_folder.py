@@ -42,13 +42,8 @@ SHARD, SIGNALS = "shard", "signals"  # in the folder of a finished shard: what t
 class BuildingFolder:
     """The folder of the unfinished build of one dataset; holds names alone, so it can be pickled."""
 
-    target: object  # the dataset, as messages name it
-    kept_at: object  # where what is finished is kept
-    path: Path  # of this machine, to work in
-    dataset: Path  # there: what becomes the target
-
     def __init__(self, target: Path) -> None:
-        self._target = self.target = target
+        self.target = target
         self.path = self.kept_at = hidden_folder(target, "building")
         self.dataset = self.path / _DATASET
 
@@ -60,7 +55,7 @@ class BuildingFolder:
         Raises:
             CacheError: it is neither.
         """
-        check_replaceable(self._target, overwrite, check_only_dataset)
+        check_replaceable(self.target, overwrite, check_only_dataset)
 
     def prepared(self, overwrite: bool, note: Note) -> object:
         """Put right what killed overwrites left at the name; return what is there, for :meth:`put_into_place`.
@@ -68,11 +63,11 @@ class BuildingFolder:
         Raises:
             CacheError: as for :meth:`check_target`.
         """
-        return prepared(self._target, overwrite, check_only_dataset, note)
+        return prepared(self.target, overwrite, check_only_dataset, note)
 
     def carried(self, names: Iterable[str]) -> Path:
         """Return a folder that holds those of some files that the dataset has which is to be replaced."""
-        return self._target
+        return self.target
 
     def put_into_place(self, plan: Plan, records: Mapping[int, ShardRecord], replaced: object, note: Note) -> None:
         """Give the dataset its name, and delete what was there before, and this folder.
@@ -86,7 +81,7 @@ class BuildingFolder:
         Raises:
             CacheError: something else is there now, or it cannot be put there.
         """
-        put_into_place(self.dataset, self._target, replaced, check_only_dataset, note)
+        put_into_place(self.dataset, self.target, replaced, check_only_dataset, note)
         self.remove()
 
     # -- who works on it -------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -43,12 +43,31 @@ def check_only_dataset(folder: Path) -> None:
         foreign += [f"{name} (edited by hand)" for name in edited_texts(folder)]
     except OSError as error:
         raise CacheError(f"{folder}: cannot be examined: {error}") from error
+    told_foreign(folder, foreign)
+
+
+def told_foreign(place: object, foreign: Sequence[str]) -> None:
+    """Refuse to overwrite a dataset that other files lie in, if there are any.
+
+    Raises:
+        CacheError: names them.
+    """
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
         raise CacheError(
-            f"{folder} is a dataset but also holds {', '.join(foreign[:_SHOWN])}{more}, which overwriting would "
+            f"{place} is a dataset but also holds {', '.join(foreign[:_SHOWN])}{more}, which overwriting would "
             "delete; move that out first, or choose another folder"
         )
+
+
+def foreign_names(names: Iterable[str], folder: Path, manifest: Manifest) -> list[str]:
+    """Return which of the files below a dataset, wherever that is, no build wrote; ``folder`` has its index."""
+    known, raw = _known(folder, manifest, {})
+    return sorted(
+        name
+        for name in names
+        if not (name in known or _is_raw(name, raw) or any(part in _LITTER for part in name.split("/")))
+    )
 
 
 def _manifest_of(folder: Path) -> Manifest | None:

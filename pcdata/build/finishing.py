@@ -80,6 +80,7 @@ def complete_dataset(
         manifest = Manifest(
             format=config.output.format,
             compression=config.output.compression,
+            identity=job.plan.identity,
             fingerprint=job.plan.settings["steps"],
             pipeline=sections,
             samples=samples,

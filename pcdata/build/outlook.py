@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pcdata.build.building_folder import BuildingFolder
+from pcdata.build.builder import building_at
 from pcdata.build.config import BuildConfig
-from pcdata.build.contents import check_only_dataset
 from pcdata.build.plan import plan_of
 from pcdata.build.source_state import captures_digest, files_of
 from pcdata.errors import CacheError
-from pcdata.files.whole_folders import is_free
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids
 
 
@@ -31,22 +28,23 @@ class Outlook:
     hindrances: list[str] = field(default_factory=list)  # why it would not begin
 
 
-def outlook(config: BuildConfig, source: CaptureSource, folder: str | os.PathLike[str]) -> Outlook:
+def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path) -> Outlook:
     """Return what ``build_dataset`` would do with these arguments.
 
     Raises:
         CaptureError: the source has no captures, or two of one id.
     """
     checked_ids("build", source)
-    target = Path(os.path.realpath(Path(folder).expanduser()))
-    plan, building = plan_of(config, source), BuildingFolder(target)
+    plan, building = plan_of(config, source), building_at(folder)
     hindrances = []
-    if not is_free(target):
+    try:
+        building.check_target(overwrite=True)
         try:
-            check_only_dataset(target)
+            building.check_target(overwrite=False)
+        except CacheError:
             hindrances.append("a dataset is there; --overwrite replaces it")
-        except CacheError as error:
-            hindrances.append(str(error))
+    except CacheError as error:
+        hindrances.append(str(error))
     try:
         different = building.differences(plan)
     except CacheError as error:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pcdata.build.building_folder import SHARD, SIGNALS, BuildingFolder
+from pcdata.build.building_url import BuildingUrl
 from pcdata.build.capture_work import CaptureWork, keep_raw
 from pcdata.build.config import BuildConfig
 from pcdata.build.origins import Origin, counted
@@ -50,12 +51,12 @@ class Job:
     imports: tuple[ImportedFile, ...] = field(repr=False)  # first: what follows may be of classes from them
     work: CaptureWork
     plan: Plan
-    folder: BuildingFolder
+    folder: BuildingFolder | BuildingUrl
     format: str
     compression: Compression
 
     @classmethod
-    def of(cls, config: BuildConfig, source: CaptureSource, plan: Plan, folder: BuildingFolder) -> Job:
+    def of(cls, config: BuildConfig, source: CaptureSource, plan: Plan, folder: BuildingFolder | BuildingUrl) -> Job:
         """Return the job of a build."""
         output = config.output
         return cls(imported_files(), CaptureWork(config, source), plan, folder, output.format, output.compression)

@@ -45,7 +45,7 @@ def add_to(commands: Any) -> None:
         metavar="PATH",
         help="folder of captures, or of several cameras' folders, or one cloud file (default: that of CONFIG)",
     )
-    build.add_argument("--out", metavar="DIR", help="folder of the new dataset")
+    build.add_argument("--out", metavar="DIR", help="folder of the new dataset, or a URL such as s3://bucket/set")
     build.add_argument(
         "--format",
         metavar="FORMAT",
@@ -108,8 +108,11 @@ def _add_ways(build: argparse.ArgumentParser) -> None:
 
 
 def _build(arguments: argparse.Namespace) -> int:
+    from pathlib import Path
+
     from pcdata.build import build_dataset, plan_of
     from pcdata.errors import ConfigError
+    from pcdata.files.urls import is_in_process
     from pcdata.report.build_text import build_text, plan_text
 
     config = _config(arguments)
@@ -130,7 +133,7 @@ def _build(arguments: argparse.Namespace) -> int:
             arguments.out,
             overwrite=arguments.overwrite,
             restart=arguments.restart,
-            workers=_workers(arguments, plan_of(config, source).num_shards),
+            workers=_workers(arguments, 1 if is_in_process(arguments.out) else plan_of(config, source).num_shards),
             timeout=arguments.timeout,
             max_bad=arguments.max_bad,
             engine=arguments.engine,
@@ -142,7 +145,8 @@ def _build(arguments: argparse.Namespace) -> int:
         )
     print(build_text(report))
     if report.is_complete:
-        print(f"\ndataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
+        loads = f"  (python {report.folder / 'load.py'} loads it)" if isinstance(report.folder, Path) else ""
+        print(f"\ndataset  {report.folder}{loads}")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0
 
 

@@ -29,6 +29,8 @@ def add_to(commands: Any) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
+    from pathlib import Path
+
     from pcdata.cli.demo import run_demo
     from pcdata.report.build_text import build_text
 
@@ -37,7 +39,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     print(build_text(report))
     points = sum(int(batch.mask.sum()) for batch in batches)
     print(f"\nloaded back with 2 workers: {len(batches)} batches, {points:,} augmented points")
-    print(f"dataset  {report.folder}  (python {report.folder / 'load.py'} loads it)")
+    print(f"dataset  {report.folder}  (python {Path(report.folder, 'load.py')} loads it)")
     print(f"picture  {picture}")
 
 

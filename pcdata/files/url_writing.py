@@ -5,7 +5,7 @@ An object store has no folders, no rename and no lock: what it promises is that 
 
 from __future__ import annotations
 
-import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,7 +15,6 @@ from pcdata.errors import CacheError, ConfigError, PcdataError
 from pcdata.files.urls import UrlFolder
 
 _AT_ONCE = 16  # files on their way, where a file system takes several
-_BLOCK = 1 << 22  # bytes
 
 
 def is_missing(error: PcdataError) -> bool:
@@ -46,11 +45,6 @@ class WritableUrl(UrlFolder):
     def name(self) -> str:
         """The last part of the URL."""
         return self.url.partition("://")[2].rpartition("/")[2]
-
-    @property
-    def is_in_process(self) -> bool:
-        """Whether other processes see nothing of it (``memory://``)."""
-        return type(self.opened()[0]).__name__ == "MemoryFileSystem"
 
     def beside(self, name: str) -> WritableUrl:
         """Return another folder in the folder that this one is in."""
@@ -227,5 +221,6 @@ def _copy(files: Any, source: str, target: str) -> None:
     try:
         files.cp_file(source, target)
     except NotImplementedError:  # through this machine
-        with files.open(source, "rb") as old, files.open(target, "wb") as new:
-            shutil.copyfileobj(old, new, _BLOCK)
+        with tempfile.TemporaryDirectory(prefix="pcdata-") as folder:
+            files.get_file(source, f"{folder}/file")
+            files.put_file(f"{folder}/file", target)

@@ -36,6 +36,11 @@ def is_url(place: object) -> bool:
     return isinstance(place, str) and _URL.match(place) is not None and not place.startswith("file://")
 
 
+def is_in_process(place: object) -> bool:
+    """Whether a place is in the memory of this process, where no other sees it."""
+    return is_url(place) and str(place).startswith("memory:")
+
+
 def path_of(place: str | os.PathLike[str]) -> Path:
     """Return the path that a place names which is no other URL, such as ``file:///data/set``."""
     if isinstance(place, str) and place.startswith("file://"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from statistics import median
 
@@ -34,7 +33,7 @@ def build_text(report: BuildReport) -> str:
     return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
 
 
-def plan_text(config: BuildConfig, source: CaptureSource, folder: str | os.PathLike[str]) -> str:
+def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path) -> str:
     """Tell what a build would do, how large the result may become, and what of it is finished."""
     plan = outlook(config, source, folder)
     left = plan.num_shards - plan.num_finished
@@ -52,4 +51,4 @@ def plan_text(config: BuildConfig, source: CaptureSource, folder: str | os.PathL
     if plan.quarantined:
         rows.append(["quarantined", f"{len(plan.quarantined)} so far"])
     rows += [["in the way", text] for text in plan.hindrances]
-    return text_table(["build", str(Path(folder))], rows)
+    return text_table(["build", str(folder)], rows)

@@ -64,6 +64,7 @@ def test_a_put_that_fails_is_tried_four_times_and_then_told(folder, tmp_path, mo
     assert len(tries) == 4
 
 
+@pytest.mark.parametrize("folder", ["memory"], indirect=True)
 def test_a_store_that_cannot_copy_by_itself_is_copied_through_here(folder, monkeypatch):
     def cp_file(self, *args, **options):
         raise NotImplementedError

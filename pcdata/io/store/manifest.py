@@ -39,6 +39,7 @@ class Manifest:
     fingerprint: str  # of the deterministic steps that made the stored clouds
     pipeline: Mapping[str, Any]  # section -> list of {transform: fields}
     samples: SampleIndex | Sequence[Sample]  # an index afterwards
+    identity: str = ""  # of the build: SHA-256 of its settings, its captures' ids and how they were read
     versions: Mapping[str, str] = field(default_factory=dict)
     keep_raw: bool = False  # whether the captures lie beside the clouds
     compact: bool = False  # whether colors are bytes and normals two numbers: see compact_fields
@@ -175,6 +176,7 @@ def _check(manifest: Manifest) -> None:
         raise CacheError(f"compression {manifest.compression!r:.100} does not exist for format {manifest.format}")
     for name, kind in (
         ("fingerprint", str),
+        ("identity", str),
         ("pipeline", dict),
         ("versions", dict),
         ("skipped", dict),
