@@ -79,6 +79,10 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "DecimateDepth": _of("DecimateDepth", {"factor": 2}, {"factor": 5, "max_jump": 0.5}, {"factor": 3, "rule": "mean"}),
     "Deproject": _of("Deproject", {}),
+    "CropPolygon": _of("CropPolygon", {"frame": "base", "polygon": ((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (0, 0))}),
+    "DropNonFinite": _of("DropNonFinite", {}),
+    "KeepValues": _of("KeepValues", {"values": (0, 1)}),
+    "RemoveDuplicates": _of("RemoveDuplicates", {}),
     "DescribeShape": _of("DescribeShape", {"radius": 0.05, "features": ("planarity", "surface_variation")}),
     "EstimateNormals": _of("EstimateNormals", {"radius": 0.05}, {"max_neighbors": 8, "orient": "none"}),
     "FarthestPointSample": _of(

@@ -24,6 +24,7 @@ from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
+from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, polygon_mask
 from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_downsample,
@@ -44,13 +45,16 @@ __all__ = [
     "TemporalState",
     "average_depth",
     "ball_query",
+    "box_mask",
     "chamfer_distance",
+    "convex_hull",
     "dbscan",
     "decimate_depth",
     "deproject_depth",
     "depth_to_disparity",
     "disparity_to_depth",
     "distort_normalized",
+    "duplicate_mask",
     "estimate_normals",
     "farthest_point_groups",
     "farthest_point_sample",
@@ -62,6 +66,7 @@ __all__ = [
     "neighborhood_covariance",
     "orient_normals",
     "pixel_rays",
+    "polygon_mask",
     "project_points",
     "radius_neighbors",
     "radius_outlier_mask",

@@ -246,13 +246,19 @@ def _count_voxels(points: Tensor, ptr: Tensor, sizes: Tensor, open_: Tensor) -> 
 
 
 def _require_distinct(points: Tensor, ptr: Tensor, num_points: int) -> None:
-    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
-    available = _distinct_per_cloud(cloud_of_rows(ptr), ranks, len(ptr) - 1)
+    group, distinct = numbered_rows(points, ptr)
+    available = group_count(cloud_of_rows(ptr)[group_first(group, distinct)], len(ptr) - 1)
     for cloud in (available < num_points).nonzero().squeeze(1).tolist():
         raise TooFewPointsError(
             f"find_voxel_size: {num_points} points were asked of cloud {cloud}, which has {int(available[cloud])} "
             "distinct ones; ask for fewer (num_points), or give it more points, as by a wider crop"
         )
+
+
+def numbered_rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, int]:
+    """Number the different points (N, 3) of each cloud: (N,) int64, and how many there are."""
+    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
+    return _rank(_voxel_keys(cloud_of_rows(ptr), ranks, len(ptr) - 1))
 
 
 def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:

@@ -2,10 +2,10 @@
 
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.chain_rules import PipelineOrderWarning
-from pcdata.transforms.clusters import ClusterObjects, LeftOutWarning, SplitObjects
+from pcdata.transforms.clusters import ClusterObjects, SplitObjects
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose
-from pcdata.transforms.crop import CropWorkspace
+from pcdata.transforms.crop import CropPolygon, CropWorkspace
 from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
 from pcdata.transforms.depth_inpainting import InpaintDepth
@@ -17,6 +17,7 @@ from pcdata.transforms.downsample import (
     RandomSample,
     VoxelDownsample,
 )
+from pcdata.transforms.drop_limit import LeftOutWarning, RemoveTransform
 from pcdata.transforms.families import SelectTransform, SpatialTransform
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
@@ -29,6 +30,7 @@ from pcdata.transforms.random_apply import RandomApply
 from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_jitter import RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplicates
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.shape import DescribeShape
 from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
@@ -42,16 +44,19 @@ __all__ = [
     "CompleteDepth",
     "Compose",
     "CropCenter",
+    "CropPolygon",
     "CropWorkspace",
     "DecimateDepth",
     "Deproject",
     "DescribeShape",
+    "DropNonFinite",
     "EstimateNormals",
     "FarthestPointSample",
     "FillHoles",
     "FuseTSDF",
     "InpaintDepth",
     "KeepConfidence",
+    "KeepValues",
     "LeftOutWarning",
     "MarkUnreliableDepth",
     "MaskDepth",
@@ -74,10 +79,12 @@ __all__ = [
     "RandomSensorNoise",
     "RandomTranslation",
     "RandomVoxelSample",
+    "RemoveDuplicates",
     "RemoveFlyingPixels",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",
+    "RemoveTransform",
     "ResizeDepth",
     "SelectTransform",
     "ShiftToOrigin",

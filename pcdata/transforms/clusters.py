@@ -8,20 +8,17 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError, PcdataWarning, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.drop_limit import DropLimit, LeftOutWarning
 from pcdata.transforms.field_types import Count, Metres
 
 
-class LeftOutWarning(PcdataWarning):
-    """A step left out what may be wanted."""
-
-
-class ClusterObjects(Transform):
+class ClusterObjects(DropLimit):
     """Label density clusters (DBSCAN) as objects and keep those of a plausible size.
 
     Labels become 0..K-1 per cloud in the order of their lowest core point; any labels the cloud had are replaced.

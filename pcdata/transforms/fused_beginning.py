@@ -31,7 +31,8 @@ def find_beginning(steps: Sequence[Transform]) -> slice | None:
     stop = start + 1
     if kinds[stop : stop + 1] == [ToFrame]:
         stop += 1
-    if kinds[stop : stop + 1] != [CropWorkspace] or steps[stop].frame_from_box is not None:
+    crop = steps[stop] if stop < len(steps) else None
+    if type(crop) is not CropWorkspace or not crop.is_plain:
         return None
     if kinds[start - 1 : start] == [MaskDepth]:
         start -= 1
@@ -56,6 +57,8 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     mask, deproject, move, crop = map(by_type.get, (MaskDepth, Deproject, ToFrame, CropWorkspace))
     assert isinstance(deproject, Deproject)
     assert isinstance(crop, CropWorkspace)
+    assert not isinstance(crop.lower, str)  # is_plain
+    assert not isinstance(crop.upper, str)
     near = far = region = None
     if isinstance(mask, MaskDepth):
         near, far, region = mask.near, mask.far, mask.mask_of(frame)

@@ -9,11 +9,11 @@ from pcdata.errors import CaptureError
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.families import SelectTransform
+from pcdata.transforms.drop_limit import RemoveTransform
 from pcdata.transforms.field_types import ConfidenceName, confidence_named
 
 
-class KeepConfidence(SelectTransform):
+class KeepConfidence(RemoveTransform):
     """Drop points that are less to be trusted than a level; ``MaskDepth(min_confidence=...)`` does so in the image.
 
     Args:

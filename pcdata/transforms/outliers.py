@@ -12,11 +12,11 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
-from pcdata.transforms.families import SelectTransform
+from pcdata.transforms.drop_limit import RemoveTransform
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
-class RemoveStatisticalOutliers(SelectTransform):
+class RemoveStatisticalOutliers(RemoveTransform):
     """Drop points whose mean distance to their nearest neighbors is unusual for their cloud (Open3D's rule).
 
     Args:
@@ -38,7 +38,7 @@ class RemoveStatisticalOutliers(SelectTransform):
         return keep, ptr_after_mask(keep, cloud.ptr)
 
 
-class RemoveRadiusOutliers(SelectTransform):
+class RemoveRadiusOutliers(RemoveTransform):
     """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
 
     runs_statistics = True

@@ -42,6 +42,7 @@ USUAL: Mapping[str, _Usual] = {
         0.02, 0.995, "it took another plane than the one that things stand on: give distance, up and max_tilt"
     ),
     "CropWorkspace": _Usual(0.0, 0.99, _CROP),
+    "CropPolygon": _Usual(0.0, 0.99, _CROP),
     "CropCenter": _Usual(0.0, 0.99, _CROP),
     # Of clutter on a table, objects are what is left: noise between them is the smaller part.
     "ClusterObjects": _Usual(0.0, 0.7, "most of what is left is called noise: use a larger eps, or fewer min_points"),

@@ -21,12 +21,15 @@ from pcdata.rng import seeded
 # Decisions (indices, masks, labels, planes, sizes) have no derivative; normals, registered and smoothed depth are
 # documented to give none.
 WITHOUT = {
+    "box_mask",
     "dbscan",
+    "duplicate_mask",
     "estimate_normals",
     "farthest_point_groups",
     "farthest_point_sample",
     "find_voxel_size",
     "flying_pixel_mask",
+    "polygon_mask",
     "radius_outlier_mask",
     "ransac_plane",
     "register_depth",

@@ -77,6 +77,10 @@ def with_labels(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "labels": torch.randint(-1, 3, (count,), generator=seeded(seed))}
 
 
+def in_a_plane(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed)[:, :2].contiguous()}
+
+
 def two_clouds(count: int, seed: int) -> dict[str, Tensor]:
     return {"points_a": points(count, seed), "points_b": points(count // 2 + 1, seed + 50)}
 
@@ -137,10 +141,12 @@ class Example:
 EXAMPLES = [
     Example("ball_query", one_cloud, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
     Example("ball_query", with_queries, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
+    Example("box_mask", one_cloud, ("row",), {"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}),
     Example("chamfer_distance", two_clouds, ("cloud",)),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),
+    Example("duplicate_mask", one_cloud, ("row",)),
     # Neighborhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
@@ -158,6 +164,7 @@ EXAMPLES = [
     Example("knn", one_cloud, ("index", "row"), {"k": 4, "exclude_self": True}),
     Example("neighborhood_covariance", with_queries, ("row", "row", "row"), {"radius": 0.05, "max_neighbors": 12}),
     Example("pack_colors", color_image, ("row",)),
+    Example("polygon_mask", in_a_plane, ("row",), {"polygon": [[0.0, 0.0], [0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]}),
     Example("project_points", in_front_of_a_camera, ("row", "row")),
     Example("radius_neighbors", with_queries, ("index", "row", "rows_ptr"), {"radius": 0.03}),
     Example("radius_neighbors", one_cloud, ("index", "row", "rows_ptr"), {"radius": 0.06, "exclude_self": True}),

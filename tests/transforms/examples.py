@@ -40,6 +40,23 @@ def normalized_cloud(counts: Sequence[int]) -> PointCloud:
     return cloud.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])).repeat(len(counts), 1, 1), unit=NORMALIZED)
 
 
+def cloud_with_flaws(counts: Sequence[int]) -> PointCloud:
+    """The batch with some points at infinity."""
+    cloud = cloud_in_base(counts)
+    weight = cloud.extra["weight"].clone()
+    weight[2::7] = math.inf
+    return cloud.with_fields(weight=weight)
+
+
+def cloud_with_repeats(counts: Sequence[int]) -> PointCloud:
+    """The batch with some points twice, as other rows."""
+    cloud = cloud_in_base(counts)
+    rows = torch.arange(cloud.num_points)
+    first = torch.repeat_interleave(cloud.ptr[:-1], cloud.counts)
+    points = cloud.points[torch.where((rows - first) % 5 == 4, rows - 1, rows)]
+    return cloud.with_fields(points=points, anchor=points)
+
+
 def _of(*transforms: T.Transform, **others: object) -> list[Example]:
     return [Example(transform, **others) for transform in transforms]  # type: ignore[arg-type]
 
@@ -64,7 +81,12 @@ EXAMPLES: dict[str, list[Example]] = {
         ),
     ],
     "CropCenter": _of(T.CropCenter(size=(5, 7)), make=frame_with_counts),
+    "CropPolygon": _of(
+        T.CropPolygon(frame="base", polygon=((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (0.0, 0.0), (-0.2, 0.2))),
+        T.CropPolygon(frame="base", polygon=((0, 0), (0.1, 0), (0, 0.1)), axis="x", low=-0.2, high=0.4, invert=True),
+    ),
     "CropWorkspace": _of(
+        T.CropWorkspace(frame="base", **BOX, invert=True, max_drop=1.0, drop_alarm="warn"),
         T.CropWorkspace(frame="base", **BOX),
         T.CropWorkspace(frame="base", frame_from_box=QUARTER_TURN, lower=(0.1, 0.0, -0.5), upper=(0.5, 0.3, 0.5)),
     ),
@@ -79,6 +101,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.DescribeShape(radius=0.05),
         T.DescribeShape(features=("linearity", "planarity"), radius=None, max_neighbors=9),
     ),
+    "DropNonFinite": _of(T.DropNonFinite(fields=("points", "weight")), make=cloud_with_flaws),
     "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(max_neighbors=8, orient="none")),
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),
@@ -104,6 +127,7 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "InpaintDepth": _of(T.InpaintDepth(), T.InpaintDepth(max_distance=1), make=frame_with_counts),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
+    "KeepValues": _of(T.KeepValues(values=(0, 1)), T.KeepValues(field="weight", low=0.2, high=0.9, invert=True)),
     "MarkUnreliableDepth": _of(
         T.MarkUnreliableDepth(sensor="realsense_d435"),
         T.MarkUnreliableDepth(sensor="kinect_v1", enclosed=False),
@@ -164,6 +188,7 @@ EXAMPLES: dict[str, list[Example]] = {
         T.RandomVoxelSample(voxel_size=0.05),
         T.RandomVoxelSample(voxel_size=(0.05, 0.1, 0.3), origin=(0.02, 0.0, 0.01), min_points=2),
     ),
+    "RemoveDuplicates": _of(T.RemoveDuplicates(), make=cloud_with_repeats),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
@@ -172,6 +197,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),
         T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, seed=4),
+        T.RemovePlane(up=(0.0, 0.0, 1.0), frame="base", keep="over", max_height=0.2, margin=0.01),
     ),
     "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
     "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),

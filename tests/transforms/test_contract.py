@@ -288,6 +288,8 @@ def changed_values(value: Any) -> list[Any]:
             "never",
             "normalized",
             "planarity",
+            "warn",
+            "y",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]

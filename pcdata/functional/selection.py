@@ -1,0 +1,154 @@
+"""Which points lie in a box, in a prism over a polygon, or repeat another one; True = it does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import checked_places
+from pcdata.errors import ConfigError, ShapeError
+from pcdata.functional.rows import cloud_of_rows, group_first
+from pcdata.functional.voxels import numbered_rows
+
+_PAIRS = 1 << 20  # points and edges looked at together
+
+
+@op(points="N 3", ptr="ptr N B", lower=checked_places, upper=checked_places, gradient=False)
+def box_mask(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    lower: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+    upper: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool
+    """Mark the points inside an axis-aligned box, its faces included: lower <= point <= upper, in float32.
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
+        lower: smallest x, y, z, (3,) or one per cloud (B, 3).
+        upper: largest x, y, z, likewise.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        ConfigError: corners that are not finite, or a lower one that is not below the upper one.
+    """
+    assert ptr is not None  # @op fills it
+    assert isinstance(lower, Tensor)  # and makes both (B, 3)
+    assert isinstance(upper, Tensor)
+    for b in (lower >= upper).any(1).nonzero().squeeze(1).tolist():
+        raise ConfigError(
+            f"box_mask: lower must be below upper on every axis, cloud {b} has {lower[b].tolist()}, {upper[b].tolist()}"
+        )
+    cloud = cloud_of_rows(ptr)
+    return ((points >= lower.float()[cloud]) & (points <= upper.float()[cloud])).all(1)
+
+
+def checked_polygon(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+    """Require at least three corners (P, 2), finite; bodies get (P, 2) float64."""
+    corners = torch.as_tensor(arguments[name], dtype=torch.float64, device=arguments["points"].device).detach()
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise ShapeError(f"{where}: {name} must be the corners (P, 2), three or more, got {tuple(corners.shape)}")
+    if not bool(torch.isfinite(corners).all()):
+        raise ConfigError(f"{where}: {name} must be finite, got {corners.tolist()}")
+    return corners
+
+
+@op(points="N 2", polygon=checked_polygon, gradient=False)
+def polygon_mask(
+    points: Tensor,  # (N, 2) float32
+    *,
+    polygon: Sequence[Sequence[float]] | Tensor,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool
+    """Mark the points of a plane that lie in a polygon, which may be concave.
+
+    Those are the points from which a ray crosses an odd number of edges, in float64. Of points exactly on an edge, those
+    on the left and lower ones count as inside, the others not, so polygons that share an edge share no point.
+
+    Args:
+        points: two coordinates each: points[:, :2] looks down along z.
+        polygon: its corners in order (P, 2), either way round; the last is joined to the first.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        ShapeError: fewer than three corners, or not (P, 2).
+        ConfigError: a corner that is not finite.
+
+    Source: Shimrat, Algorithm 112: Position of point relative to polygon, Communications of the ACM 5(8), 1962.
+    """
+    assert isinstance(polygon, Tensor)  # @op makes it one
+    inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    (ax, ay), (bx, by) = polygon.unbind(1), polygon.roll(-1, 0).unbind(1)
+    slope = (bx - ax) / torch.where(by == ay, 1.0, by - ay)
+    for rows in torch.arange(len(points), dtype=torch.int64, device=points.device).split(max(1, _PAIRS // len(ax))):
+        x, y = points[rows].double().unbind(1)
+        spans = (ay <= y[:, None]) != (by <= y[:, None])  # a level edge never does
+        inside[rows] = (spans & (x[:, None] < ax + (y[:, None] - ay) * slope)).sum(1) % 2 == 1
+    return inside
+
+
+@op(points="N 3", ptr="ptr N B", gradient=False)
+def duplicate_mask(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool
+    """Mark the points that repeat an earlier one of their cloud, coordinate for coordinate (0 and -0 are equal).
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+    """
+    assert ptr is not None  # @op fills it
+    group, number = numbered_rows(points, ptr)
+    rows = torch.arange(len(points), dtype=torch.int64, device=points.device)
+    return group_first(group, number)[group] != rows
+
+
+def convex_hull(
+    points: Tensor,  # (N, 2) float
+) -> Tensor:  # (P,) int64 rows
+    """Return the corners of the convex hull of points in a plane, counterclockwise; points on its edges are none.
+
+    Fewer than three rows come back where all points lie on a line.
+
+    Raises:
+        ShapeError: the points are not (N, 2).
+
+    Source: Barber, Dobkin and Huhdanpaa, The quickhull algorithm for convex hulls, ACM TOMS 22(4), 1996; in a plane.
+    """
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ShapeError(f"convex_hull: points must be (N, 2), got {tuple(points.shape)}")
+    wide = points.detach().double()
+    rows = torch.arange(len(wide), dtype=torch.int64, device=points.device)
+    if not len(rows):
+        return rows
+    x, y = wide.unbind(1)
+    left = (x == x.min()).nonzero().squeeze(1)
+    right = (x == x.max()).nonzero().squeeze(1)
+    first, last = left[y[left].argmin()], right[y[right].argmax()]
+    if bool((wide[first] == wide[last]).all()):
+        return first[None]
+    corners: list[Tensor] = []
+    # Edges of the hull so far, each with the points to its right; the farthest of those is a corner too.
+    stack = [(last, first, rows), (first, last, rows)]
+    while stack:
+        a, b, around = stack.pop()
+        edge, offset = wide[b] - wide[a], wide[around] - wide[a]
+        beyond = offset[:, 0] * edge[1] - offset[:, 1] * edge[0]
+        outside = beyond > 1e-12 * float(edge.square().sum())
+        if not bool(outside.any()):
+            corners.append(a)
+            continue
+        around, beyond = around[outside], beyond[outside]
+        farthest = around[beyond.argmax()]
+        stack += [(farthest, b, around), (a, farthest, around)]
+    return torch.stack(corners)
