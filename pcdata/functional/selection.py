@@ -68,8 +68,8 @@ def polygon_mask(
 ) -> Tensor:  # (N,) bool
     """Mark the points of a plane that lie in a polygon, which may be concave.
 
-    Those are the points from which a ray crosses an odd number of edges, in float64. Of points exactly on an edge, those
-    on the left and lower ones count as inside, the others not, so polygons that share an edge share no point.
+    Those are the points from which a ray crosses an odd number of edges, in float64. Of points exactly on an edge,
+    those on the left and lower ones count as inside, the others not, so polygons that share an edge share no point.
 
     Args:
         points: two coordinates each: points[:, :2] looks down along z.

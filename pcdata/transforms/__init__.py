@@ -17,8 +17,7 @@ from pcdata.transforms.downsample import (
     RandomSample,
     VoxelDownsample,
 )
-from pcdata.transforms.drop_limit import LeftOutWarning, RemoveTransform
-from pcdata.transforms.families import SelectTransform, SpatialTransform
+from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTransform, SpatialTransform
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.keep_confidence import KeepConfidence

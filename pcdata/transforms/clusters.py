@@ -14,7 +14,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
-from pcdata.transforms.drop_limit import DropLimit, LeftOutWarning
+from pcdata.transforms.families import DropLimit, LeftOutWarning
 from pcdata.transforms.field_types import Count, Metres
 
 

@@ -13,7 +13,7 @@ from pcdata.functional.selection import box_mask, polygon_mask
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.drop_limit import RemoveTransform
+from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Matrix4, Name, Vec3
 
 

@@ -1,12 +1,21 @@
-"""The two families that carry most steps: those that move clouds, and those that choose rows."""
+"""The families that carry most steps: those that move clouds, those that choose rows, those that remove some."""
 
 from __future__ import annotations
 
+import warnings
+from typing import Literal
+
 from torch import Tensor
 
+from pcdata.errors import PcdataWarning, TooFewPointsError
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.field_types import Fraction
+
+
+class LeftOutWarning(PcdataWarning):
+    """A step left out what may be wanted."""
 
 
 class SpatialTransform(Transform, abstract=True):
@@ -32,3 +41,42 @@ class SelectTransform(Transform, abstract=True):
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows of every field."""
         return data.select(params["index"], params["ptr"])
+
+
+class DropLimit(Transform, abstract=True):
+    """A step that removes points, and says when it removes more than is meant.
+
+    Args:
+        max_drop: largest part of a cloud's points that it may remove; None = all but the last.
+        drop_alarm: what it does where it removes more.
+
+    Raises:
+        TooFewPointsError: it removes more of a cloud, and the alarm is an error.
+
+    Warns:
+        LeftOutWarning: it removes more of a cloud, and the alarm is a warning.
+    """
+
+    max_drop: Fraction | None = None
+    drop_alarm: Literal["error", "warn"] = "error"
+
+    def recorded_counts(
+        self, result: PointCloud, before: list[int] | None, after: list[int], params: Params
+    ) -> PointCloud:
+        """Hold the counts to the limit before they are recorded."""
+        for b, (had, count) in enumerate(zip(before or [], after)):
+            if self.max_drop is None or had - count <= self.max_drop * had:
+                continue
+            text = (
+                f"{type(self).__name__}: {had - count} of the {had} points of cloud {b}{sample_name(result, b)} are "
+                f"removed, {(had - count) / had:.1%}, more than max_drop={self.max_drop:g}; look at its fields, or at "
+                "the capture"
+            )
+            if self.drop_alarm == "error":
+                raise TooFewPointsError(text)
+            warnings.warn(text, LeftOutWarning, stacklevel=2)
+        return super().recorded_counts(result, before, after, params)
+
+
+class RemoveTransform(DropLimit, SelectTransform, abstract=True):
+    """A step that removes rows: write ``pick``."""

@@ -9,7 +9,7 @@ from pcdata.errors import CaptureError
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.drop_limit import RemoveTransform
+from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import ConfidenceName, confidence_named
 
 

@@ -21,7 +21,7 @@ from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import METRE, PointCloud
 from pcdata.transforms.base import Params, sample_name
-from pcdata.transforms.drop_limit import RemoveTransform
+from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.

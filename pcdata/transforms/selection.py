@@ -10,7 +10,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.functional.selection import duplicate_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.drop_limit import RemoveTransform
+from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Name
 
 
