@@ -41,8 +41,17 @@ def test_a_build_names_the_capture_that_is_an_outlier_and_strict_fails(tmp_path)
     assert told in said
     manifest = Manifest.read(tmp_path / "set")
     assert [one["name"] for one in manifest.alarms] == ["CropWorkspace"]
-    assert manifest.steps == (
-        {"step": "CropWorkspace", "samples": 9, "min": 100, "p5": 100, "median": 900, "p95": 900, "max": 900},
+    assert manifest.steps == (  # fmt: skip
+        {
+            "step": "CropWorkspace",
+            "samples": 9,
+            "before": None,
+            "min": 100,
+            "p5": 100,
+            "median": 900,
+            "p95": 900,
+            "max": 900,
+        },
     )
     with pytest.raises(CaptureError, match="steps drop more than is usual"):
         build_dataset(config, source, tmp_path / "strict", strict=True)

@@ -94,9 +94,11 @@ def test_clouds_among_depth_images_are_judged_by_themselves():
 
 
 def test_statistics_are_whole_numbers_that_occurred():
-    told = {f"c{n}": [("Deproject", n)] for n in range(101)}
-    (one,) = step_statistics(told)
-    assert one == {"step": "Deproject", "samples": 101, "min": 0, "p5": 5, "median": 50, "p95": 95, "max": 100}
+    told = {f"c{n}": [("Deproject", n), ("Crop", n // 2)] for n in range(101)}
+    first, second = step_statistics(told)
+    counts = {"samples": 101, "min": 0, "p5": 5, "median": 50, "p95": 95, "max": 100}
+    assert first == {"step": "Deproject", "before": None, **counts}
+    assert (second["before"], second["median"], second["max"]) == (50, 25, 50)
 
 
 def test_usual_ranges_are_of_steps_that_there_are():
