@@ -1,10 +1,11 @@
 """Stop a build of 200 synthetic captures at random moments, let it go on, and compare it with an undisturbed one.
 
-    python benchmarks/kill_builds.py [--seed 0] [--stops 50] [--start spawn]    # results/kill_builds.json
+    python benchmarks/kill_builds.py [--seed 0] [--stops 50] [--start spawn]    # results/kill_builds_fork.json
 
 Ways, in turn: SIGKILL of a worker; of the parent, with and without workers; a disk that is full (RLIMIT_FSIZE); an
 exception in the middle; no memory (RLIMIT_AS). Each stop hits a build that goes on from the stop before, so that most
-builds are stopped several times. A build that ends is compared byte for byte, and the next one begins anew.
+builds are stopped several times. A build that ends is compared byte for byte, card and all, and the next one begins
+anew. Before that, this process, workers, three parts and, where it is installed, Ray must give the same bytes.
 
 Builds are forks of one process that has loaded torch, and so are their workers, unless ``--start spawn`` is given.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib.util
 import json
 import os
 import random
@@ -62,7 +64,9 @@ def main() -> None:
         work = Path(name)
         seconds = {way: undisturbed(source, work, way) for way in WAYS[:3]}
         whole = tree(work / "whole")
-        assert all(tree(work / f"whole {way}") == whole for way in WAYS[:3])
+        assert {"README.md", "croissant.json", "dataset.json"} <= {*whole}
+        engines = other_engines(source, work)
+        assert all(tree(path) == whole for path in work.iterdir())
         for number in range(arguments.stops):
             way = WAYS[number % len(WAYS)]
             usual = seconds["parent" if not WORKERS[way] else "worker"]
@@ -81,12 +85,13 @@ def main() -> None:
         "stops": len(rows),
         "seed": arguments.seed,
         "start": arguments.start,
+        "same_bytes": ["this process", "2 workers", *engines],
         "outcomes": [{"way": way, "outcome": what, "count": count} for (way, what), count in sorted(counts.items())],
         "compared": sum("same" in row for row in rows) + 1,
         "different": sum(not row.get("same", True) for row in rows) + (not last),
         "left_behind": left,
     }
-    (RESULTS / "kill_builds.json").write_text(json.dumps(result, indent=1) + "\n")
+    (RESULTS / f"kill_builds_{arguments.start}.json").write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
     sys.exit(bool(result["different"] or left))
 
@@ -98,6 +103,17 @@ def undisturbed(source: Rendered, work: Path, way: str) -> float:
     if way == "parent":
         shutil.copytree(work / f"whole {way}", work / "whole")
     return time.perf_counter() - begun
+
+
+def other_engines(source: Rendered, work: Path) -> list[str]:
+    """Build in three parts, and with Ray where it is installed; return what was done."""
+    config = config_from_yaml(CONFIG)
+    for part in range(3):
+        build_dataset(config, source, work / "whole parts", part=(part, 3))
+    if importlib.util.find_spec("ray") is None:
+        return ["3 parts"]
+    build_dataset(config, source, work / "whole ray", engine="ray", workers=2)
+    return ["3 parts", "Ray, 2 tasks"]
 
 
 class Rendered:

@@ -41,7 +41,7 @@ def test_a_build_names_the_capture_that_is_an_outlier_and_strict_fails(tmp_path)
     assert told in said
     manifest = Manifest.read(tmp_path / "set")
     assert [one["name"] for one in manifest.alarms] == ["CropWorkspace"]
-    assert manifest.steps == (  # fmt: skip
+    assert manifest.steps == (
         {
             "step": "CropWorkspace",
             "samples": 9,
