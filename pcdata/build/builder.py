@@ -58,6 +58,7 @@ def build_dataset(
     part: tuple[int, int] | None = None,
     finalize: bool = False,
     strict: bool = False,
+    retry_quarantined: bool = False,
     progress: Progress | None = None,
     note: Note | None = None,
 ) -> BuildReport:
@@ -88,6 +89,9 @@ def build_dataset(
         finalize: only put the dataset into place, of which every shard is finished.
         strict: fail before the dataset is put into place where a step drops more than is usual, or a capture is an
             outlier of the rest; see :mod:`pcdata.validation.step_losses`. Otherwise notes say so.
+        retry_quarantined: try the captures again that the build of the dataset, or the unfinished one, quarantined.
+            Their shards are built anew, the others are kept, and the dataset is replaced by what a build gives in which
+            they never failed.
         progress: called after every capture.
         note: told at once what the report's ``notes`` say in the end.
 
@@ -101,9 +105,18 @@ def build_dataset(
     """
     _check_arguments(config, source)
     _check_ways(workers, timeout, engine, part, finalize)
+    if retry_quarantined and (restart or finalize or part is not None):
+        raise ConfigError(
+            "build_dataset: retry_quarantined goes on with a whole build: without restart, finalize, part"
+        )
+    overwrite = overwrite or retry_quarantined
     building = building_at(folder)
     if isinstance(building, BuildingUrl) and is_in_process(folder) and (workers or engine != "pool"):
         raise ConfigError(f"build_dataset: {folder} is in the memory of this process: build it with workers=0")
+    if isinstance(building, BuildingUrl) and retry_quarantined:
+        raise ConfigError(
+            f"build_dataset: {folder}: retry_quarantined takes a folder of this machine; build it again: --overwrite"
+        )
     report = BuildReport(building.target.url if isinstance(building, BuildingUrl) else building.target)
     report.skipped.update(skipped_of(source))
     building.check_target(overwrite)
@@ -120,7 +133,9 @@ def build_dataset(
     with building.opened(plan, what, restart=restart, note=tell):
         replaced = building.prepared(overwrite, tell) if part is None else None
         shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
-        done = _finished(job, shards, tell)
+        if retry_quarantined and isinstance(building, BuildingFolder):
+            building.take_over(plan)
+        done = _finished(job, shards, tell, retry_quarantined=retry_quarantined)
         if finalize and len(done) < plan.num_shards:
             missing = plan.num_shards - len(done)
             raise CacheError(f"{folder}: {missing} of {plan.num_shards} shards are not finished; build them first")
@@ -169,7 +184,7 @@ def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: in
         work_here(job, shards, tally)
 
 
-def _finished(job: Job, shards: range, note: Note) -> dict[int, ShardRecord]:
+def _finished(job: Job, shards: range, note: Note, *, retry_quarantined: bool) -> dict[int, ShardRecord]:
     """Return what is finished already; shards whose captures changed since are to be done again."""
     plan, source = job.plan, job.work.source
     done = job.folder.finished(plan)
@@ -179,10 +194,13 @@ def _finished(job: Job, shards: range, note: Note) -> dict[int, ShardRecord]:
         if shard in done and captures_digest(source, plan.ids_of(shard)) != done[shard].captures
     ]
     doubtful = [shard for shard in shards if shard in done and done[shard].is_doubtful]
-    for shard in {*changed, *doubtful}:
+    bad = [shard for shard in shards if shard in done and retry_quarantined and done[shard].quarantined]
+    for shard in {*changed, *doubtful, *bad}:
         del done[shard]
         job.folder.forget(shard)
-    if doubtful:
+    if bad:
+        note(f"{len(bad)} finished shards are built anew, to try their quarantined captures again")
+    elif doubtful:
         note(f"{len(doubtful)} finished shards are built anew, since captures of them ran out of memory or time")
     if changed:
         note(f"{len(changed)} finished shards are built anew, since a file of their captures has changed")

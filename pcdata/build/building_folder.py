@@ -10,6 +10,9 @@
 
 A shard's folder has the digest of its record in its name. So whoever commits the same shard twice, because a process of
 a dead build still runs or because a file system has no locks, does the same work twice and spoils nothing.
+
+Of a build that quarantined captures ``.NAME.kept`` stays: its plan, its records and the signals of each shard. So these
+captures can be tried again, and the other shards are taken from the dataset.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ class BuildingFolder:
         self.target = target
         self.path = self.kept_at = hidden_folder(target, "building")
         self.dataset = self.path / _DATASET
+        self._kept = hidden_folder(target, "kept")
 
     # -- the name that the dataset gets ----------------------------------------------------------------------------
 
@@ -82,7 +86,66 @@ class BuildingFolder:
             CacheError: something else is there now, or it cannot be put there.
         """
         put_into_place(self.dataset, self.target, replaced, check_only_dataset, note)
+        with shielded():
+            shutil.rmtree(self._kept, ignore_errors=True)
+            if any(record.quarantined for record in records.values()):
+                self._keep(records.values())
         self.remove()
+
+    def _keep(self, records: Iterable[ShardRecord]) -> None:
+        """Set aside what :meth:`take_over` needs; the plan goes last: without it, the rest counts for nothing."""
+        with suppress(OSError):  # of a full disk: then all is built anew
+            self._kept.mkdir()
+            os.rename(self.path / _RECORDS, self._kept / _RECORDS)
+            for record in records:
+                if (signals := self.work_place(record) / SIGNALS).is_dir():
+                    place = self._kept / _SHARDS / record.folder_name
+                    place.mkdir(parents=True)
+                    os.rename(signals, place / SIGNALS)
+            os.rename(self.path / PLAN, self._kept / PLAN)
+
+    def take_over(self, plan: Plan) -> None:
+        """Begin with the shards of the dataset that hold all their captures; an unfinished build goes on as it is.
+
+        Raises:
+            CacheError: there is no build to go on with, or it has other settings; or nothing can be written.
+        """
+        if self._num_kept():
+            return
+        path = self._kept / PLAN
+        if not path.exists():
+            raise CacheError(
+                f"{self.target}: no captures of it are quarantined, or what its build left ({self._kept.name}) is not "
+                "beside it; build all of it again: --overwrite"
+            )
+        different = plan.differences(str(path), read_bytes("build", path, max_bytes=MOST_PLAN, error=CacheError))
+        if different:
+            raise CacheError(
+                f"{self.target}: was built with other settings: this differs in its {', '.join(different)}; only the "
+                "same build can try its quarantined captures again, so repeat its settings, or build all of it again: "
+                "--overwrite"
+            )
+        for shard in range(plan.num_shards):
+            with suppress(CacheError):
+                self._take_over(plan, shard)
+
+    def _take_over(self, plan: Plan, shard: int) -> None:
+        path = self._kept / _RECORDS / f"{shard:05d}.json"
+        record = ShardRecord.of(
+            str(path), read_bytes("build", path, max_bytes=MOST_RECORD, error=CacheError), plan, shard
+        )
+        place = shard_folder(self.target, shard)
+        signals = self._kept / _SHARDS / record.folder_name / SIGNALS
+        if record.quarantined or not record.is_whole(place) or ("digest" in record.signals) > signals.is_dir():
+            return
+        with self.shard_scratch(shard) as scratch:
+            try:
+                shutil.copytree(place, scratch / SHARD, copy_function=_linked)
+                if signals.is_dir():
+                    shutil.copytree(signals, scratch / SIGNALS, copy_function=_linked)
+            except OSError as error:
+                raise CacheError(f"{self.target}: cannot be written: {write_fault(error)}") from error
+            self.commit(scratch, record)
 
     # -- who works on it -------------------------------------------------------------------------------------------
 
@@ -321,3 +384,11 @@ class BuildingFolder:
             if isinstance(error, CacheError):
                 raise
             raise CacheError(f"{self.target}: cannot be written: {write_fault(error)}") from error
+
+
+def _linked(source: str, target: str) -> None:
+    """Give a file, which nobody writes again, a second name; copy it where the file system has none."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

@@ -59,6 +59,11 @@ def add_to(commands: Any) -> None:
         action="store_true",
         help="delete an unfinished build of DIR and begin anew",
     )
+    build.add_argument(
+        "--retry-quarantined",
+        action="store_true",
+        help="try the captures again that are quarantined in DIR; their shards are built anew, the rest is kept",
+    )
     _add_ways(build)
     build.add_argument(
         "--dry-run", action="store_true", help="say what would be built, how large, and what is finished; write nothing"
@@ -140,6 +145,7 @@ def _build(arguments: argparse.Namespace) -> int:
             part=part,
             finalize=arguments.finalize,
             strict=arguments.strict,
+            retry_quarantined=arguments.retry_quarantined,
             progress=progress,
             note=progress.note,
         )
@@ -147,6 +153,8 @@ def _build(arguments: argparse.Namespace) -> int:
     if report.is_complete:
         loads = f"  (python {report.folder / 'load.py'} loads it)" if isinstance(report.folder, Path) else ""
         print(f"\ndataset  {report.folder}{loads}")
+        if report.quarantined and isinstance(report.folder, Path):
+            print("         once the cause is mended, the same command with --retry-quarantined tries those again")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -113,7 +114,7 @@ def test_what_ends_or_blocks_its_process_is_tried_alone_and_quarantined(tmp_path
         "c8": "RuntimeError: no",
     }
     assert CachedCloudDataset(tmp_path / "out").ids == ["c0", "c2", "c3", "c6", "c7", "c9"]
-    assert [path.name for path in tmp_path.iterdir() if path.name != "times"] == ["out"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".out.kept", "out", "times"]
     assert all(source.times(name) == 2 for name in ("c1", "c4", "c5", "c8"))
 
 
@@ -236,3 +237,44 @@ def test_three_captures_that_lack_memory_stop_the_build_and_are_tried_again(tmp_
 def test_one_capture_that_lacks_memory_is_quarantined(tmp_path, moody):
     report = build_dataset(config_from_yaml(CONFIG), moody(c4=[MemoryError()]), tmp_path / "out")
     assert report.quarantined == {"c4": "MemoryError"}
+
+
+def test_quarantined_captures_are_tried_again_and_the_other_shards_kept(tmp_path, moody):
+    config = config_from_yaml(CONFIG)
+    build_dataset(config, moody(), tmp_path / "calm")
+    for file in (tmp_path / "times").iterdir():
+        file.unlink()
+    source = moody(c4=[ValueError("x"), ValueError("x"), ""])
+    assert list(build_dataset(config, source, tmp_path / "out").quarantined) == ["c4"]
+    for stop in (KeyboardInterrupt, None):  # a retry that is stopped goes on
+        for name in {*source.ids} - {"c4"}:
+            (source.folder / name).unlink(missing_ok=True)
+
+        def progress(*told, stop=stop):
+            if stop is not None:
+                raise stop
+
+        with pytest.raises(stop) if stop else nullcontext():
+            report = build_dataset(config, source, tmp_path / "out", retry_quarantined=True, progress=progress)
+        assert {*os.listdir(source.folder)} <= {"c3", "c4", "c5"}
+    assert (report.quarantined, report.is_complete) == ({}, True)
+    assert tree(tmp_path / "out") == tree(tmp_path / "calm")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["calm", "out", "times"]
+    with pytest.raises(CacheError, match="no captures of it are quarantined"):
+        build_dataset(config, source, tmp_path / "out", retry_quarantined=True)
+
+
+def test_only_the_same_build_tries_again_and_a_plain_one_begins_anew(tmp_path, moody):
+    source, other = moody(c4=[ValueError("x")]), config_from_yaml(CONFIG.replace("8", "9"))
+    build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out")
+    was = tree(tmp_path / "out")
+    with pytest.raises(CacheError, match="differs in its steps"):
+        build_dataset(other, source, tmp_path / "out", retry_quarantined=True)
+    with pytest.raises(ConfigError, match="without restart, finalize, part"):
+        build_dataset(other, source, tmp_path / "out", retry_quarantined=True, part=(0, 2))
+    report = build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out", retry_quarantined=True)
+    assert list(report.quarantined) == ["c4"]
+    assert tree(tmp_path / "out") == was
+    report = build_dataset(other, moody(), tmp_path / "out", overwrite=True)
+    assert report.notes == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "times"]
