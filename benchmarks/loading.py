@@ -14,6 +14,7 @@ What the rates stand beside:
   nothing is read, copied or allocated; ``fresh tensor``: a new tensor of that size for every batch, which torch moves
   to shared memory.
 - ``npz and default_collate``, ``hdf5 group per sample``: what most training code does.
+- ``webdataset``: the tars that pcdata builds, by key at random, and streamed shard by shard.
 - WebDataset, LitData, Zarr and Lance, each as its documentation shows, where they are installed.
 
 Augmented are every sample by RandomRotation, RandomScale and RandomJitter, and also by RandomPointDropout.
@@ -38,9 +39,9 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, default_collate
+from torch.utils.data import DataLoader, Dataset, IterableDataset, default_collate
 
-from pcdata import CachedCloudDataset, PointCloud, collate_fixed, collate_packed
+from pcdata import CachedCloudDataset, PointCloud, StreamedCloudDataset, collate_fixed, collate_packed
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.rng import seeded
 
@@ -156,6 +157,28 @@ def loader_of(data: Dataset, collate: Callable[..., Any], workers: int, passes: 
         return DataLoader(data, batch_size=BATCH, sampler=order, num_workers=workers, collate_fn=collate)
 
     return _Loaded(begin)
+
+
+def streamed(data: CachedCloudDataset, workers: int, passes: int) -> _Loaded:
+    """Batches of many passes over a dataset that is gone through shard by shard, in a window as large as the peer's."""
+
+    def begin(number: int) -> DataLoader:
+        data.set_epoch(number)
+        stream = StreamedCloudDataset(data, batch_size=BATCH, shuffle_buffer=256, drop_last=True)
+        return DataLoader(_Passes(stream, passes), batch_size=None, num_workers=workers, collate_fn=collate_fixed)
+
+    return _Loaded(begin)
+
+
+class _Passes(IterableDataset):
+    """Several passes in a row: workers begin once."""
+
+    def __init__(self, data: StreamedCloudDataset, passes: int) -> None:
+        self.data, self.passes = data, passes
+
+    def __iter__(self) -> Iterator[Any]:
+        for _ in range(self.passes):
+            yield from self.data
 
 
 def copied(clouds: _Clouds) -> _Loaded:
@@ -317,13 +340,17 @@ def main() -> None:
             if number == 0:
                 ways["packed"] = loaded(CachedCloudDataset(built, augment=None), collate_fixed)
             ways[f"packed, {name}"] = loaded(CachedCloudDataset(built), collate_packed)
+        built = folder / "tars"
+        build_dataset(config_from_yaml("cloud: [Center]\noutput: {format: webdataset}\n"), clouds, built)
+        ways["webdataset"] = loaded(CachedCloudDataset(built), collate_fixed)
+        ways["webdataset, streamed"] = streamed(CachedCloudDataset(built), arguments.workers, passes)
         skipped = {}
         for name, way in peers(folder, clouds, arguments.workers, passes).items():
             (skipped if isinstance(way, str) else ways)[name] = way
         rates: dict[str, list[float]] = {name: [] for name in ways}
         for number in range(arguments.repeats + 1):  # the first stretch begins workers and fills caches
             for name, way in list(ways.items()):
-                is_ours = name in ("memcpy", "torch's ceiling") or name.startswith("packed")
+                is_ours = name in ("memcpy", "torch's ceiling") or name.startswith(("packed", "webdataset"))
                 count = arguments.batches if is_ours else max(8, arguments.batches // 8)
                 try:
                     found = rate(way, count, 4 * arguments.workers)

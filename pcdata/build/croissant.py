@@ -21,7 +21,13 @@ from pcdata.io.store.shards import TABLE, hash_of, read_table, shard_folder
 _CONFORMS = "http://mlcommons.org/croissant/1.1"
 _MOST_FILES = 1000  # that are listed one by one; of more, the tables of the shards list them with their SHA-256
 _TYPES = {"json": "application/json", "npy": "application/octet-stream", "tsv": "text/tab-separated-values"}
-_TYPES |= {"h5": "application/x-hdf5", "yaml": "application/yaml", "py": "text/x-python", "png": "image/png"}
+_TYPES |= {
+    "h5": "application/x-hdf5",
+    "tar": "application/x-tar",
+    "yaml": "application/yaml",
+    "py": "text/x-python",
+    "png": "image/png",
+}
 _OTHER = "application/octet-stream"
 _CONTEXT: dict[str, Any] = {
     "@language": "en",

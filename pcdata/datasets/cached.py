@@ -79,7 +79,7 @@ class CachedCloudDataset(SampleDataset):
         self.folder, server = Path(folder), None
         if isinstance(folder, str) and ":" in folder:
             self.folder, server = opened_folder("CachedCloudDataset", folder, storage_options)
-        self._place: object = self.folder if server is None else server  # as messages call it
+        self._shown: object = self.folder if server is None else server  # as messages call it
         self.manifest = Manifest.read(self.folder)
         stored = self._stored_pipeline()
         self._warn_of_other_files()
@@ -87,7 +87,7 @@ class CachedCloudDataset(SampleDataset):
         fingerprint = wanted.stored_fingerprint()
         if fingerprint != self.manifest.fingerprint:
             raise CacheError(
-                f"{self._place}: the cache was made by other deterministic steps than the ones given "
+                f"{self._shown}: the cache was made by other deterministic steps than the ones given "
                 f"(fingerprint {self.manifest.fingerprint[:12]}, expected {fingerprint[:12]}): "
                 f"{wanted.difference(stored)}; rebuild it with this pipeline, or load it with its own"
             )
@@ -138,7 +138,7 @@ class CachedCloudDataset(SampleDataset):
             others = {mine[name].name for name in one["transforms"] if name in mine}
             if others and one["sha256"] not in known:
                 warnings.warn(
-                    f"{self._place}: was built with another {one['file']} (sha256 {one['sha256'][:12]}) than the "
+                    f"{self._shown}: was built with another {one['file']} (sha256 {one['sha256'][:12]}) than the "
                     f"{', '.join(sorted(others))} that is imported; rebuild it if its steps have changed",
                     PcdataWarning,
                     stacklevel=4,
@@ -163,7 +163,7 @@ class CachedCloudDataset(SampleDataset):
         """
         told = self.manifest.signals
         if "fault" in told:
-            raise ShapeError(f"{self._place}: its samples have no signals in common: {told['fault']}; build it again")
+            raise ShapeError(f"{self._shown}: its samples have no signals in common: {told['fault']}; build it again")
         if "digest" not in told:
             return {}
         record, path = self._shards.signals(), self._shards.signals_store().place_of(SIGNALS_KEY)
@@ -263,7 +263,7 @@ class CachedCloudDataset(SampleDataset):
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f" of {self.split}"
-        return f"CachedCloudDataset({str(self._place)!r}, {len(self)} samples{split}, {self.manifest.format})"
+        return f"CachedCloudDataset({str(self._shown)!r}, {len(self)} samples{split}, {self.manifest.format})"
 
 
 class _FirstTouch:
