@@ -75,6 +75,7 @@ _HOMES = {
         "SplitObjects",
         "ToFrame",
         "Transform",
+        "Undistort",
         "VoxelDownsample",
         "VoxelSample",
     ],

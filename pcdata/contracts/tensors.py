@@ -4,7 +4,7 @@ A contract is a short string read by :func:`check_tensors`:
 
 * ``"N 3"``: a float32 tensor of that shape; equal letters must agree across the call.
 * ``"V H W : uint8"``: the same with a dtype; ``float`` means float32 or float64.
-* ``"V H W : depth"``: float32 lengths, none below 0.
+* ``"V H W : depth"``: float32 lengths, none below 0; ``image``: uint8, float32 or float64.
 * ``"ptr N B"``: int64 row pointers of shape (B+1,) that cut N rows into B clouds.
 * ``"ptr N B >= 3"``: the same, with at least 3 rows in every cloud.
 """
@@ -31,6 +31,7 @@ _DTYPES: dict[str, tuple[torch.dtype, ...]] = {
     "uint8": (torch.uint8,),
     "int32": (torch.int32,),
     "bool": (torch.bool,),
+    "image": (torch.uint8, torch.float32, torch.float64),
 }
 
 

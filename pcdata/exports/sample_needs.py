@@ -75,8 +75,8 @@ def one_view(where: str, data: Any, view: int | None) -> DepthFrame:
     frame = data.view(view or 0).to("cpu")
     if frame.camera.distortion is not None and bool((frame.camera.distortion != 0).any()):
         raise IntrinsicsError(
-            f"{where}: the loader knows no lens distortion, but this camera has some; rectify the images when "
-            "recording, and give the intrinsics of the rectified stream"
+            f"{where}: the loader knows no lens distortion, but this camera has some; take it out first "
+            "with the step Undistort, or rectify the images when recording"
         )
     if float(frame.camera.intrinsics[0, 0, 1]) != 0.0:
         raise IntrinsicsError(f"{where}: the loader knows no skew, but this camera has some; rectify the images")

@@ -1,10 +1,9 @@
 """Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
-decimated, resized and filled depth, disparity, Chamfer distance, distances and
-covariances of neighbors. None flow through decisions
-(indices, masks, labels, planes, sizes, which points are neighbors), nor through estimated normals, ``register_depth``,
-``spatial_filter`` and TSDF volumes.
+decimated, resized, undistorted and filled depth, undistorted images, disparity, Chamfer distance, distances and
+covariances of neighbors. None flow through decisions (indices, masks, labels, planes, sizes, which points are
+neighbors), nor through estimated normals, ``register_depth``, ``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.clusters import dbscan
@@ -16,6 +15,7 @@ from pcdata.functional.depth.flying_pixels import flying_pixel_mask
 from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
+from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import chamfer_distance
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
@@ -79,6 +79,8 @@ __all__ = [
     "spatial_filter",
     "statistical_outlier_mask",
     "temporal_filter",
+    "undistort_depth",
+    "undistort_image",
     "undistort_normalized",
     "voxel_downsample",
     "voxel_majority",

@@ -1,9 +1,15 @@
-"""The OpenCV lens model: bending normalized image coordinates, and bending them back.
+"""Lenses: bending normalized image coordinates, and bending them back.
 
-Normalized coordinates are (x/z, y/z) of a point in the camera frame. Coefficients come in OpenCV's order,
-``k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]``: 4, 5, 8 or 12 of them.
+Normalized coordinates are (x/z, y/z) of a point in the camera frame. What a lens is in numbers, and which models there
+are: :mod:`pcdata.geometry.lens_models`.
 
-Source: OpenCV calib3d, "Detailed description"; the radial part is Brown (1966), the quotient Claus & Fitzgibbon (2005).
+OpenCV's polynomial, ``k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]``, bends in closed form and is inverted
+step by step. RealSense's ``inverse_brown_conrady`` (k1 k2 p1 p2 k3) does too: its documentation calls it the model that
+undistorts, but since 2021 its SDK projects in closed form and iterates to deproject. It differs from OpenCV's only in
+that p1 and p2 act on what k1 k2 k3 have bent; with the coefficients of a D455 that is less than 0.05 pixel.
+
+Source: OpenCV calib3d, "Detailed description"; the radial part is Brown (1966), the quotient Claus & Fitzgibbon (2005),
+the tilted sensor Louhichi et al. (2007); librealsense, rs2_project_point_to_pixel.
 """
 
 from __future__ import annotations
@@ -14,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import CaptureError, ShapeError
-
-COEFFICIENT_COUNTS = (4, 5, 8, 12)
+from pcdata.errors import ShapeError
+from pcdata.geometry.lens_models import LENS_MODELS, ROW, WIDEST_PLAIN, check_distortion, lens_facts
+from pcdata.geometry.radial_lenses import bend_radially, radial_fold, unbend_radially
 
 # Normalized units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
 _CONVERGED = 1e-12
@@ -46,25 +52,18 @@ class _Coefficients(NamedTuple):
     s2: Tensor
     s3: Tensor
     s4: Tensor
+    after: bool = False  # p1 and p2 act on what the radial part has bent (inverse_brown_conrady)
 
 
-def check_distortion(where: str, distortion: Tensor) -> None:
-    """Require (..., D) coefficients with D one of 4, 5, 8, 12.
+class _Polynomial(NamedTuple):
+    """One view's lens that is a polynomial."""
 
-    Raises:
-        CaptureError: any other number; 14 (a tilted sensor) is refused by name.
-    """
-    count = distortion.shape[-1] if distortion.ndim else 0
-    if count == 14:
-        raise CaptureError(
-            f"{where}: 14 distortion coefficients describe a tilted sensor, which is not supported; "
-            "if tau_x and tau_y (the last two) are 0, pass the first 12"
-        )
-    if count not in COEFFICIENT_COUNTS:
-        raise CaptureError(
-            f"{where}: distortion must hold 4, 5, 8 or 12 coefficients per view in OpenCV's order "
-            f"(k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4), got {count}; pass None for a lens without distortion"
-        )
+    twelve: Tensor  # (12,) float64
+    tilt: Tensor | None  # (2,) tau_x, tau_y in radians
+    after: bool
+
+    def split(self, ndim: int) -> _Coefficients:
+        return _split(self.twelve[None], ndim)._replace(after=self.after)
 
 
 def distort_normalized(
@@ -78,11 +77,15 @@ def distort_normalized(
 
     Raises:
         ShapeError: the views of the two differ.
-        CaptureError: the number of coefficients is not one of OpenCV's.
+        CaptureError: the number of coefficients is not one of a known lens.
     """
     _check_views("distort_normalized", xy, distortion)
-    x, y = xy.double().unbind(-1)
-    return torch.stack(_bend(x, y, _split(distortion, x.ndim)), dim=-1)
+    if distortion.shape[1] <= WIDEST_PLAIN:
+        x, y = xy.double().unbind(-1)
+        return torch.stack(_bend(x, y, _split(distortion, x.ndim)), dim=-1)
+    if not len(xy):
+        return xy.double()
+    return torch.stack([_distort_view(one, row.double()) for one, row in zip(xy.double(), distortion)])
 
 
 def undistort_normalized(
@@ -99,26 +102,76 @@ def undistort_normalized(
         ShapeError, CaptureError: as :func:`distort_normalized`.
     """
     _check_views("undistort_normalized", xy, distortion)
-    target = xy.double().reshape(len(xy), -1, 2)
+    if not len(xy):
+        return xy.double()
+    target = xy.double().flatten(1, -2) if xy.ndim > 2 else xy.double()[:, None]
+    solved = [_undistort_view(one, row.double()) for one, row in zip(target, distortion)]
+    return torch.stack(solved).reshape(xy.shape)
+
+
+def _distort_view(xy: Tensor, row: Tensor) -> Tensor:
+    """Bend (..., 2) coordinates by one lens of any model."""
+    model, polynomial = _model_of(row)
+    if polynomial is None:
+        return bend_radially(xy, model, row[1 : 1 + LENS_MODELS[model][1][-1]])
+    x, y = xy.unbind(-1)
+    bent = torch.stack(_bend(x, y, polynomial.split(x.ndim)), dim=-1)
+    return bent if polynomial.tilt is None else _through(_tilt(polynomial.tilt), bent)
+
+
+def _undistort_view(target: Tensor, row: Tensor) -> Tensor:
+    """Undistort (P, 2) coordinates of one lens of any model."""
+    model, polynomial = _model_of(row)
+    if polynomial is None:
+        return unbend_radially(target, model, row[1 : 1 + LENS_MODELS[model][1][-1]])
+    if polynomial.tilt is not None:
+        target = _through(torch.linalg.inv(_tilt(polynomial.tilt)), target)
     with torch.no_grad():
-        solved = torch.empty_like(target)
-        for view, coefficients in enumerate(distortion):
-            fold = float(fold_radius(coefficients[None]))
-            split = _split(_without_canceled_poles(coefficients)[None], 1)
-            for begin in range(0, target.shape[1], _CHUNK):
-                some = slice(begin, begin + _CHUNK)
-                solved[view, some] = _invert(target[view, some], split, fold)
-    if torch.is_grad_enabled() and (xy.requires_grad or distortion.requires_grad):
-        solved = _with_gradient(solved, target, distortion)
-    return solved.reshape(xy.shape)
+        fold = float(fold_radius(row[None]))
+        reduced = polynomial._replace(twelve=_without_canceled_poles(polynomial.twelve)).split(1)
+        chunks = [_invert(some, reduced, fold) for some in target.split(_CHUNK)]
+        solved = torch.cat(chunks) if chunks else target.clone()
+    if torch.is_grad_enabled() and (target.requires_grad or row.requires_grad):
+        solved = _with_gradient(solved, target, polynomial.split(1))
+    return solved
 
 
-def _with_gradient(solved: Tensor, target: Tensor, distortion: Tensor) -> Tensor:
-    """Attach the inverse function's derivative to its values (V, P, 2): that of one Newton step at the solution."""
+def _model_of(row: Tensor) -> tuple[str, _Polynomial | None]:
+    """Return the model of one lens (D,), and its parts where it is a polynomial."""
+    model = "opencv"
+    if len(row) == ROW:
+        model, row = lens_facts(row.detach())[0], row[1:]
+        if model not in ("opencv", "inverse_brown_conrady"):
+            return model, None
+    tilt = row[WIDEST_PLAIN : WIDEST_PLAIN + 2]
+    is_tilted = len(tilt) == 2 and (tilt.requires_grad or bool((tilt != 0).any()))
+    return model, _Polynomial(
+        _padded(row[:WIDEST_PLAIN]), tilt if is_tilted else None, model == "inverse_brown_conrady"
+    )
+
+
+def _tilt(angles: Tensor) -> Tensor:  # (3, 3)
+    """Return the homography of a sensor tilted by tau_x and tau_y (2,), as OpenCV has it."""
+    (cx, cy), (sx, sy), one, zero = angles.cos(), angles.sin(), angles.new_ones(()), angles.new_zeros(())
+    about_x = torch.stack([one, zero, zero, zero, cx, sx, zero, -sx, cx]).reshape(3, 3)
+    about_y = torch.stack([cy, zero, -sy, zero, one, zero, sy, zero, cy]).reshape(3, 3)
+    turn = about_y @ about_x
+    onto = torch.stack([turn[2, 2], zero, -turn[0, 2], zero, turn[2, 2], -turn[1, 2], zero, zero, one]).reshape(3, 3)
+    return onto @ turn
+
+
+def _through(homography: Tensor, xy: Tensor) -> Tensor:
+    """Move (..., 2) coordinates; NaN where they leave the front of the sensor's plane."""
+    x, y, z = (xy @ homography[:, :2].T + homography[:, 2]).unbind(-1)
+    front = z > 0
+    return torch.where(front[..., None], torch.stack([x, y], -1) / torch.where(front, z, 1.0)[..., None], torch.nan)
+
+
+def _with_gradient(solved: Tensor, target: Tensor, coefficients: _Coefficients) -> Tensor:
+    """Attach the inverse function's derivative to its values (P, 2): that of one Newton step at the solution."""
     known = ~solved.isnan().any(-1, keepdim=True)
     at = torch.where(known, solved, 0.0)  # the center of the image stands in where there is no solution
     x, y = at.unbind(-1)
-    coefficients = _split(distortion, 2)
     with torch.no_grad():
         xx, xy, yx, yy = _jacobian(x, y, coefficients)
         determinant = xx * yy - xy * yx
@@ -132,10 +185,16 @@ def _with_gradient(solved: Tensor, target: Tensor, distortion: Tensor) -> Tensor
 def fold_radius(distortion: Tensor) -> Tensor:
     """Return (V,) float64: the normalized radius at which each view's radial model stops growing, or infinity.
 
-    It is the first zero of d(r N/D)/dr, or the first pole that no zero cancels; with t = r^2 both are polynomials in t.
+    Of a polynomial it is the first zero of d(r N/D)/dr, or the first pole that no zero cancels; with t = r^2 both are
+    polynomials in t. A fisheye or f-theta lens ends at 89.4 degrees off axis at the latest.
     """
     radii = []
-    for coefficients in _padded(distortion):
+    for row in distortion.detach():
+        model, polynomial = _model_of(row.double())
+        if polynomial is None:
+            radii.append(radial_fold(model, row.double()[1 : 1 + LENS_MODELS[model][1][-1]]))
+            continue
+        coefficients = polynomial.twelve
         numerator, denominator = _radial_parts(coefficients)
         t = np.polynomial.Polynomial([0.0, 1.0])
         slope = numerator * denominator + 2 * t * (numerator.deriv() * denominator - numerator * denominator.deriv())
@@ -146,7 +205,7 @@ def fold_radius(distortion: Tensor) -> Tensor:
 
 def _radial_parts(coefficients: Tensor) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:
     """Return numerator and denominator of one view's radial quotient in t = r^2, without canceled poles."""
-    k1, k2, _, _, k3, k4, k5, k6 = _padded(coefficients)[:8].tolist()
+    k1, k2, _, _, k3, k4, k5, k6 = coefficients[:8].tolist()
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
     denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
     for pole in _positive_roots(denominator):
@@ -159,7 +218,7 @@ def _radial_parts(coefficients: Tensor) -> tuple[np.polynomial.Polynomial, np.po
 
 def _without_canceled_poles(coefficients: Tensor) -> Tensor:
     """Return (12,) float64 coefficients of the same lens whose radial quotient is reduced."""
-    reduced = _padded(coefficients)
+    reduced = coefficients.clone()
     for part, places in zip(_radial_parts(coefficients), ([0, 1, 4], [5, 6, 7])):
         given = part.coef[1:4].tolist()
         reduced[places] = reduced.new_tensor([*given, *[0.0] * (3 - len(given))])
@@ -208,6 +267,9 @@ def _newton_step(
 def _bend(x: Tensor, y: Tensor, c: _Coefficients) -> tuple[Tensor, Tensor]:
     r2 = x * x + y * y
     radial = _cubic(r2, c.k1, c.k2, c.k3) / _cubic(r2, c.k4, c.k5, c.k6)
+    if c.after:
+        a, b = x * radial, y * radial
+        return a + 2 * c.p1 * a * b + c.p2 * (r2 + 2 * a * a), b + 2 * c.p2 * a * b + c.p1 * (r2 + 2 * b * b)
     bent_x = x * radial + 2 * c.p1 * x * y + c.p2 * (r2 + 2 * x * x) + (c.s1 + c.s2 * r2) * r2
     bent_y = y * radial + c.p1 * (r2 + 2 * y * y) + 2 * c.p2 * x * y + (c.s3 + c.s4 * r2) * r2
     return bent_x, bent_y
@@ -219,11 +281,28 @@ def _jacobian(x: Tensor, y: Tensor, c: _Coefficients) -> tuple[Tensor, Tensor, T
     denominator = _cubic(r2, c.k4, c.k5, c.k6)
     radial = _cubic(r2, c.k1, c.k2, c.k3) / denominator
     slope = (_cubic_slope(r2, c.k1, c.k2, c.k3) - radial * _cubic_slope(r2, c.k4, c.k5, c.k6)) / denominator
+    if c.after:
+        return _jacobian_after(x, y, radial, slope, c)
     prism_x, prism_y = c.s1 + 2 * c.s2 * r2, c.s3 + 2 * c.s4 * r2
     mixed = 2 * (x * y * slope + c.p1 * x + c.p2 * y)
     xx = radial + 2 * x * x * slope + 2 * c.p1 * y + 6 * c.p2 * x + 2 * x * prism_x
     yy = radial + 2 * y * y * slope + 6 * c.p1 * y + 2 * c.p2 * x + 2 * y * prism_y
     return xx, mixed + 2 * y * prism_x, mixed + 2 * x * prism_y, yy
+
+
+def _jacobian_after(
+    x: Tensor, y: Tensor, radial: Tensor, slope: Tensor, c: _Coefficients
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the derivatives where p1 and p2 act on (a, b), what the radial part has bent."""
+    a, b = x * radial, y * radial
+    ax, both, by = radial + 2 * x * x * slope, 2 * x * y * slope, radial + 2 * y * y * slope
+    x_of_a, x_of_b = 1 + 2 * c.p1 * b + 4 * c.p2 * a, 2 * c.p1 * a
+    y_of_a, y_of_b = 2 * c.p2 * b, 1 + 2 * c.p2 * a + 4 * c.p1 * b
+    xx = x_of_a * ax + x_of_b * both + 2 * x * c.p2
+    xy = x_of_a * both + x_of_b * by + 2 * y * c.p2
+    yx = y_of_a * ax + y_of_b * both + 2 * x * c.p1
+    yy = y_of_a * both + y_of_b * by + 2 * y * c.p1
+    return xx, xy, yx, yy
 
 
 def _cubic(t: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -241,7 +320,8 @@ def _padded(distortion: Tensor) -> Tensor:
 
 def _split(distortion: Tensor, ndim: int) -> _Coefficients:
     """Shape every (V,) coefficient to broadcast against (V, ...) coordinates of ``ndim`` dimensions."""
-    return _Coefficients(*(column.reshape(-1, *[1] * (ndim - 1)) for column in _padded(distortion).unbind(-1)))
+    columns = [column.reshape(-1, *[1] * (ndim - 1)) for column in _padded(distortion).unbind(-1)]
+    return _Coefficients._make([*columns[:12], False])
 
 
 def _check_views(where: str, xy: Tensor, distortion: Tensor) -> None:

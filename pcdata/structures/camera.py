@@ -1,4 +1,4 @@
-"""The pinhole camera with OpenCV axes and lens distortion."""
+"""The camera with OpenCV axes, and the lens that bends what a pinhole would see."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
+from pcdata.geometry.lens_models import check_distortion, lens_facts, lens_row
 from pcdata.structures.structure import Structure, derived
 
 # Of the side of an image: principal points of depth cameras lie nearer to its middle, those of another size do not.
@@ -28,7 +29,9 @@ class Camera(Structure):
     Args:
         intrinsics: (V, 3, 3) float64, pixels.
         size: (height, width) in pixels.
-        distortion: (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]].
+        distortion: (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]; or rows of 16
+            numbers that name another model (``fisheye``, ``inverse_brown_conrady``, ``f_theta``), which
+            :meth:`pinhole` makes.
         is_window: cut from a larger image, so the principal point may lie outside.
     """
 
@@ -43,6 +46,8 @@ class Camera(Structure):
             {"intrinsics": self.intrinsics, "distortion": self.distortion},
             {"intrinsics": "V 3 3 : float64", "distortion": "V D : float64"},
         )
+        if self.distortion is not None:
+            check_distortion("Camera", self.distortion)
         # The class is frozen; a list would never equal the size of an image.
         object.__setattr__(self, "size", tuple(self.size))
         if [type(side) for side in self.size] != [int, int] or min(self.size) < 1:
@@ -62,8 +67,21 @@ class Camera(Structure):
         cy: float,
         size: tuple[int, int],
         distortion: Sequence[float] | None = None,
+        lens: str | None = None,
     ) -> Camera:
-        """Make one camera from focal lengths and principal point in pixels; ``size`` is (height, width)."""
+        """Make one camera from focal lengths and principal point in pixels; ``size`` is (height, width).
+
+        ``lens`` is the model that the coefficients in ``distortion`` are of: ``opencv`` (the default), ``fisheye``
+        (k1 k2 k3 k4, also called equidistant or Kannala-Brandt), ``inverse_brown_conrady`` (k1 k2 p1 p2 k3, as
+        RealSense's SDK computes it) or ``f_theta`` (its one coefficient); or a name that ROS, OpenCV or RealSense has
+        for one of them.
+
+        Raises:
+            CaptureError: an unknown model, another number of coefficients, or a model without coefficients.
+            IntrinsicsError: numbers that cannot be the intrinsics of this image.
+        """
+        if lens is not None:
+            distortion = lens_row("Camera.pinhole", lens, () if distortion is None else distortion)
         intrinsics = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]], dtype=torch.float64, device="cpu")
         coefficients = (
             None if distortion is None else torch.tensor([list(distortion)], dtype=torch.float64, device="cpu")
@@ -74,6 +92,11 @@ class Camera(Structure):
     def num_views(self) -> int:
         """The number of cameras V."""
         return self.intrinsics.shape[0]
+
+    @property
+    def lenses(self) -> list[tuple[str, list[float]]]:
+        """The model of every view's lens and its coefficients; empty where there is no lens."""
+        return [] if self.distortion is None else [lens_facts(row) for row in self.distortion]
 
     def off_center(self) -> list[float]:
         """Return, per view, how far its principal point is from the middle, as a part of the image's side."""
@@ -139,7 +162,7 @@ class Camera(Structure):
 
     def __repr__(self) -> str:
         height, width = self.size
-        lens = "" if self.distortion is None else f", {self.distortion.shape[1]} distortion coefficients"
+        lens = "".join(f", {len(values)} coefficients of {model}" for model, values in self.lenses[:1])
         focal = ", ".join(f"{k[0][0]:.1f}" for k in self.intrinsics.tolist())
         return f"Camera({self.num_views} views, {width}x{height}, fx {focal}{lens})"
 

@@ -8,11 +8,13 @@ from typing import Any, get_args
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from pcdata.errors import CaptureError, ConfigError, DeviceError, DTypeError, FrameError, VolumeTooLargeError
 from pcdata.functional import tsdf
 from pcdata.functional.depth.deproject import check_rays, pixel_rays
 from pcdata.functional.tsdf.views import UNIT_WEIGHT
+from pcdata.geometry.lens_models import WIDEST_PLAIN
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import DepthFrame
 from pcdata.structures.kinds import Kind
@@ -191,7 +193,7 @@ class TSDFVolume:
             depth=depth,
             rays=directions,
             pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
-            distortion=None if lens is None else torch.nn.functional.pad(lens.double(), (0, 12 - len(lens))),
+            distortion=None if lens is None else pad(lens.double(), (0, max(0, WIDEST_PLAIN - len(lens)))),
             world_from_camera=frame.world_from_camera[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
             color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),

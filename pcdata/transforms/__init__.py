@@ -33,6 +33,7 @@ from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplica
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.shape import DescribeShape
 from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
+from pcdata.transforms.undistort import Undistort
 from pcdata.transforms.unreliable import MarkUnreliableDepth
 from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
 
@@ -93,6 +94,7 @@ __all__ = [
     "SplitObjects",
     "ToFrame",
     "Transform",
+    "Undistort",
     "VoxelDownsample",
     "VoxelSample",
     "planes_in_cloud",

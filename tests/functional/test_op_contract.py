@@ -99,6 +99,21 @@ def depth_image(count: int, seed: int) -> dict[str, Tensor]:
     return {"depth": depth.reshape(1, 12, 16), "intrinsics": intrinsics, "distortion": LENS}
 
 
+def lens_image(count: int, seed: int) -> dict[str, Tensor]:
+    images = depth_image(count, seed)
+    image = images["depth"][..., None].expand(-1, -1, -1, 2).contiguous()
+    return {
+        "image": image,
+        "intrinsics": images["intrinsics"],
+        "distortion": LENS,
+        "new_intrinsics": INTRINSICS,
+    }
+
+
+def lens_depth(count: int, seed: int) -> dict[str, Tensor]:
+    return {**depth_image(count, seed), "new_intrinsics": INTRINSICS}
+
+
 def in_front_of_a_camera(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed) + 0.5, "intrinsics": INTRINSICS, "distortion": LENS}
 
@@ -174,6 +189,8 @@ EXAMPLES = [
     Example("resize_depth", depth_alone, ("row", "row"), {"size": (7, 30), "max_jump": 0.3}),
     Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
+    Example("undistort_depth", lens_depth, ("row", "row"), {"rule": "surface", "max_jump": 0.3}),
+    Example("undistort_image", lens_image, ("row", "row"), {"size": (7, 30)}),
     Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),
     Example(
         "voxel_downsample",

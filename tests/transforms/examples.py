@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from pcdata import transforms as T
+from pcdata.geometry.lens_models import lens_row
 from pcdata.structures import NORMALIZED, DepthFrame, PointCloud
 from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
@@ -59,6 +60,12 @@ def cloud_with_repeats(counts: Sequence[int]) -> PointCloud:
 
 def _of(*transforms: T.Transform, **others: object) -> list[Example]:
     return [Example(transform, **others) for transform in transforms]  # type: ignore[arg-type]
+
+
+def _frame_with_a_lens(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> DepthFrame:
+    frame = frame_with_counts(counts, seed=seed)
+    lens = torch.tensor([lens_row("example", "fisheye", [-0.01, 0.04, -0.03, 0.006])], dtype=torch.float64)
+    return replace(frame, camera=replace(frame.camera, distortion=lens.repeat(len(counts), 1)))
 
 
 EXAMPLES: dict[str, list[Example]] = {
@@ -218,6 +225,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.ToFrame(frame="camera")),
         Example(T.ToFrame(frame="table", start="base", matrix=QUARTER_TURN)),
     ],
+    "Undistort": _of(T.Undistort(), T.Undistort(rule="surface", zoom=0.8), make=_frame_with_a_lens),
     "VoxelDownsample": [
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),
         Example(

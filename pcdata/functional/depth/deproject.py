@@ -1,4 +1,4 @@
-"""Between depth images and points: the pinhole camera with OpenCV's lens distortion.
+"""Between depth images and points: the pinhole camera with the distortion of its lens.
 
 OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel centers, so pixel (u, v) is seen along
 ``K^-1 (u, v, 1)``. Depth is the z coordinate, not the ray length. A skewed K (K[0,1] not 0) is honored throughout.
@@ -24,7 +24,8 @@ from pcdata.functional.rows import (
     ptr_from_counts,
     transform_points,
 )
-from pcdata.geometry.lens import check_distortion, distort_normalized, fold_radius, undistort_normalized
+from pcdata.geometry.lens import distort_normalized, fold_radius, undistort_normalized
+from pcdata.geometry.lens_models import check_distortion
 
 
 @op(depth="V H W", intrinsics="V 3 3 : float", distortion="V D : float")
@@ -32,7 +33,7 @@ def deproject_depth(
     depth: Tensor,  # (V, H, W) float32, metres, 0 = no reading
     intrinsics: Tensor,  # (V, 3, 3) float32 or float64, pixels
     *,
-    distortion: Tensor | None = None,  # (V, D) OpenCV coefficients, D = 4, 5, 8 or 12
+    distortion: Tensor | None = None,  # (V, D) lenses, see pcdata.geometry.lens_models
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # points (M, 3) float32 metres, ptr (V+1,), pixel_index (M,) int64
     """Turn every depth reading into a 3D point in its own camera's frame.

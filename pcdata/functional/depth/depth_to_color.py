@@ -22,7 +22,8 @@ from pcdata.functional.depth.splatting import (
     painted,
 )
 from pcdata.geometry import rigid
-from pcdata.geometry.lens import check_distortion, distort_normalized, fold_radius
+from pcdata.geometry.lens import distort_normalized, fold_radius
+from pcdata.geometry.lens_models import check_distortion
 
 _BAND = 1 << 16  # pixels handled at once on a CPU: the dozens of intermediate images stay in a core's cache
 

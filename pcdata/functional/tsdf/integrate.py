@@ -14,6 +14,8 @@ from pcdata.contracts.dispatch import op
 from pcdata.functional.tsdf.blocks import BLOCKS, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
 from pcdata.functional.tsdf.grid import GRID, VoxelGrid, pack_keys, unpack_keys, voxel_offsets
 from pcdata.functional.tsdf.views import VIEW, FusionView
+from pcdata.geometry.lens import distort_normalized
+from pcdata.geometry.lens_models import is_plain
 
 _TOGETHER = 2048  # blocks updated in one go: a million voxels
 _FURTHEST = 2.0**40  # blocks; beyond what keys reach
@@ -143,7 +145,11 @@ def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tens
     if view.distortion is not None:
         radius = u * u + v * v
         ahead &= radius < torch.tensor(view.fold, dtype=torch.float32, device="cpu")
-        x, y = bend(u, v, radius, view.distortion.float())
+        if is_plain(view.distortion):
+            x, y = bend(u, v, radius, view.distortion.float())
+        else:
+            seen = torch.stack([torch.where(ahead, one, 0.0) for one in (u, v)], dim=-1)
+            x, y = distort_normalized(seen[None], view.distortion[None])[0].float().unbind(-1)
         fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32, device="cpu").unbind()
         u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
     inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)

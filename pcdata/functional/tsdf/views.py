@@ -29,7 +29,7 @@ class FusionView:
     depth: Tensor  # (H, W) float32 metres, 0 = no reading
     rays: Tensor  # (2, H, W) float32, x/z and y/z of every pixel
     pinhole: tuple[float, float, float, float, float]  # fx, skew, cx, fy, cy
-    distortion: Tensor | None  # (12,) float64 coefficients
+    distortion: Tensor | None  # (12,) float64 coefficients; (14,) or (16,) of other lenses
     world_from_camera: Tensor  # (4, 4) float64
     weight: Tensor | None = None  # (H, W) int32 at least 1; None = 1 everywhere
     color: Tensor | None = None  # (H, W) int32: r | g << 10 | b << 20, in steps of a stored color
@@ -51,7 +51,7 @@ VIEW = Fields(
     FusionView,
     depth="H W",
     rays="2 H W",
-    distortion="12 : float64",
+    distortion="D : float64",
     world_from_camera="4 4 : float64",
     weight="H W : int32",
     color="H W : int32",

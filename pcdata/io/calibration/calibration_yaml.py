@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pcdata.errors import CalibrationError, CaptureError, PcdataError, locates_path
 from pcdata.files.opening import read_text, replacing
-from pcdata.geometry.lens import COEFFICIENT_COUNTS
+from pcdata.geometry.lens_models import LENS_MODELS
 from pcdata.io.calibration.pose_nodes import (
     POSE_KEYS,
     Entries,
@@ -37,7 +37,7 @@ VERSION = 1
 UNIT = "metre"
 
 _LARGEST_SIDE = 1 << 16  # pixels
-_MODELS = ("pinhole", "opencv")  # without and with OpenCV's polynomial distortion
+_MODELS = ("pinhole", *LENS_MODELS)  # without and with a lens
 
 
 @locates_path
@@ -110,12 +110,12 @@ def calibration_from_yaml(text: str, *, name: str = "<yaml>") -> Calibration:
 def _camera_data(camera: Camera) -> dict[str, Any]:
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics[0].tolist()
     data: dict[str, Any] = {
-        "model": "pinhole" if camera.distortion is None else "opencv",
+        "model": camera.lenses[0][0] if camera.lenses else "pinhole",
         "width": camera.size[1],
         "height": camera.size[0],
     }
     data |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return data if camera.distortion is None else data | {"distortion": camera.distortion[0].tolist()}
+    return data | {"distortion": camera.lenses[0][1]} if camera.lenses else data
 
 
 def _evidence_data(calibration: Calibration, name: str) -> dict[str, Any]:
@@ -160,15 +160,15 @@ def _read_camera(
         for value in ("fx", "fy", "cx", "cy")
         if value in entries
     }
-    distortion = None
+    distortion, lens = None, _read_model(document, what, entries)
     if "distortion" in entries:
-        distortion = numbers(document, entries["distortion"][1], f"{what}: distortion", COEFFICIENT_COUNTS)
-    _check_model(document, what, entries)
+        counts = LENS_MODELS[lens][1] if lens in LENS_MODELS else LENS_MODELS["opencv"][1]
+        distortion = numbers(document, entries["distortion"][1], f"{what}: distortion", counts)
     if len(pixels) + len(pinhole) < 6 or None in pixels.values() or None in pinhole.values():
         return None
     size = (cast(int, pixels["height"]), cast(int, pixels["width"]))
     try:
-        camera = Camera.pinhole(**cast("dict[str, float]", pinhole), size=size, distortion=distortion)
+        camera = Camera.pinhole(**cast("dict[str, float]", pinhole), size=size, distortion=distortion, lens=lens)
         check_camera(name, camera)
     except (CaptureError, CalibrationError) as error:
         document.fault(key, f"{what}: {error}")
@@ -176,15 +176,19 @@ def _read_camera(
     return camera
 
 
-def _check_model(document: YamlDocument, what: str, entries: Entries) -> None:
+def _read_model(document: YamlDocument, what: str, entries: Entries) -> str | None:
+    """Return the model of the lens, None where there is none."""
     if "model" not in entries:
-        return
+        return None
     node = entries["model"][1]
     model = document.plain(node)
     if model not in _MODELS:
-        document.fault(node, f"{what}: model must be {' or '.join(_MODELS)}, got {model!r}; fisheye is not supported")
-    elif (model == "opencv") != ("distortion" in entries):
-        document.fault(node, f"{what}: model opencv has distortion (OpenCV order), model pinhole has none")
+        document.fault(node, f"{what}: model must be one of {', '.join(_MODELS)}, got {model!r}")
+    elif (model != "pinhole") != ("distortion" in entries):
+        document.fault(node, f"{what}: model pinhole has no distortion, every other model has (see Camera.pinhole)")
+    elif model != "pinhole":
+        return str(model)
+    return None
 
 
 def _read_transform(

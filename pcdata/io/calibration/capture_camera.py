@@ -20,6 +20,7 @@ from pcdata.files.opening import map_npy, read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.geometry import rigid
+from pcdata.geometry.lens_models import LENS_MODELS, lens_row, model_named
 from pcdata.io.sources.folder_roles import check_folders, is_within
 from pcdata.io.sources.option_checks import check_invalid_values
 from pcdata.structures import Camera
@@ -38,7 +39,6 @@ _STATED = {  # key: attribute of CaptureCamera; what a capture may say of itself
 }
 _REMARKS = ("notes", "sensor", "serial", "registered_to", "date")  # free text, not interpreted
 REMARKS_OF = {"sensor_name": "sensor", "serial": "serial", "registered_to": "registered_to"}  # by key of provenance
-_DISTORTION_LENGTHS = (4, 5, 8, 12)  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]
 _HINTS = {
     "depth_scale": "depth_scale has three incompatible meanings; write metres_per_unit (0.001 for millimetres)",
     "factor_depth": "write metres_per_unit = 1 / factor_depth",
@@ -74,7 +74,8 @@ def read_capture_camera(path: str | os.PathLike[str]) -> CaptureCamera:
         {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0,
          "distortion": [0.1, -0.2, 0.0, 0.0, 0.0], "metres_per_unit": 0.001, "frame_id": "base"}
 
-    The last three are optional, as are ``skew`` in pixels, ``is_window`` of an image that was cut from a larger one,
+    The last three are optional, as are ``lens``, the model of a lens that is not OpenCV's polynomial (see
+    :meth:`~pcdata.Camera.pinhole`), ``skew`` in pixels, ``is_window`` of an image that was cut from a larger one,
     ``depth_encoding``, the order of the stored bits ("plain", "rotated" or
     "swapped"), ``background_label``, the id that means "no object", and ``invalid_values``, a list of stored depths
     besides 0 that mean "no reading"; ``calibration``, a calibration file beside this one whose camera counts instead,
@@ -134,7 +135,7 @@ def capture_camera_of(where: str, data: dict[str, Any]) -> CaptureCamera:
         cy=cy,
         skew=_number(where, "skew", data.get("skew", 0.0)),
         size=(height, width),
-        distortion=_distortion(where, data.get("distortion")),
+        distortion=_distortion(where, data.get("distortion"), data.get("lens")),
         is_window=is_window,
     )
     return CaptureCamera(
@@ -168,7 +169,8 @@ def write_capture_camera(path: str | os.PathLike[str], calibration: CaptureCamer
     data |= {"skew": k[0][1]} if k[0][1] else {}
     data |= {"is_window": True} if camera.is_window else {}
     if camera.distortion is not None:
-        data["distortion"] = camera.distortion[0].tolist()
+        model, data["distortion"] = camera.lenses[0]
+        data |= {} if model == "opencv" else {"lens": model}
     data |= {key: value for key, name in _STATED.items() if (value := getattr(calibration, name)) is not None}
     data |= {key: calibration.remarks[key] for key in _REMARKS if key in calibration.remarks}
     with replacing(where, path) as temporary:
@@ -253,7 +255,7 @@ def _camera(where: str, *, skew: float = 0.0, is_window: bool = False, **values:
 
 
 def _check_keys(where: str, data: dict[str, Any]) -> None:
-    known = (*_REQUIRED, "skew", "is_window", "distortion", *_STATED, *_REMARKS)
+    known = (*_REQUIRED, "skew", "is_window", "distortion", "lens", *_STATED, *_REMARKS)
     faults = [f"{key!r} is missing" for key in _REQUIRED if key not in data]
     for key in data:
         if key not in known:
@@ -290,15 +292,20 @@ def _whole(where: str, data: dict[str, Any], key: str) -> int:
     return int(number)
 
 
-def _distortion(where: str, value: Any) -> list[float] | None:
-    if value is None or value == []:
+def _distortion(where: str, value: Any, lens: Any) -> list[float] | None:
+    if lens is not None and (not isinstance(lens, str) or model_named(lens) is None):
+        raise CaptureError(f"{where}: 'lens' must be one of {', '.join(LENS_MODELS)}, got {lens!r:.80}")
+    model = "opencv" if lens is None else str(model_named(lens))
+    if (value is None or value == []) and lens is None:
         return None
-    if not isinstance(value, list) or len(value) not in _DISTORTION_LENGTHS:
+    counts = LENS_MODELS[model][1]
+    if not isinstance(value, list) or len(value) not in counts:
+        order = "OpenCV order k1 k2 p1 p2 k3 ..." if model == "opencv" else f"of the lens {model}"
         raise CaptureError(
-            f"{where}: 'distortion' must be a list of {', '.join(map(str, _DISTORTION_LENGTHS))} numbers "
-            f"(OpenCV order k1 k2 p1 p2 k3 ...), got {value!r:.200}"
+            f"{where}: 'distortion' must be a list of {', '.join(map(str, counts))} numbers ({order}), got "
+            f"{value!r:.200}"
         )
-    return [_number(where, "distortion", entry) for entry in value]
+    return lens_row(where, model, [_number(where, "distortion", entry) for entry in value])
 
 
 def _numbers(where: str, text: str) -> list[float]:

@@ -24,11 +24,11 @@ from pcdata.functional.depth.unit_fit import DepthEncoding
 from pcdata.geometry import rigid
 from pcdata.io.arrays.plain_pickles import read_plain_pickle
 from pcdata.io.calibration.capture_camera import capture_camera_of
+from pcdata.io.calibration.stated_lens import lens_of
 from pcdata.structures import Camera
 
 Size = tuple[int, int]  # (height, width)
 _MAX_PICKLE = 1 << 27
-_LENSES = ("Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady", "None")
 _YAML_LINE = re.compile(r"^(\w+):[ \t]*([^#\n]*?)[ \t]*(?:#[^\n]*)?$", re.MULTILINE)  # flat: one number a line
 _REALSENSE = re.compile(
     r'Intrinsic of "Depth" /[^\n]*\n\s*Width:\s*(\d+)\s*\n\s*Height:\s*(\d+)\s*\n\s*PPX:\s*(\S+)\s*\n\s*PPY:\s*(\S+)'
@@ -83,7 +83,7 @@ def read_foreign_camera(
 def pinhole(
     size: Size,
     numbers: tuple[float, float, float, float],  # fx, fy, cx, cy
-    distortion: tuple[float, ...] | None = None,
+    distortion: Sequence[float] | None = None,
     of_size: Size | None = None,
 ) -> Camera:
     """Return the camera of an image of this size, which must be the one that its numbers belong to, where known."""
@@ -199,8 +199,7 @@ def _text_intrinsics(where: str, text: str) -> ForeignCamera:
         return ForeignCamera(pinhole_of_matrix(where, rows))
     streams: dict[Size, tuple[float, ...]] = {}
     for width, height, cx, cy, fx, fy, lens, coefficients in _REALSENSE.findall(text):
-        if lens not in _LENSES or (any(bent := numbers_of(coefficients)) and lens != "Brown Conrady"):
-            raise IntrinsicsError(f"{where}: the lens {lens!r} with {coefficients.split()} is not OpenCV's")
+        bent = lens_of(f"{where}: the depth stream", lens, numbers_of(coefficients)) or ()
         streams[int(height), int(width)] = (*map(float, (fx, fy, cx, cy)), *bent)
     if not streams:
         raise CaptureError(f'{where}: names no intrinsics of the stream "Depth"')

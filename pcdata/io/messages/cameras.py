@@ -6,41 +6,15 @@ Source: sensor_msgs/CameraInfo: matrices are of the whole sensor; a region of in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from pcdata.errors import IntrinsicsError, PcdataError
-from pcdata.geometry.lens import COEFFICIENT_COUNTS
+from pcdata.io.calibration.stated_lens import lens_of
 from pcdata.structures import Camera
 
 SAY_INTRINSICS = "say intrinsics=(fx, fy, cx, cy) in pixels (--intrinsics FX FY CX CY)"
-# By model: how many coefficients it has, in OpenCV's order.
-_POLYNOMIALS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "Brown Conrady": (4, 5)}
-
-
-def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float] | None:
-    """Return the coefficients of a lens in OpenCV's order; None where nothing is bent.
-
-    Raises:
-        IntrinsicsError: the model is another one than OpenCV's polynomial.
-    """
-    numbers = [float(value) for value in coefficients]
-    if not all(map(math.isfinite, numbers)):
-        raise IntrinsicsError(f"{where} has a lens with coefficients that are not finite: {numbers}")
-    if model in ("equidistant", "kannala_brandt", "fisheye"):
-        raise IntrinsicsError(
-            f"{where} has the fisheye lens {model!r}, which no pinhole camera has; undistort the recording first"
-        )
-    if not any(numbers):
-        return None
-    if model not in _POLYNOMIALS or len(numbers) not in (*_POLYNOMIALS[model], *COEFFICIENT_COUNTS):
-        raise IntrinsicsError(
-            f"{where} has the lens model {model!r:.60} with {len(numbers)} coefficients {numbers}, which is not "
-            "OpenCV's; undistort the recording first"
-        )
-    return numbers
 
 
 def camera_of(
@@ -63,7 +37,7 @@ def camera_of(
         how: what helps where it is not calibrated.
 
     Raises:
-        IntrinsicsError: it is not calibrated, of another size, or has a lens that is not OpenCV's.
+        IntrinsicsError: it is not calibrated, of another size, or has a lens of no known model.
     """
     matrix = [float(value) for value in (info.p if hasattr(info, "p") else info.P)] if rectified else _k(info)
     k = [matrix[0], matrix[1], matrix[2], *matrix[3 + rectified : 6 + rectified]]  # a projection has four columns

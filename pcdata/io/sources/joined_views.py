@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pcdata.errors import ShapeError
 from pcdata.files.sample_names import name_some
+from pcdata.geometry.lens_models import same_width
 from pcdata.structures import Camera, DepthFrame
 from pcdata.structures.signal_joining import agreed_signals
 
@@ -58,17 +59,9 @@ def _join(images: Sequence[Tensor | None]) -> Tensor | None:
 
 
 def _join_cameras(cameras: Sequence[Camera]) -> Camera:
-    lenses = [camera.distortion for camera in cameras]
-    widest = max(0 if lens is None else lens.shape[1] for lens in lenses)
-    padded = [
-        torch.zeros(camera.num_views, widest, dtype=torch.float64, device="cpu")
-        if lens is None
-        else torch.nn.functional.pad(lens, (0, widest - lens.shape[1]))
-        for camera, lens in zip(cameras, lenses)
-    ]
     return Camera(
         intrinsics=torch.cat([camera.intrinsics for camera in cameras]),
         size=cameras[0].size,
-        distortion=torch.cat(padded) if widest else None,
+        distortion=same_width([camera.distortion for camera in cameras], [camera.num_views for camera in cameras]),
         is_window=any(camera.is_window for camera in cameras),
     )

@@ -76,6 +76,7 @@ class DepthStream:
         color: the feature of the color image of the same pixels.
         intrinsics: the column.
         distortion: the column.
+        lens: the model of what distortion holds; None = OpenCV's polynomial.
         is_window: whether the camera is cut from a larger image.
         extrinsics: the column.
         direction: where the extrinsics lead; None = nobody says it.
@@ -94,6 +95,7 @@ class DepthStream:
     color: str | None = None
     intrinsics: str | None = None
     distortion: str | None = None
+    lens: str | None = None
     is_window: bool = False
     extrinsics: str | None = None
     direction: Direction | None = None

@@ -13,6 +13,7 @@ from typing import Any, get_args
 import torch
 
 from pcdata.errors import CaptureError, PcdataError
+from pcdata.geometry.lens_models import model_named
 from pcdata.io.sources.lerobot_cameras import DepthStream, Feature, Storage
 from pcdata.structures.signal_kinds import parse_kind
 
@@ -43,6 +44,7 @@ class CameraFacts:
     distortion: str | None = None
     world_from_camera: str | None = None
     is_window: bool = False
+    lens: str | None = None  # the model of what distortion holds; None = OpenCV's polynomial
     images: Mapping[str, str] = field(default_factory=dict)  # see DepthStream
 
     def stream(self) -> DepthStream:
@@ -57,6 +59,7 @@ class CameraFacts:
             intrinsics=self.intrinsics,
             distortion=self.distortion,
             is_window=self.is_window,
+            lens=self.lens,
             images=self.images,
             extrinsics=self.world_from_camera,
             direction=None if self.world_from_camera is None else "camera_to_frame",
@@ -143,6 +146,8 @@ def _check(facts: DatasetFacts, features: Mapping[str, Feature]) -> None:
             raise CaptureError(f"camera {camera.name!r:.100}: metres_per_unit must be metres, got {unit!r:.60}")
         if not isinstance(camera.is_window, bool):
             raise CaptureError(f"camera {camera.name!r:.100}: is_window must be true or false")
+        if camera.lens is not None and (not _texts(camera.lens) or model_named(camera.lens) is None):
+            raise CaptureError(f"camera {camera.name!r:.100}: lens must be a known model, got {camera.lens!r:.60}")
         if not set(camera.images) <= set(IMAGES) or not _texts(*camera.images.values()):
             raise CaptureError(f"camera {camera.name!r:.100}: images must be keys of {', '.join(IMAGES)}")
         if camera.storage in ("image", "array"):

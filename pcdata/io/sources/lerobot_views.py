@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError
 from pcdata.geometry import rigid
+from pcdata.geometry.lens_models import lens_row
 from pcdata.io.calibration.foreign_cameras import Size, matrix_of, pinhole, pinhole_of_matrix
 from pcdata.io.sources.lerobot_cameras import DepthStream, Feature
 from pcdata.structures import Camera
@@ -28,6 +29,7 @@ class Lens:
     column: str | None = None
     order: tuple[int, ...] = (0, 1, 2, 3)  # of fx, fy, cx, cy in a column of four
     distortion: str | None = None
+    model: str | None = None  # of the lens; None = OpenCV's polynomial
     is_window: bool = False
 
     @property
@@ -68,7 +70,12 @@ class Lens:
         camera = pinhole_of_matrix(f"column {self.column}", rows)
         if self.distortion is None and not self.is_window:
             return camera(size), _turn(fx < 0)
-        lens = None if self.distortion is None else torch.from_numpy(np.array(row[self.distortion], np.float64))[None]
+        lens = None
+        if self.distortion is not None:
+            coefficients = np.asarray(row[self.distortion], dtype=np.float64).ravel().tolist()
+            lens = torch.tensor(
+                [lens_row(where, self.model or "opencv", coefficients)], dtype=torch.float64, device="cpu"
+            )
         matrix = torch.tensor([rows], dtype=torch.float64, device="cpu")
         return Camera(intrinsics=matrix, size=size, distortion=lens, is_window=self.is_window), _turn(fx < 0)
 
@@ -122,7 +129,13 @@ def lens_of_column(stream: DepthStream, said: Feature) -> Lens:
     names = said.get("names")
     listed = [str(name) for name in names] if isinstance(names, list) else []
     order = tuple(listed.index(name) for name in _ORDER) if sorted(listed) == sorted(_ORDER) else (0, 1, 2, 3)
-    return Lens(column=stream.intrinsics, order=order, distortion=stream.distortion, is_window=stream.is_window)
+    return Lens(
+        column=stream.intrinsics,
+        order=order,
+        distortion=stream.distortion,
+        model=stream.lens,
+        is_window=stream.is_window,
+    )
 
 
 def _turn(is_turned: bool) -> Tensor:

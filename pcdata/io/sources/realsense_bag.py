@@ -23,8 +23,8 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError, add_note
 from pcdata.extras import require
 from pcdata.geometry import rigid
+from pcdata.io.calibration.stated_lens import lens_of
 from pcdata.io.messages.bag_file import BagFile, bag_topics
-from pcdata.io.messages.cameras import lens_of
 from pcdata.io.messages.decoding import decoded
 from pcdata.io.messages.images import color_pixels, depth_numbers
 from pcdata.io.messages.message_log import MessageLog

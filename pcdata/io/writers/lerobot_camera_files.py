@@ -88,10 +88,11 @@ class CameraWriter:
         self._images = {role: VideoWriter(folder, key, fps, is_depth=True) for role, key in images.items()}
         base = f"camera.{name}"
         self.features[f"{base}.intrinsics"] = number_feature("float64", [3, 3])
-        lens, pose = None, None
+        lens, model, pose = None, None, None
         if first.camera.distortion is not None:
             lens = f"{base}.distortion"
-            self.features[lens] = number_feature("float64", [first.camera.distortion.shape[1]])
+            model, coefficients = first.camera.lenses[self._view]
+            self.features[lens] = number_feature("float64", [len(coefficients)])
         if first.world_from_camera is not None:
             pose = f"{base}.{str(first.frame_id).replace('/', '_')}_from_camera"
             self.features[pose] = number_feature("float64", [4, 4])
@@ -107,6 +108,7 @@ class CameraWriter:
             distortion=lens,
             world_from_camera=pose,
             is_window=first.camera.is_window,
+            lens=None if model == "opencv" else model,
             images=images,
         )
 
@@ -173,7 +175,7 @@ class CameraWriter:
             video.add(values.astype(np.uint16))
         row[facts.intrinsics] = frame.camera.intrinsics[view].numpy()
         if facts.distortion is not None and frame.camera.distortion is not None:
-            row[facts.distortion] = frame.camera.distortion[view].numpy()
+            row[facts.distortion] = np.array(frame.camera.lenses[view][1], dtype=np.float64)
         if facts.world_from_camera is not None and frame.world_from_camera is not None:
             row[facts.world_from_camera] = frame.world_from_camera[view].numpy()
         return off, beyond

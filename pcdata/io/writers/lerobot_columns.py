@@ -82,8 +82,7 @@ def check_alike(sample_id: str, frame: DepthFrame, first_id: str, first: DepthFr
             f"{sample_id}: its poses lead to {frame.frame_id!r}, those of {first_id} to {first.frame_id!r}"
         )
     models = [
-        (None if one.distortion is None else one.distortion.shape, one.is_window)
-        for one in (frame.camera, first.camera)
+        ([(model, len(values)) for model, values in one.lenses], one.is_window) for one in (frame.camera, first.camera)
     ]
     if models[0] != models[1]:
         raise CaptureError(f"{sample_id}: has another lens model than {first_id}; write these apart (--only, --skip)")

@@ -69,11 +69,13 @@ class RosMessages:
     def camera_info(self, header: Any, camera: Camera) -> Any:
         """Return the intrinsics and the lens of one camera.
 
-        A lens of 8 and more coefficients is OpenCV's rational one; of 4 the missing one, k3, is 0.
+        A polynomial of 8 and more coefficients is called the rational one; of 4 the missing one, k3, is 0. A lens of
+        another model has ROS's name for it, ``equidistant``, or RealSense's.
         """
         k = camera.intrinsics[0].numpy()
-        lens = [] if camera.distortion is None else camera.distortion[0].tolist()
-        lens += [0.0] * (len(lens) == 4)
+        model, lens = camera.lenses[0] if camera.lenses else ("opencv", [])
+        lens += [0.0] * (len(lens) == 4 and model == "opencv")
+        names = {"opencv": "plumb_bob" if len(lens) <= 5 else "rational_polynomial", "fisheye": "equidistant"}
         height, width = camera.size
         whole = self._made(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -83,7 +85,7 @@ class RosMessages:
             header=header,
             height=height,
             width=width,
-            distortion_model="plumb_bob" if len(lens) <= 5 else "rational_polynomial",
+            distortion_model=names.get(model, model),
             d=np.array(lens, dtype=np.float64),
             k=k.reshape(-1),
             r=np.eye(3).reshape(-1),

@@ -8,6 +8,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_cameras, half_pixels
 from pcdata.geometry.lens import fold_radius
+from pcdata.geometry.lens_models import is_plain
 from pcdata.kernels.cpu.images import rays_of_cameras
 from pcdata.kernels.cpu.native import call, room, room_for
 
@@ -27,11 +28,11 @@ def register_depth(
     color_distortion: Tensor | None,
     max_jump: float,
 ) -> RegisteredDepth:
-    """Project and paint a few rows at a time; what floats cannot hold is left to the reference."""
+    """Project and paint a few rows at a time; what floats and the core's lens cannot hold is left to the reference."""
     check_cameras(depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth)
     views, height, width = depth.shape
     color_shape = (views, *color_size)
-    if 0 < height * width <= _MOST_PIXELS and views > 0:
+    if is_plain(color_distortion) and 0 < height * width <= _MOST_PIXELS and views > 0:
         rays = rays_of_cameras(intrinsics, (height, width), distortion)
         results = room_for(
             (color_shape, torch.float32),

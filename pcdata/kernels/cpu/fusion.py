@@ -13,6 +13,7 @@ from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView
+from pcdata.geometry.lens_models import is_plain
 from pcdata.kernels.cpu.native import address, call, numbers, room, room_for
 
 _FEWEST_SLOTS = 1 << 12  # of a table of rows
@@ -60,7 +61,7 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
 @kernel("integrate_view", "cpu")
 def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: VoxelGrid, *, carve: bool) -> None:
     """Update every block on its own, 4, 8 or 16 voxels at a time."""
-    if view.depth.numel() > _MOST_PIXELS:
+    if view.depth.numel() > _MOST_PIXELS or not is_plain(view.distortion):
         OPERATIONS["integrate_view"].reference(blocks, rows, view, grid, carve=carve)
         return
     lens = None

@@ -117,14 +117,22 @@ def test_color_too_late_for_every_depth_is_refused_with_the_gap(tmp_path):
         open_source(path, registered=True, max_time_apart=0.0)
 
 
-def test_a_lens_model_that_is_not_opencv_s_is_refused(tmp_path):
+def test_the_lens_models_of_the_sdk_are_read(tmp_path):
     topic = f"{DEPTH}/info/camera_info"
     lens = (0.1, -0.2, 0.001, 0.002, 0.0)
     forward = written(tmp_path / "forward.bag", with_other(topic, camera_info(30.0, lens)))
     assert open_source(forward).load("000000").camera.distortion.tolist() == [list(lens)]
-    inverse = with_other(topic, camera_info(30.0, lens, "Inverse Brown Conrady"))
-    with pytest.raises(IntrinsicsError, match=r"Inverse Brown Conrady.*undistort"):
-        open_source(written(tmp_path / "inverse.bag", inverse))
+    fisheye = (0.1, -0.02, 0.001, 0.002, 0.0)  # the SDK writes five numbers of every model
+    for said, numbers, model, count in (
+        ("Inverse Brown Conrady", lens, "inverse_brown_conrady", 5),
+        ("Kannala Brandt4", fisheye, "fisheye", 4),
+        ("Ftheta", (0.9, 0.0, 0.0, 0.0, 0.0), "f_theta", 1),
+    ):
+        path = written(tmp_path / f"{model}.bag", with_other(topic, camera_info(30.0, numbers, said)))
+        assert open_source(path).load("000000").camera.lenses == [(model, list(numbers[:count]))]
+    unknown = with_other(topic, camera_info(30.0, lens, "Panini"))
+    with pytest.raises(IntrinsicsError, match=r"Panini.*undistort"):
+        open_source(written(tmp_path / "unknown.bag", unknown))
 
 
 def test_images_that_cannot_be_right_are_refused(tmp_path):

@@ -236,11 +236,13 @@ def with_info(**changes: Any) -> list[Entry]:
     return without("/cam/depth/camera_info", COLOR) + infos
 
 
-def test_lenses_are_opencv_s_or_refused(tmp_path: Path) -> None:
+def test_lenses_are_read_by_their_model_or_refused(tmp_path: Path) -> None:
     for model, lens in (("plumb_bob", [0.1, -0.2, 0.001, 0.002, 0.03]), ("rational_polynomial", [0.1] * 8)):
         camera = open_source(mcap(tmp_path, with_info(model=model, d=lens), model)).load("000000").camera
         assert camera.distortion.tolist() == [lens]
-    for number, (model, lens) in enumerate((("equidistant", [0.0] * 4), ("", [0.1] * 5), ("plumb_bob", [0.1] * 14))):
+    fisheye = open_source(mcap(tmp_path, with_info(model="equidistant", d=[0.01, 0.0, 0.0, 0.0]), "equidistant"))
+    assert fisheye.load("000000").camera.lenses == [("fisheye", [0.01, 0.0, 0.0, 0.0])]
+    for number, (model, lens) in enumerate((("panini", [0.1] * 4), ("", [0.1] * 5), ("plumb_bob", [0.1] * 13))):
         with pytest.raises(IntrinsicsError, match="undistort the recording"):
             open_source(mcap(tmp_path, with_info(model=model, d=lens), f"refused_{number}"))
 

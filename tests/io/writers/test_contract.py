@@ -13,6 +13,7 @@ import torch
 
 from pcdata import open_source
 from pcdata.errors import CacheError, CaptureError, ConfigError, NoReadingError, PcdataError
+from pcdata.geometry.lens_models import lens_row
 from pcdata.io import WRITERS, SubsetSource, Writer, convert, register_writer
 from pcdata.io.sources.capture_source import episodes_of, signals_of
 from pcdata.io.writers.writer import KEPT
@@ -54,6 +55,20 @@ def test_what_a_writer_keeps_is_read_back_as_it_was(kind: str, views: int, tmp_p
         if "pose" in keeps:
             assert read.frame_id == "base"
             assert torch.allclose(read.world_from_camera, frame.world_from_camera, rtol=0, atol=1e-12)
+
+
+def test_the_lenses_of_a_rig_come_back_by_their_models(kind: str, tmp_path: Path) -> None:
+    rows = [
+        lens_row("test", model, values)
+        for model, values in (
+            ("fisheye", [-0.005, 0.04, -0.03, 0.006]),
+            ("inverse_brown_conrady", [-0.056, 0.068, 0.0004, 0.0007, -0.02]),
+            ("f_theta", [0.3]),
+        )
+    ]
+    camera = replace(made_frame(views=3).camera, distortion=torch.tensor(rows, dtype=torch.float64))
+    source = written(cut_to_episodes(made_captures(4, views=3, camera=camera)), kind, tmp_path / "out")
+    assert source.load(source.ids[0]).camera.lenses == camera.lenses
 
 
 def test_signals_come_back_with_their_kinds_frames_and_types(kind: str, tmp_path: Path) -> None:
