@@ -7,7 +7,7 @@ from pcdata.functional import deproject_depth, project_points
 
 SIZE = (120, 160)
 lens = {"lens": "fisheye", "distortion": [-0.005, 0.040, -0.037, 0.006]}
-camera = pcdata.Camera.pinhole(fx=70.0, fy=70.0, cx=79.5, cy=59.5, size=SIZE, **lens)
+camera = pcdata.Camera.pinhole(fx=90.0, fy=90.0, cx=79.5, cy=59.5, size=SIZE, **lens)
 print(camera)
 
 # A wall one metre away, seen by a wide lens: its points lie on a plane.
