@@ -24,6 +24,7 @@ _HOMES = {
         "SurfaceMesh",
         "TSDFVolume",
         "register_to_color",
+        "render",
     ],
     "pcdata.sensors": ["SensorProfile", "sensor_profile"],
     "pcdata.transforms": [

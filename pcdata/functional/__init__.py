@@ -23,6 +23,15 @@ from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.rendering import (
+    RenderedPoints,
+    RenderedTriangles,
+    deproject_ranges,
+    depth_normals,
+    render_points,
+    render_ranges,
+    render_triangles,
+)
 from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
 from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, polygon_mask
 from pcdata.functional.voxels import (
@@ -42,6 +51,8 @@ __all__ = [
     "DepthAverage",
     "ImageGrid",
     "RegisteredDepth",
+    "RenderedPoints",
+    "RenderedTriangles",
     "TemporalState",
     "average_depth",
     "ball_query",
@@ -51,6 +62,8 @@ __all__ = [
     "dbscan",
     "decimate_depth",
     "deproject_depth",
+    "deproject_ranges",
+    "depth_normals",
     "depth_to_disparity",
     "disparity_to_depth",
     "distort_normalized",
@@ -74,6 +87,9 @@ __all__ = [
     "range_to_depth",
     "ransac_plane",
     "register_depth",
+    "render_points",
+    "render_ranges",
+    "render_triangles",
     "resize_depth",
     "shape_features",
     "spatial_filter",

@@ -11,6 +11,7 @@ from pcdata.structures.image_layout import ImageLayout
 from pcdata.structures.kinds import CAMERA_FRAME, METRE, NORMALIZED, Kind
 from pcdata.structures.padded import PaddedClouds
 from pcdata.structures.point_cloud import PointCloud
+from pcdata.structures.rendering import Rendered, render
 from pcdata.structures.signals import Signal
 from pcdata.structures.surface_mesh import SurfaceMesh
 from pcdata.structures.tsdf_volume import TSDFVolume
@@ -29,10 +30,12 @@ __all__ = [
     "Kind",
     "PaddedClouds",
     "PointCloud",
+    "Rendered",
     "Signal",
     "SurfaceMesh",
     "TSDFVolume",
     "confidence_of",
     "register_to_color",
+    "render",
     "with_filled_depth",
 ]

@@ -118,8 +118,17 @@ def in_front_of_a_camera(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed) + 0.5, "intrinsics": INTRINSICS, "distortion": LENS}
 
 
+def triangles_in_front_of_a_camera(count: int, seed: int) -> dict[str, Tensor]:
+    corners = points(3 * count, seed).reshape(count, 3, 3) + 0.5
+    return {"triangles": corners, "intrinsics": INTRINSICS, "distortion": LENS}
+
+
 def depth_alone(count: int, seed: int) -> dict[str, Tensor]:
     return {"depth": depth_image(count, seed)["depth"]}
+
+
+def ranges_alone(count: int, seed: int) -> dict[str, Tensor]:
+    return {"ranges": depth_image(count, seed)["depth"]}
 
 
 def disparity_alone(count: int, seed: int) -> dict[str, Tensor]:
@@ -161,6 +170,8 @@ EXAMPLES = [
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),
+    Example("deproject_ranges", ranges_alone, ("row", "ptr", "row")),
+    Example("depth_normals", depth_image, ("row", "row"), {"reach": 2, "max_jump": 0.3}),
     Example("duplicate_mask", one_cloud, ("row",)),
     # Neighborhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
@@ -186,6 +197,9 @@ EXAMPLES = [
     Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
     Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
     Example("register_depth", beside_a_color_camera, ("row",) * 4, {"color_size": (18, 24)}),
+    Example("render_points", in_front_of_a_camera, ("row", "index"), {"size": (12, 16), "point_size": 0.05}),
+    Example("render_ranges", one_cloud, ("row", "index"), {"size": (12, 16)}),
+    Example("render_triangles", triangles_in_front_of_a_camera, ("row", "index", "row"), {"size": (12, 16)}),
     Example("resize_depth", depth_alone, ("row", "row"), {"size": (7, 30), "max_jump": 0.3}),
     Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
@@ -254,7 +268,7 @@ def packed_results(
             outputs.append(ptr_from_counts(torch.cat([value.diff() for value in values])))
             continue
         if kind == "index":
-            sizes = [len(cloud["points"]) for cloud in clouds]
+            sizes = [len(next(iter(cloud.values()))) for cloud in clouds]
             starts = ptr_from_counts(sizes).tolist()
             values = [
                 torch.where(value == size, starts[-1], value + start)
