@@ -14,6 +14,7 @@ from pcdata.io.messages.camera_descriptions import described, how_intrinsics
 from pcdata.io.messages.clock import Clock
 from pcdata.io.messages.image_topics import (
     ImageTopic,
+    faults,
     named_image,
     pixels,
     preferred,
@@ -155,9 +156,10 @@ def _depths(
             f"{where}: holds {len(fitting)} topics of depth; say which by {how}:"
             + "".join(f"\n  {told(one.topic)}" for one in fitting)
         )
+    unreadable = "".join(f"\n  {name} cannot be read: {fault}" for name, fault in faults(log).items())
     raise CaptureError(
         f"{where}: no topic holds depth images (16UC1, 32FC1, compressedDepth) that say so; name one by {how}. "
-        f"Topics:{topics_in_words(log)}"
+        f"Topics:{topics_in_words(log)}{unreadable}"
     )
 
 

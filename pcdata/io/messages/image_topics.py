@@ -15,6 +15,7 @@ from pcdata.io.messages.transforms import plain_frame
 _IMAGES = (
     "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"
 )  # fmt: skip
+_MOST_TRIED = 3  # messages of a topic whose first ones may be damaged
 _TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
 
 
@@ -34,18 +35,35 @@ class ImageTopic:
 
 
 def image_topics(log: MessageLog) -> dict[str, ImageTopic]:
-    """Return the topics of images by name, each with what its first message shows; damaged ones are left out."""
-    found = {}
+    """Return the topics of images by name, each with what its first message shows that can be read.
+
+    Those of which none of the first few can be read are left out; :func:`faults` says why.
+    """
+    looked = {topic.name: _looked_at(log, topic) for topic in _of_images(log)}
+    return {name: image for name, image in looked.items() if isinstance(image, ImageTopic)}
+
+
+def faults(log: MessageLog, names: Sequence[str] | None = None) -> dict[str, str]:
+    """Return why images cannot be read, by topic: an unknown packing, or damage."""
+    looked = {topic.name: _looked_at(log, topic) for topic in _of_images(log) if names is None or topic.name in names}
+    return {name: image for name, image in looked.items() if isinstance(image, str)}
+
+
+def _of_images(log: MessageLog) -> list[Topic]:
+    return [one for one in log.topics.values() if plain_type(one.type) in _IMAGES and len(one) and is_known(one)]
+
+
+def _looked_at(log: MessageLog, topic: Topic) -> ImageTopic | str:
+    """Return what the first message shows that can be read; of none, what is wrong with the first."""
+    fault = ""
     with log.opened() as read:
-        for topic in log.topics.values():
-            if plain_type(topic.type) in _IMAGES and len(topic) and is_known(topic):
-                try:
-                    message = decoded(topic, read(topic, 0))
-                    form = form_of(message, topic.name)
-                except CaptureError:
-                    continue
-                found[topic.name] = ImageTopic(topic, form, plain_frame(message.header.frame_id))
-    return found
+        for number in range(min(len(topic), _MOST_TRIED)):
+            try:
+                message = decoded(topic, read(topic, number))
+                return ImageTopic(topic, form_of(message, topic.name), plain_frame(message.header.frame_id))
+            except CaptureError as error:
+                fault = fault or str(error)
+    return fault
 
 
 def topics_in_words(log: MessageLog, kinds: Sequence[str] | None = None) -> str:
@@ -79,7 +97,8 @@ def named_image(where: str, log: MessageLog, images: Mapping[str, ImageTopic], n
         return images[name]
     if name in log.topics:
         topic = log.topics[name]
-        why = "has no messages" if not len(topic) else "is none of images, or its first message is damaged"
+        fault = faults(log, [name]).get(name)
+        why = "has no messages" if not len(topic) else f"cannot be read: {fault}" if fault else "is none of images"
         raise CaptureError(f"{where}: topic {told(topic)} {why}")
     raise ConfigError(
         f"{where}: there is no topic {name!r:.200}{near_matches(name, log.topics)}; topics of images:"

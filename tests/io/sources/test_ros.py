@@ -222,6 +222,19 @@ def test_images_that_cannot_be_right_are_refused_where_they_are(tmp_path: Path) 
         assert len(refused) == 1, word
 
 
+def test_images_of_an_unknown_packing_are_named_with_it_and_a_damaged_first_image_hides_no_others(
+    tmp_path: Path,
+) -> None:
+    odd = [ROS2.packed(EPOCH + n * STEP, packed_depth(depth_of(n)), "16UC1; compressedDepth zip") for n in range(4)]
+    path = mcap(tmp_path, with_depth(lambda number, stamp: odd[number]), "odd")
+    for options in ({}, {"depth": DEPTH}):
+        with pytest.raises(CaptureError, match=r"cannot be read: depth is packed as 'zip'; known are png and rvl"):
+            open_source(path, **options)
+    first = [one for one in with_depth(DEPTHS["packed"]) if not (one[0] == DEPTH and one[1] == EPOCH)]
+    source = open_source(mcap(tmp_path, [*first, (DEPTH, EPOCH, odd[0])], "first"))
+    assert list(refused_captures(source)) == ["000000"]
+
+
 def _refusal(source: Any, sample_id: str, word: str) -> bool:
     return word in refused_captures(source.subset([sample_id])).get(sample_id, "")
 
