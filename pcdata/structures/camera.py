@@ -143,6 +143,33 @@ class Camera(Structure):
         intrinsics[:, 1, 2] -= top
         return replace(self, intrinsics=intrinsics, size=size, is_window=True)
 
+    def turned(self) -> Camera:
+        """Return the camera of the image turned by 90 degrees counterclockwise, as ``numpy.rot90`` turns it.
+
+        Its x axis is the y axis of this one, its y axis the opposite of this one's x axis.
+
+        Raises:
+            IntrinsicsError: axes that are skewed have no upper triangular intrinsics afterwards.
+        """
+        if bool((self.intrinsics[:, 0, 1] != 0).any()):
+            raise IntrinsicsError("Camera.turned: skewed axes cannot be turned; undistort and resample the image first")
+        intrinsics = self.intrinsics.clone()
+        intrinsics[:, 0, 0], intrinsics[:, 1, 1] = self.intrinsics[:, 1, 1], self.intrinsics[:, 0, 0]
+        intrinsics[:, 0, 2] = self.intrinsics[:, 1, 2]
+        intrinsics[:, 1, 2] = self.size[1] - 1 - self.intrinsics[:, 0, 2]
+        distortion = self.distortion
+        if distortion is not None:
+            if bool((distortion[:, 12:] != 0).any()):
+                raise IntrinsicsError("Camera.turned: a tilted sensor cannot be turned; undistort the image first")
+            distortion = distortion.clone()
+            # Radial terms stay; decentering (p1, p2) and thin prism terms (s1..s4) turn with the axes.
+            distortion[:, 2], distortion[:, 3] = -self.distortion[:, 3], self.distortion[:, 2]  # type: ignore[index]
+            if distortion.shape[1] >= 12:
+                given = self.distortion[:, 8:12]  # type: ignore[index]
+                distortion[:, 8:12] = torch.cat([given[:, 2:], -given[:, :2]], dim=1)
+        size = (self.size[1], self.size[0])
+        return replace(self, intrinsics=intrinsics, size=size, distortion=distortion)
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; :meth:`from_dict` reads them back exactly."""
         distortion = None if self.distortion is None else self.distortion.tolist()

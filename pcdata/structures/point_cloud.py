@@ -228,6 +228,10 @@ class PointCloud(CloudBatch):
         """Replace all per-point fields at once, and any other attributes, by ones that are known to fit."""
         return derived(self, **attributes(rows), **others)
 
+    def with_rows(self, fields: Mapping[str, Tensor], ptr: Tensor) -> PointCloud:
+        """Replace the rows of all fields at once: the same fields of other rows, cut by ``ptr`` into as many clouds."""
+        return self._with_rows(fields, ptr=ptr, layout=None)
+
     def averaged(
         self, group: Tensor, ptr: Tensor, *, points: Tensor, reduce: Mapping[str, str | Tensor] | None = None
     ) -> PointCloud:

@@ -9,7 +9,7 @@ from pcdata.transforms.crop import CropPolygon, CropWorkspace
 from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
 from pcdata.transforms.depth_inpainting import InpaintDepth
-from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, ResizeDepth
+from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, RandomTurnDepth, ResizeDepth, TurnDepth
 from pcdata.transforms.downsample import (
     FarthestPointSample,
     RandomFarthestPointSample,
@@ -21,14 +21,16 @@ from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTr
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.keep_confidence import KeepConfidence
+from pcdata.transforms.mixing import mix_scenes
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace, ShiftToOrigin
 from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
 from pcdata.transforms.planes import RemovePlane, planes_in_cloud
 from pcdata.transforms.random_apply import RandomApply
 from pcdata.transforms.random_column import RandomColumn
-from pcdata.transforms.random_jitter import RandomColorJitter, RandomJitter, RandomPointDropout
+from pcdata.transforms.random_jitter import RandomColorDrop, RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms.random_parts import RandomCuboid, RandomOcclusion
 from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplicates
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.shape import DescribeShape
@@ -66,11 +68,14 @@ __all__ = [
     "NormalizeWorkspace",
     "PipelineOrderWarning",
     "RandomApply",
+    "RandomColorDrop",
     "RandomColorJitter",
     "RandomColumn",
+    "RandomCuboid",
     "RandomFarthestPointSample",
     "RandomFlip",
     "RandomJitter",
+    "RandomOcclusion",
     "RandomPointCount",
     "RandomPointDropout",
     "RandomRotation",
@@ -78,6 +83,7 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomTranslation",
+    "RandomTurnDepth",
     "RandomVoxelSample",
     "RemoveDuplicates",
     "RemoveFlyingPixels",
@@ -94,8 +100,10 @@ __all__ = [
     "SplitObjects",
     "ToFrame",
     "Transform",
+    "TurnDepth",
     "Undistort",
     "VoxelDownsample",
     "VoxelSample",
+    "mix_scenes",
     "planes_in_cloud",
 ]

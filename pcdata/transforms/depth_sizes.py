@@ -1,4 +1,4 @@
-"""Depth frames of another size: CropCenter, DecimateDepth, ResizeDepth. The intrinsics always follow."""
+"""Depth frames of another size, or turned: the intrinsics always follow."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from annotated_types import Interval
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from pcdata.errors import ShapeError
+from pcdata.errors import ConfigError, FrameError, ShapeError
 from pcdata.functional.depth.resampling import MAX_FACTOR, decimate_depth, resize_depth
+from pcdata.rng import Streams
 from pcdata.structures import DepthFrame
+from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.field_types import Count, Positive
 
@@ -56,6 +58,78 @@ class CropCenter(Transform):
             for name, image in images.items()
         }
         return replace(data, camera=data.camera.cropped(top, left, self.size), **window)
+
+
+class TurnDepth(Transform):
+    """Turn every image by quarter turns, counterclockwise; intrinsics, distortion and poses follow.
+
+    The scene stays where it is: the camera is turned about its own axis, so each point keeps its place in every frame
+    but the camera's own.
+
+    Args:
+        quarter_turns: of 90 degrees each.
+
+    Raises:
+        FrameError: a signal is in the frame of the camera, which turns.
+        IntrinsicsError: skewed pixel axes.
+    """
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    quarter_turns: Annotated[int, Interval(ge=1, le=3)] = 1
+
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Turn the images and the cameras."""
+        return turned_frame(type(self).__name__, data, self.quarter_turns)
+
+
+class RandomTurnDepth(Transform):
+    """Turn every image of a capture by a random number of quarter turns, as TurnDepth does.
+
+    Args:
+        quarter_turns: the numbers to choose from, each as likely as the others.
+    """
+
+    is_random = True
+    takes = DepthFrame
+    gives = DepthFrame
+
+    quarter_turns: tuple[Annotated[int, Interval(ge=0, le=3)], ...] = (0, 1, 2, 3)
+
+    def check_fields(self) -> None:
+        """Require a number to choose."""
+        if not self.quarter_turns:
+            raise ConfigError("RandomTurnDepth: quarter_turns must name numbers to choose from")
+
+    def make_params(self, data: DepthFrame, streams: Streams) -> Params:
+        """Draw one number for the capture."""
+        choices = torch.tensor(self.quarter_turns, dtype=torch.int64, device="cpu")
+        return {"quarter_turns": choices[(streams.uniform(0.0, 1.0) * len(choices)).long()]}
+
+    def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
+        """Turn the images and the cameras."""
+        return turned_frame(type(self).__name__, data, int(params["quarter_turns"][0]))
+
+
+def turned_frame(where: str, data: DepthFrame, quarter_turns: int) -> DepthFrame:
+    """Return the capture with its images turned counterclockwise."""
+    in_camera = [name for name, signal in data.recorded_signals.items() if signal.frame == CAMERA_FRAME]
+    if in_camera and quarter_turns:
+        raise FrameError(
+            f"{where}: signal {in_camera[0]!r} is in frame {CAMERA_FRAME!r}, which turns; bring it into another one"
+        )
+    names = ("depth", "colors", "labels", "confidence", "mask")
+    images: dict[str, Any] = {
+        name: None if image is None else torch.rot90(image, quarter_turns, (1, 2)).contiguous()
+        for name, image in ((name, getattr(data, name)) for name in names)
+    }
+    camera, pose = data.camera, data.world_from_camera
+    turn = torch.tensor([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64, device="cpu")
+    for _ in range(quarter_turns):
+        camera = camera.turned()
+        pose = None if pose is None else pose @ turn.to(pose.device)
+    return replace(data, camera=camera, world_from_camera=pose, **images)
 
 
 class DecimateDepth(Transform):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -98,10 +99,21 @@ def validated_fields(cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
     try:
         model = _field_model(cls)(**_as_plain(fields))
     except pydantic.ValidationError as error:
-        faults = [(fault["loc"], _fault_message(cls, fault)) for fault in error.errors()]
+        told: dict[Path, list[str]] = {}
+        for fault in error.errors():
+            told.setdefault(_place(fault["loc"]), []).append(_fault_message(cls, fault))
+        faults = [(path, ", or: ".join(texts)) for path, texts in told.items()]
         lines = [f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults]
         raise faulty_config("\n".join(lines), faults) from None
     return dict(vars(model))
+
+
+def _place(path: Path) -> Path:
+    """Leave out the alternatives of a type, which pydantic names between field and index."""
+    return path[:1] + tuple(part for part in path[1:] if isinstance(part, int) or not _ALTERNATIVE.fullmatch(part))
+
+
+_ALTERNATIVE = re.compile(r"(constrained-)?(float|str|int)|(tuple|literal|dict)\[.*\]")
 
 
 def _fault_message(cls: type, fault: Any) -> str:

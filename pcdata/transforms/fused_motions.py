@@ -38,7 +38,7 @@ def _is_blind(step: Transform) -> bool:
     # Exact types: a subclass may do something else.
     if type(step) in (RandomRotation, RandomScale, RandomFlip):
         return vars(step)["about"] == "origin"
-    return type(step) in (RandomTranslation, RandomJitter)
+    return type(step) is RandomTranslation or (type(step) is RandomJitter and step.is_plain)
 
 
 def run_motions(

@@ -1,4 +1,4 @@
-"""Random changes that are not motions: RandomJitter, RandomPointDropout, RandomColorJitter."""
+"""Random changes that are not motions: noise, dropped points, other colors."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import itertools
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError
-from pcdata.functional.noise import PointStep, move_points, random_rows
-from pcdata.functional.rows import ptr_from_counts
+from pcdata.errors import ConfigError, DTypeError, FrameError
+from pcdata.functional.nearest import sum_of_squares
+from pcdata.functional.noise import PointStep, move_points, normal_rows, random_rows
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -21,14 +22,22 @@ class RandomJitter(Transform):
     """Add independent Gaussian noise to every point, in the cloud's unit; ``source_from_cloud`` does not undo it.
 
     Args:
-        sigma: standard deviation per axis.
+        sigma: standard deviation per axis; one, or one for each axis of the frame.
         clip: the largest change per axis; None = unlimited.
+        along_ray: points move along the line to the viewpoint that saw them, as the error of a depth camera does;
+            then sigma and clip are lengths along it.
     """
 
     is_random = True
 
-    sigma: NonNegative = 0.001
+    sigma: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 0.001
     clip: Positive | None = None
+    along_ray: bool = False
+
+    def check_fields(self) -> None:
+        """Along the ray there is one direction."""
+        if self.along_ray and isinstance(self.sigma, tuple):
+            raise ConfigError("RandomJitter: along_ray takes one sigma, the one along the ray")
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw a seed per cloud: with it the noise can be drawn again exactly."""
@@ -36,10 +45,30 @@ class RandomJitter(Transform):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Add the noise that belongs to the seeds."""
-        return data.with_fields(points=move_points(data.points, data.ptr, [self.point_step(params)]))
+        if self.is_plain:
+            return data.with_fields(points=move_points(data.points, data.ptr, [self.point_step(params)]))
+        noise = normal_rows(data.ptr, params["seed"]) * data.points.new_tensor(self.sigma)
+        noise = noise if self.clip is None else noise.clamp(-self.clip, self.clip)
+        if self.along_ray:
+            viewpoint = data.viewpoint_per_point()
+            if viewpoint is None:
+                raise FrameError(
+                    "RandomJitter: along_ray needs to know where the sensor stood: set PointCloud.viewpoint, or leave "
+                    "along_ray out"
+                )
+            ray = data.points - viewpoint
+            length = sum_of_squares(ray).sqrt()[:, None]
+            noise = ray / torch.where(length > 0, length, 1.0) * noise[:, :1]
+        return data.with_fields(points=data.points + noise)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the noise is the same in all directions."""
+        return not self.along_ray and not isinstance(self.sigma, tuple)
 
     def point_step(self, params: Params) -> PointStep:
-        """Return the noise that belongs to the seeds."""
+        """Return the plain noise that belongs to the seeds."""
+        assert not isinstance(self.sigma, tuple)  # is_plain
         return params["seed"], self.sigma, self.clip
 
 
@@ -125,3 +154,30 @@ def _adjust(colors: Tensor, factors: Tensor) -> Tensor:
     image = adjust_saturation(image, saturation)
     image = adjust_hue(image, hue * (2 * torch.pi))
     return image[0, :, :, 0].T.contiguous().clamp(0, 1)
+
+
+class RandomColorDrop(Transform):
+    """Give all points of a cloud one color with a probability: what a model does without colors.
+
+    Args:
+        probability: that a cloud loses its colors.
+        color: RGB in [0, 1] that they get.
+
+    Source: Qian et al., PointNeXt: Revisiting PointNet++ with improved training and scaling strategies, NeurIPS 2022.
+    """
+
+    is_random = True
+
+    probability: Fraction = 0.2
+    color: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+        """Draw, per cloud, whether it loses them."""
+        return {"dropped": streams.uniform(0.0, 1.0) < self.probability}
+
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
+        """Paint the chosen clouds."""
+        if data.colors is None:
+            raise DTypeError("RandomColorDrop: the cloud has no colors")
+        dropped = params["dropped"].to(data.device)[cloud_of_rows(data.ptr)]
+        return data.with_fields(colors=torch.where(dropped[:, None], data.colors.new_tensor(self.color), data.colors))

@@ -15,24 +15,28 @@ from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params
 from pcdata.transforms.families import SpatialTransform
-from pcdata.transforms.field_types import Fraction, NonNegative, Positive, Vec3
+from pcdata.transforms.field_types import Fraction, Positive, Vec3
 
-About = Literal["origin", "centroid"]
+# The point that stays: the origin, the mean of each cloud, or a point in the cloud's unit.
+About = Literal["origin", "centroid"] | Vec3
+Angles = tuple[float, float]  # degrees, from and to
 
 
 class RandomRotation(SpatialTransform):
-    """Rotate every cloud about an axis by a random angle, or by a random rotation.
+    """Rotate every cloud about an axis by a random angle, about all three, or by a random rotation.
 
     Args:
         axis: None = any rotation, uniform over all orientations.
-        degrees: angles are drawn from [-degrees, degrees).
+        degrees: angles are drawn from [-degrees, degrees), or from [low, high) where two are given.
+        degrees_xyz: instead of axis and degrees: ranges [low, high) of the angles about x, then y, then z of the frame.
         about: the fixed point.
     """
 
     is_random = True
 
     axis: Vec3 | None = (0.0, 0.0, 1.0)
-    degrees: Annotated[float, Interval(ge=0, le=180)] = 180.0
+    degrees: Annotated[float, Interval(ge=0, le=180)] | Angles = 180.0
+    degrees_xyz: tuple[Angles, Angles, Angles] | None = None
     about: About = "origin"
 
     def check_fields(self) -> None:
@@ -41,32 +45,67 @@ class RandomRotation(SpatialTransform):
             raise ConfigError("RandomRotation: axis must not be zero")
         if self.axis is None and self.degrees != 180.0:
             raise ConfigError("RandomRotation: axis None means any rotation, so degrees must stay 180; or give an axis")
+        if self.degrees_xyz is not None and (self.axis != (0.0, 0.0, 1.0) or self.degrees != 180.0):
+            raise ConfigError("RandomRotation: give either degrees_xyz, or an axis and degrees")
+        ranges = [self.degrees] if isinstance(self.degrees, tuple) else []
+        for low, high in [*ranges, *(self.degrees_xyz or ())]:
+            if not -360 <= low <= high <= 360:
+                raise ConfigError(f"RandomRotation: degrees from {low} to {high} are no range within -360 to 360")
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one rotation per cloud."""
-        if self.axis is None:
+        if self.degrees_xyz is not None:
+            low, high = torch.tensor(self.degrees_xyz, dtype=torch.float64, device="cpu").unbind(1)
+            angles = torch.deg2rad(low + (high - low) * streams.uniform(0.0, 1.0, 3))
+            axes = torch.eye(3, dtype=torch.float64, device="cpu")
+            x, y, z = (
+                rigid.rotation_about_axis(axes[i].expand(len(angles), 3), angle)
+                for i, angle in enumerate(angles.unbind(1))
+            )
+            rotation = z @ y @ x
+        elif self.axis is None:
             quaternion = streams.normal(4)  # a normalized Gaussian quaternion is uniform over rotations
             rotation = rigid.rotation_from_quaternion(quaternion)
         else:
-            limit = torch.deg2rad(torch.tensor(self.degrees, dtype=torch.float64, device="cpu")).item()
-            angle = streams.uniform(-limit, limit)
+            from_, to = self.degrees if isinstance(self.degrees, tuple) else (-self.degrees, self.degrees)
+            low, high = torch.deg2rad(torch.tensor([from_, to], dtype=torch.float64, device="cpu"))
+            angle = streams.uniform(low.item(), high.item())
             axis = torch.nn.functional.normalize(torch.tensor(self.axis, dtype=torch.float64, device="cpu"), dim=0)
             rotation = rigid.rotation_about_axis(axis.expand(len(angle), 3), angle)
         return {"matrix": _about(self.about, data, rotation)}
 
 
 class RandomTranslation(SpatialTransform):
-    """Shift every cloud by a random offset, drawn per axis from [-max_offset, max_offset)."""
+    """Shift every cloud by a random offset, drawn per axis.
+
+    Args:
+        max_offset: in the cloud's unit; one number, or one per axis; offsets are drawn from [-max_offset, max_offset).
+        min_offset: the lower ends instead of -max_offset, of the same form.
+    """
 
     is_random = True
 
-    # In the cloud's unit; one number, or one per axis.
-    max_offset: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 0.02
+    max_offset: float | Vec3 = 0.02
+    min_offset: float | Vec3 | None = None
+
+    def check_fields(self) -> None:
+        """Require ranges."""
+        low, high = self._ends()
+        if bool((low > high).any()):
+            given = "" if self.min_offset is None else f"min_offset {self.min_offset} to "
+            raise ConfigError(f"RandomTranslation: {given}max_offset {self.max_offset} is no range")
+
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        high = torch.tensor(self.max_offset, dtype=torch.float64, device="cpu")
+        if self.min_offset is None:
+            return -high, high
+        return torch.tensor(self.min_offset, dtype=torch.float64, device="cpu"), high
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one offset per cloud."""
-        limit = torch.tensor(self.max_offset, dtype=torch.float64, device="cpu")
-        offset = streams.uniform(-1.0, 1.0, 3) * limit
+        low, high = self._ends()
+        drawn = streams.uniform(-1.0, 1.0, 3)
+        offset = drawn * high if self.min_offset is None else low + (high - low) * (drawn + 1.0) / 2
         return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device="cpu"), offset)}
 
 
@@ -74,27 +113,35 @@ class RandomScale(SpatialTransform):
     """Scale every cloud by a random factor; the unit stays, so objects really become larger or smaller.
 
     Args:
-        low: smallest factor.
-        high: largest factor.
-        about: the point that stays: the origin, or the centroid of each cloud.
+        low: smallest factor; one, or with per_axis one for each.
+        high: largest factor, likewise.
+        about: the point that stays.
         per_axis: a factor for every axis instead of one for all.
     """
 
     is_random = True
 
-    low: Positive = 0.9
-    high: Positive = 1.1
+    low: Positive | tuple[Positive, Positive, Positive] = 0.9
+    high: Positive | tuple[Positive, Positive, Positive] = 1.1
     about: About = "origin"
     per_axis: bool = False
 
     def check_fields(self) -> None:
         """Require low <= high."""
-        if self.low > self.high:
+        if not self.per_axis and (isinstance(self.low, tuple) or isinstance(self.high, tuple)):
+            raise ConfigError("RandomScale: factors for each axis need per_axis: true")
+        low, high = self._ends()
+        if bool((low > high).any()):
             raise ConfigError(f"RandomScale: low {self.low} exceeds high {self.high}")
+
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        low, high = (torch.tensor(end, dtype=torch.float64, device="cpu") for end in (self.low, self.high))
+        return low, high
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one factor, or three, per cloud."""
-        factors = streams.uniform(self.low, self.high, 3 if self.per_axis else 1)
+        low, high = self._ends()
+        factors = low + (high - low) * streams.uniform(0.0, 1.0, 3 if self.per_axis else 1)
         return {"matrix": _about(self.about, data, torch.diag_embed(factors.expand(-1, 3)))}
 
 
@@ -105,7 +152,7 @@ class RandomFlip(SpatialTransform):
 
     Args:
         probability: that x, y and z are mirrored, each drawn by itself.
-        about: the point that stays: the origin, or the centroid of each cloud.
+        about: the point that stays.
     """
 
     is_random = True
@@ -121,9 +168,12 @@ class RandomFlip(SpatialTransform):
 
 
 def _about(point: About, data: PointCloud, linear: Tensor) -> Tensor:
-    """Return (B, 4, 4) that apply (B, 3, 3) about the origin or about each cloud's mean."""
+    """Return (B, 4, 4) that apply (B, 3, 3) about the origin, about each cloud's mean, or about a point."""
     if point == "origin":
         return rigid.from_rotation_translation(linear, linear.new_zeros(3))
-    center = segment_mean(data.points, data.ptr).to(linear.device)
+    if point == "centroid":
+        center = segment_mean(data.points, data.ptr).to(linear.device)
+    else:
+        center = linear.new_tensor(point).expand(len(linear), 3)
     shift = center - (linear @ center[:, :, None]).squeeze(-1)
     return rigid.from_rotation_translation(linear, shift)

@@ -51,7 +51,7 @@ USUAL: Mapping[str, _Usual] = {
     **dict.fromkeys(
         (
             *("FarthestPointSample", "RandomFarthestPointSample", "RandomSample", "RandomPointCount"),
-            *("RandomVoxelSample", "VoxelSample"),
+            *("RandomVoxelSample", "VoxelSample", "RandomCuboid"),
         ),
         _Usual(0.0, 1.0, ""),
     ),

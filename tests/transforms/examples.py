@@ -158,7 +158,9 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.RandomApply(step=T.RemovePlane(), probability=0.4)),
     ],
     "RandomColorJitter": _of(T.RandomColorJitter(), T.RandomColorJitter(brightness=0.9, hue=0.5)),
+    "RandomColorDrop": _of(T.RandomColorDrop(), T.RandomColorDrop(probability=0.5, color=(0.5, 0.5, 0.5))),
     "RandomColumn": _of(T.RandomColumn(size=0.15, min_points=3)),
+    "RandomCuboid": _of(T.RandomCuboid(), T.RandomCuboid(low=0.1, high=(0.2, 0.3, 0.4), keep="inside")),
     "RandomFarthestPointSample": _of(
         T.RandomFarthestPointSample(num_points=32),
         T.RandomFarthestPointSample(num_points=100, if_short="repeat", color_weight=0.1, balance_labels=True),
@@ -167,7 +169,10 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomJitter": [
         Example(T.RandomJitter(), displacement=0.005 * math.sqrt(3)),
         Example(T.RandomJitter(sigma=0.0001, clip=None), displacement=0.0001 * 8 * math.sqrt(3)),
+        Example(T.RandomJitter(sigma=(0.0, 0.001, 0.002), clip=0.004), displacement=0.006),
+        Example(T.RandomJitter(along_ray=True, clip=0.004), displacement=0.004),
     ],
+    "RandomOcclusion": _of(T.RandomOcclusion(), T.RandomOcclusion(low=0.5, high=1.0)),
     "RandomPointCount": _of(
         T.RandomPointCount(num_points=50),
         T.RandomPointCount(num_points=100, spread=0.5, if_short="repeat"),
@@ -178,19 +183,30 @@ EXAMPLES: dict[str, list[Example]] = {
         T.RandomRotation(),
         T.RandomRotation(axis=(1.0, 2.0, -0.5), degrees=30.0, about="centroid"),
         T.RandomRotation(axis=None, about="centroid"),
+        T.RandomRotation(degrees=(-10.0, 40.0), about=(0.1, 0.0, -0.2)),
+        T.RandomRotation(degrees_xyz=((-5.0, 5.0), (0.0, 0.0), (10.0, 180.0))),
     ),
     "RandomSample": _of(
         T.RandomSample(num_points=32),
         *(T.RandomSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
         T.RandomSample(num_points=100, with_replacement=True),
     ),
-    "RandomScale": _of(T.RandomScale(), T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True)),
+    "RandomScale": _of(
+        T.RandomScale(),
+        T.RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True),
+        T.RandomScale(low=(0.9, 1.0, 1.0), high=1.5, per_axis=True),
+    ),
     "RandomSensorNoise": _of(
         T.RandomSensorNoise(sensor="realsense_d435"),
         T.RandomSensorNoise(sensor="azure_kinect_nfov", strength=0.5, edge_dropout=0.1, grazing_degrees=70.0),
         make=frame_with_counts,
     ),
-    "RandomTranslation": _of(T.RandomTranslation(), T.RandomTranslation(max_offset=(0.1, 0.0, 0.3))),
+    "RandomTranslation": _of(
+        T.RandomTranslation(),
+        T.RandomTranslation(max_offset=(0.1, 0.0, 0.3)),
+        T.RandomTranslation(min_offset=0.1, max_offset=0.2),
+    ),
+    "RandomTurnDepth": _of(T.RandomTurnDepth(), T.RandomTurnDepth(quarter_turns=(1, 3)), make=frame_with_counts),
     "RandomVoxelSample": _of(
         T.RandomVoxelSample(voxel_size=0.05),
         T.RandomVoxelSample(voxel_size=(0.05, 0.1, 0.3), origin=(0.02, 0.0, 0.01), min_points=2),
@@ -225,6 +241,7 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.ToFrame(frame="camera")),
         Example(T.ToFrame(frame="table", start="base", matrix=QUARTER_TURN)),
     ],
+    "TurnDepth": _of(T.TurnDepth(), T.TurnDepth(quarter_turns=2), make=frame_with_counts),
     "Undistort": _of(T.Undistort(), T.Undistort(rule="surface", zoom=0.8), make=_frame_with_a_lens),
     "VoxelDownsample": [
         Example(T.VoxelDownsample(voxel_size=0.02), displacement=0.02 * math.sqrt(3)),

@@ -288,6 +288,8 @@ def changed_values(value: Any) -> list[Any]:
             "never",
             "normalized",
             "planarity",
+            "inside",
+            "outside",
             "warn",
             "y",
         ]

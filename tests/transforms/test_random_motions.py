@@ -94,7 +94,7 @@ def test_offsets_fill_their_range_axis_by_axis():
     assert abs(float(torch.corrcoef(offset[:, [0, 2]].T)[0, 1])) < 0.2
     assert float(matrices(RandomTranslation(max_offset=0.05))[:, :3, 3].abs().max()) <= 0.05
     for wrong in (-0.1, (0.1, -0.1, 0.1)):
-        with pytest.raises(ConfigError, match="greater than or equal to 0"):
+        with pytest.raises(ConfigError, match="is no range"):
             RandomTranslation(max_offset=wrong)
 
 
