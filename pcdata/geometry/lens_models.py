@@ -105,6 +105,28 @@ def same_width(lenses: Iterable[Tensor | None], views: Iterable[int]) -> Tensor 
     return torch.cat(rows)
 
 
+def turned_lenses(where: str, distortion: Tensor) -> Tensor:
+    """Return (V, D) lenses seen from axes turned by a quarter: x along the old y, y against the old x.
+
+    Radial terms stay; decentering (p1, p2) and thin prism terms (s1..s4) turn with the axes.
+
+    Raises:
+        CaptureError: a tilted sensor, whose tilts are of the old axes.
+    """
+    turned = distortion.clone()
+    begin = int(distortion.shape[1] == ROW)
+    radial = {LENS_MODELS[name][0] for name in ("fisheye", "f_theta")}
+    bends = [view for view in range(len(turned)) if not begin or int(distortion[view, 0]) not in radial]
+    given = distortion[bends, begin:]
+    if bool((given[:, WIDEST_PLAIN:] != 0).any()):
+        raise CaptureError(f"{where}: a tilted sensor (tau_x, tau_y) cannot be turned; undistort the image first")
+    if bends:
+        turned[bends, begin + 2], turned[bends, begin + 3] = -given[:, 3], given[:, 2]
+        if given.shape[1] >= WIDEST_PLAIN:
+            turned[bends, begin + 8 : begin + 12] = torch.cat([given[:, 10:12], -given[:, 8:10]], dim=1)
+    return turned
+
+
 def check_distortion(where: str, distortion: Tensor) -> None:
     """Require (..., D) lenses: D is 4, 5, 8, 12 or 14, or 16 for rows that name their model.
 

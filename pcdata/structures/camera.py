@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, IntrinsicsError, ShapeError
-from pcdata.geometry.lens_models import check_distortion, lens_facts, lens_row
+from pcdata.geometry.lens_models import check_distortion, lens_facts, lens_row, turned_lenses
 from pcdata.structures.structure import Structure, derived
 
 # Of the side of an image: principal points of depth cameras lie nearer to its middle, those of another size do not.
@@ -150,6 +150,7 @@ class Camera(Structure):
 
         Raises:
             IntrinsicsError: axes that are skewed have no upper triangular intrinsics afterwards.
+            CaptureError: a tilted sensor.
         """
         if bool((self.intrinsics[:, 0, 1] != 0).any()):
             raise IntrinsicsError("Camera.turned: skewed axes cannot be turned; undistort and resample the image first")
@@ -157,16 +158,7 @@ class Camera(Structure):
         intrinsics[:, 0, 0], intrinsics[:, 1, 1] = self.intrinsics[:, 1, 1], self.intrinsics[:, 0, 0]
         intrinsics[:, 0, 2] = self.intrinsics[:, 1, 2]
         intrinsics[:, 1, 2] = self.size[1] - 1 - self.intrinsics[:, 0, 2]
-        distortion = self.distortion
-        if distortion is not None:
-            if bool((distortion[:, 12:] != 0).any()):
-                raise IntrinsicsError("Camera.turned: a tilted sensor cannot be turned; undistort the image first")
-            distortion = distortion.clone()
-            # Radial terms stay; decentering (p1, p2) and thin prism terms (s1..s4) turn with the axes.
-            distortion[:, 2], distortion[:, 3] = -self.distortion[:, 3], self.distortion[:, 2]  # type: ignore[index]
-            if distortion.shape[1] >= 12:
-                given = self.distortion[:, 8:12]  # type: ignore[index]
-                distortion[:, 8:12] = torch.cat([given[:, 2:], -given[:, :2]], dim=1)
+        distortion = None if self.distortion is None else turned_lenses("Camera.turned", self.distortion)
         size = (self.size[1], self.size[0])
         return replace(self, intrinsics=intrinsics, size=size, distortion=distortion)
 

@@ -139,8 +139,20 @@ def test_turned_pixels_project_to_turned_places_whatever_the_lens():
     turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     turned = camera.turned()
     pixel, _ = project_points(points, intrinsics=camera.intrinsics, distortion=camera.distortion)
-    again, _ = project_points((points @ turn.T).contiguous(), intrinsics=turned.intrinsics, distortion=turned.distortion)
+    again, _ = project_points(
+        (points @ turn.T).contiguous(), intrinsics=turned.intrinsics, distortion=turned.distortion
+    )
     torch.testing.assert_close(again, torch.stack([pixel[:, 1], 79 - pixel[:, 0]], 1), atol=1e-3, rtol=0)
+    for lens, numbers in {
+        "fisheye": [0.1, -0.02, 0.003, 0.001],
+        "inverse_brown_conrady": [0.1, -0.05, 0.01, -0.02, 0.003],
+    }.items():
+        other = Camera.pinhole(fx=90.0, fy=100.0, cx=41.0, cy=28.0, size=(60, 80), distortion=numbers, lens=lens)
+        pixel, _ = project_points(points, intrinsics=other.intrinsics, distortion=other.distortion)
+        again, _ = project_points(
+            (points @ turn.T).contiguous(), intrinsics=turned.intrinsics, distortion=other.turned().distortion
+        )
+        torch.testing.assert_close(again, torch.stack([pixel[:, 1], 79 - pixel[:, 0]], 1), atol=1e-3, rtol=0)
     skewed = camera.intrinsics.clone()
     skewed[:, 0, 1] = 0.3
     with pytest.raises(IntrinsicsError, match="skewed axes cannot be turned"):
