@@ -161,12 +161,12 @@ def building_at(folder: str | Path) -> BuildingFolder | BuildingUrl:
         ConfigError: there is no such kind of URL.
         MissingExtraError: what opens it is not installed.
     """
-    if isinstance(folder, str):
+    if isinstance(folder, str) and ":" in folder:
         if is_url(folder):
             return BuildingUrl(folder)
         folder = path_of(folder)
     # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
-    return BuildingFolder(Path(os.path.realpath(folder.expanduser())))
+    return BuildingFolder(Path(os.path.realpath(Path(folder).expanduser())))
 
 
 def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:

@@ -71,7 +71,7 @@ def add_to(commands: Any) -> None:
     build.add_argument(
         "--print-config", action="store_true", help="print the configuration with everything resolved; build nothing"
     )
-    build.set_defaults(run=_build)
+    build.set_defaults(run=_build, out_may_be_url=True)
 
 
 def _add_ways(build: argparse.ArgumentParser) -> None:

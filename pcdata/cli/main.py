@@ -49,6 +49,7 @@ def _run(argv: Sequence[str] | None) -> int:
     arguments.words = words[next((place for place, word in enumerate(words) if word[:1] != "-"), 0) + 1 :]
     try:
         _import(getattr(arguments, "imports", []))
+        _refuse_url(arguments)
         verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code
         sys.stdout.flush()
     except PcdataError as error:
@@ -68,6 +69,16 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"pcdata: {error if str(error) else 'not enough memory'}", file=sys.stderr)
         return 1
     return verdict or 0
+
+
+def _refuse_url(arguments: argparse.Namespace) -> None:
+    """Refuse a URL as --out of a command that writes to the disk alone, before it does anything."""
+    out = getattr(arguments, "out", None)
+    if isinstance(out, str) and ":" in out and not hasattr(arguments, "out_may_be_url"):
+        from pcdata.files.urls import url_hint
+
+        if hint := url_hint(out):
+            raise ConfigError(f"--out: {hint}")
 
 
 def _tell_what_is_needed(words: Sequence[str], message: str) -> None:

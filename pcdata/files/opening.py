@@ -24,6 +24,7 @@ from pcdata.files.inputs import note_input
 from pcdata.files.interrupts import shielded
 from pcdata.files.npy import PREFIX, header_length, parse_header
 from pcdata.files.part_files import part_file
+from pcdata.files.urls import url_hint
 
 MAX_TEXT_BYTES = 1 << 20  # a calibration or pose file holds a few hundred bytes
 MAX_STREAMED_BYTES = 1 << 42  # 4 TB: a file that is read in parts, whose claims are checked before each part is read
@@ -205,6 +206,8 @@ def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataErr
     """
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
+        if hint := url_hint(path):
+            raise error(f"{where}: {hint}")
         raise error(f"{where}: {path}: the folder {target.parent} does not exist; create it first")
     try:
         with suppress(FileNotFoundError):
@@ -239,6 +242,8 @@ def _missing(where: str, file: Path) -> str:
             f"{where}: {file}: is a link to {os.readlink(file)}, which is not there; fetch its content, or correct the "
             "link"
         )
+    if ":" in str(file) and (hint := url_hint(file)):
+        return f"{where}: {hint}"
     return f"{where}: {file}: no such file; check the path (relative to {Path.cwd()})"
 
 

@@ -24,6 +24,7 @@ RETRIES = 3  # of a read that fails, before that is an error
 
 _T = TypeVar("_T")
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(?:://|::)")  # two letters or more: one is a drive
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")  # what a path makes of its beginning
 _SECRET = re.compile(r"(?<=://)[^/@]*:[^/@]*(?=@)")
 _FIRST_WAIT = 0.5  # seconds before the second attempt; twice as long before each later one
 # What another attempt would not change.
@@ -51,6 +52,19 @@ def path_of(place: str | os.PathLike[str]) -> Path:
 
 def _is_full(cause: Exception) -> bool:
     return isinstance(cause, OSError) and cause.errno == errno.ENOSPC
+
+
+def url_hint(path: str | os.PathLike[str]) -> str:
+    """Return what to say of a path that was meant to be a URL, such as ``s3:/bucket``; "" of any other."""
+    parts = Path(path).parts
+    for place, part in enumerate(parts):
+        if _SCHEME.fullmatch(part) and not Path(*parts[: place + 1]).exists():
+            rest = "/".join(("",) * (part == "file:") + parts[place + 1 :])
+            return (
+                f"{part}//{rest} is a URL, and this works on the disk alone: give a path, and copy with a tool of the "
+                "store, such as 'aws s3 sync'; 'pcdata verify' then says whether a dataset came whole"
+            )
+    return ""
 
 
 class UrlStatus(NamedTuple):

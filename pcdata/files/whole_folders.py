@@ -25,6 +25,7 @@ from pcdata.files.scratch import (
     silent,
 )
 from pcdata.files.syncing import sync_folder
+from pcdata.files.urls import url_hint
 
 # The file at the top of a folder that says what it is; without it nobody could tell what a killed removal left.
 DATASET, EXPORT = "dataset.json", "pcdata_export.json"
@@ -91,6 +92,8 @@ def is_free(folder: Path) -> bool:
         os.lstat(folder)
         return folder.is_dir() and not os.listdir(folder)
     except FileNotFoundError:
+        if ":" in str(folder) and (hint := url_hint(folder)):
+            raise CacheError(hint) from None
         return True
     except OSError as error:  # a name that is too long, a file where a folder is to be
         raise CacheError(f"{folder}: cannot be written there: {write_fault(error)}") from error

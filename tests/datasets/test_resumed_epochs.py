@@ -58,19 +58,35 @@ def test_two_ranks_read_together_what_one_reads(dataset, workers):
     assert len({name for name, _ in alone}) == len(dataset)
 
 
-def test_a_stateful_loader_goes_on_where_it_was(dataset):
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # which torchdata calls
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_stateful_loader_goes_on_in_another_process_where_it_was(dataset, workers, ranks):
+    """Shuffled or cut for ranks, with batches that are read and augmented at once."""
     stateful = pytest.importorskip("torchdata.stateful_dataloader", reason="pip install torchdata")
 
-    def begin():
-        return stateful.StatefulDataLoader(dataset, batch_size=2, num_workers=1, collate_fn=collate_packed)
+    def begin(data, rank=0):
+        sampler = DistributedSampler(data, ranks, rank, seed=1) if ranks > 1 else None
+        generator = torch.Generator().manual_seed(5)
+        how = {"num_workers": workers, "generator": generator, "collate_fn": collate_packed, "shuffle": ranks == 1}
+        return stateful.StatefulDataLoader(data, batch_size=2, sampler=sampler, **how)
 
-    whole = by_id(begin())
-    stopped = begin()
-    batches = iter(stopped)
-    begun = by_id([next(batches)])
-    resumed = begin()
-    resumed.load_state_dict(stopped.state_dict())
-    assert begun + by_id(resumed) == whole
+    parts = []
+    for rank in range(ranks):
+        dataset.set_epoch(4)
+        whole = by_id(begin(dataset, rank))
+        dataset.set_epoch(4)
+        stopped = begin(dataset, rank)
+        batches = iter(stopped)
+        begun = by_id([next(batches)])
+        kept = pickle.dumps(stopped.state_dict())  # as a checkpoint keeps it
+        anew = CachedCloudDataset(dataset.folder, seed=3)
+        anew.set_epoch(4)
+        resumed = begin(anew, rank)
+        resumed.load_state_dict(pickle.loads(kept))
+        assert begun + by_id(resumed) == whole
+        parts += whole
+    assert len({name for name, _ in parts}) == len(parts) == len(dataset)
 
 
 def test_other_epochs_seeds_and_samples_have_other_draws(caches, dataset):

@@ -13,6 +13,7 @@ from typing import Any
 from pcdata.errors import CaptureError, ConfigError, PcdataError, add_note, locates_path, near_matches
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
+from pcdata.files.urls import url_hint
 from pcdata.io.sources.capture_source import kinds_of, refused_captures
 from pcdata.io.sources.combine import Selectable
 from pcdata.io.sources.detect import detect_layout
@@ -100,6 +101,8 @@ def _open(path: str | os.PathLike[str], kind: str | None, options: dict[str, Any
     if given.exists():
         return _open_one(given, kind, options)
     if not glob.has_magic(str(given)):
+        if hint := url_hint(given):
+            raise CaptureError(f"{_WHERE}: {hint}")
         raise CaptureError(f"{_WHERE}: {given}: no such file or folder; check the path (relative to {Path.cwd()})")
     fixed = Path(*_before_pattern(given.parts))
     found = [Path(match) for match in glob.glob(str(given) + _folders_alone(path))]

@@ -14,6 +14,7 @@ from typing import Any
 from pcdata.errors import CacheError, PcdataWarning, locate
 from pcdata.files.opening import read_bytes
 from pcdata.files.scratch import retired_of
+from pcdata.files.urls import url_hint
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
 from pcdata.io.store.sample_index import Sample, SampleIndex
@@ -120,6 +121,8 @@ class Manifest:
                     f"{folder}: is missing, since an overwrite of it was killed: the old one is {retired[0]}; "
                     "rename it back, or build again"
                 )
+            if hint := url_hint(folder):
+                raise CacheError(hint)
             raise CacheError(f"{folder}: not a pcdata dataset: it has no {FILE_NAME}; make one with 'pcdata build'")
         text = read_bytes("dataset", path, max_bytes=_MAX_BYTES, error=CacheError)
         try:
