@@ -39,6 +39,8 @@ _NOISE_M = 0.003  # metres: three standard deviations of the noise of a depth ca
 _NOISE = 0.01  # of the size of a cloud that is in no metres
 _OF_SPACING = 0.25  # of the distance of neighbors: between points of a curved surface it is not where its plane is
 _BESIDE = 3.0  # distances of neighbors: how far beside a point the next one of an independent sample may be
+# Of points of which one in n is kept, none of the next 6 n is with a chance of exp(-6), far below what may be missing.
+_KEPT, _COUNTED = 6.0, 24
 _MOST = 2048  # points of a cloud that are looked up
 _ALIGNED = 192  # points that are brought onto the other cloud
 _STEPS = 24  # of the alignment, at most
@@ -176,6 +178,12 @@ class Surface:
         self.reach = max(_BESIDE * self.spacing, self.noise)
         self._planes: tuple[Points, Points] | None = None
 
+    def radius_of(self, points: Points, count: float) -> NDArray[np.float64]:
+        """Return how far around each of its points so many others lie: the nearest are counted, more are reckoned."""
+        nearest = int(min(np.ceil(count), _COUNTED, len(self.points) - 1))
+        distance = self._tree.query(points, k=[nearest + 1])[0][:, 0]  # the nearest is the point itself
+        return np.asarray(distance * np.sqrt(count / nearest))  # on a surface their number grows with the area
+
     def _nearest(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
         """Return of every point the distance to the nearest one, a point of the local plane there, and its normal."""
         distance, near = self._tree.query(points)
@@ -234,10 +242,16 @@ class Surface:
 
 
 def _covers(points: Points, surface: Surface) -> bool:
-    """Whether nearly all of the denser cloud has a point of the sparser one near."""
+    """Whether nearly all of the denser cloud has a point of the sparser one near, for its own density or the local one.
+
+    A cloud of a camera is dense on what is near and sparse on the rest; one that was thinned out evenly has its points
+    as far apart as the sparser one's are anywhere.
+    """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points)
     spacing = float(np.median(tree.query(_some(points, 256), k=[2])[0]))
-    distance, _ = tree.query(_some(surface.points, _MOST))
-    return bool((distance <= max(_BESIDE * spacing, surface.noise)).mean() >= _NEARLY_ALL)
+    some = _some(surface.points, _MOST)
+    distance, _ = tree.query(some)
+    near = np.maximum(surface.radius_of(some, _KEPT * len(surface.points) / len(points)), _BESIDE * spacing)
+    return bool((distance <= np.maximum(near, surface.noise)).mean() >= _NEARLY_ALL)

@@ -85,6 +85,18 @@ def test_a_few_centimetres_that_differ_on_a_large_table_are_no_duplicate():
     assert distance(here, there) is None
 
 
+@pytest.mark.parametrize("kept", [0.5, 0.25])
+def test_a_thinned_copy_of_a_cloud_that_is_dense_in_one_place_is_found(kept):
+    draw = np.random.default_rng(0)
+    table = np.concatenate([draw.uniform(-0.4, 0.4, (400, 2)), np.zeros((400, 1))], 1)
+    ball = draw.normal(size=(1000, 3))
+    ball = 0.06 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0.1, 0.0, 0.06]
+    cloud = np.concatenate([table, ball])
+    assert distance(cloud[draw.random(len(cloud)) < kept], cloud) == pytest.approx(0.0, abs=1e-9)
+    without = np.concatenate([table[table[:, 0] > -0.2], ball])  # a fourth of the table is not there
+    assert distance(without, cloud) is None
+
+
 def test_clouds_that_are_in_no_metres_are_judged_by_their_size(views):
     points = views[0][0] * 40
     copy = points + np.random.default_rng(0).normal(0, 0.002 * np.std(points), points.shape)
