@@ -23,26 +23,31 @@ from pcdata.errors import CacheError, ConfigError, DTypeError
 from pcdata.files import urls
 from pcdata.io.store import tar_shard, url_dataset
 from pcdata.structures.unbatched import Unbatched
-from pcdata.synthetic import TeleopSource
+from tests.build.test_builder import Clouds
 from tests.io.store.test_stores import assert_same_cloud
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 STORED = """
-depth: [Deproject]
-cloud: [ToFrame: {frame: base}, FarthestPointSample: {num_points: 16, if_short: repeat}]
+cloud: [Center]
 augment: [RandomRotation: {degrees: 180}, RandomJitter: {sigma: 0.01}, RandomPointDropout: {low: 0.1, high: 0.5}]
 """
+
+
+def numbered(number: int) -> PointCloud:
+    points = torch.rand(20 + number, 3, generator=torch.Generator().manual_seed(number))
+    cloud = PointCloud(points=points, colors=points, frame_id="base", meta=[{"sample_id": f"s{number}"}])
+    return cloud.with_signal("joints", torch.full((1, 2), float(number)), "invariant")
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory) -> dict[str, str]:
     """The same dataset of seven shards as tars, packed, and tars on a server."""
     root = tmp_path_factory.mktemp("streamed")
-    source = TeleopSource(num_episodes=2, num_views=1, size=(8, 10))
+    source = Clouds({f"s{number}": numbered(number) for number in range(27)})
     for form in ("webdataset", "packed"):
         build_dataset(config_from_yaml(f"{STORED}output: {{format: {form}, shard_size: 4}}\n"), source, root / form)
-    pcdata.split_dataset(root / "webdataset", {"train": 1, "val": 1})
+    pcdata.split_dataset(root / "webdataset", {"train": 0.5, "val": None}, by="sample")
     served(root / "webdataset", "memory://streamed/set")
     return {form: str(root / form) for form in ("webdataset", "packed")} | {"server": "memory://streamed/set"}
 
