@@ -58,6 +58,7 @@ def build_dataset(
     part: tuple[int, int] | None = None,
     finalize: bool = False,
     strict: bool = False,
+    hash_captures: bool = False,
     retry_quarantined: bool = False,
     progress: Progress | None = None,
     note: Note | None = None,
@@ -92,6 +93,8 @@ def build_dataset(
         retry_quarantined: try the captures again that the build of the dataset, or the unfinished one, quarantined.
             Their shards are built anew, the others are kept, and the dataset is replaced by what a build gives in which
             they never failed.
+        hash_captures: tell a file of the captures that was changed by its content, which reads all of them once more
+            before a shard, and once at the end; otherwise one above 64 KiB is told by its size and time.
         progress: called after every capture.
         note: told at once what the report's ``notes`` say in the end.
 
@@ -120,7 +123,7 @@ def build_dataset(
     report = BuildReport(building.target.url if isinstance(building, BuildingUrl) else building.target)
     report.skipped.update(skipped_of(source))
     building.check_target(overwrite)
-    plan = plan_of(config, source)
+    plan = plan_of(config, source, hash_captures=hash_captures)
     limit = most_bad(max_bad, len(plan.ids))
     job = Job.of(config, source, plan, building)
 
@@ -191,7 +194,7 @@ def _finished(job: Job, shards: range, note: Note, *, retry_quarantined: bool) -
     changed = [
         shard
         for shard in shards
-        if shard in done and captures_digest(source, plan.ids_of(shard)) != done[shard].captures
+        if shard in done and captures_digest(source, plan.ids_of(shard), plan.hashes_captures) != done[shard].captures
     ]
     doubtful = [shard for shard in shards if shard in done and done[shard].is_doubtful]
     bad = [shard for shard in shards if shard in done and retry_quarantined and done[shard].quarantined]

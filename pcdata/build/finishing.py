@@ -125,7 +125,7 @@ def counts_of(records: Mapping[int, ShardRecord]) -> dict[str, Counts]:
 def _check_captures(source: CaptureSource, job: Job, records: Sequence[ShardRecord]) -> None:
     for record in records:
         ids = job.plan.ids_of(record.shard)
-        if captures_digest(source, ids) != record.captures:
+        if captures_digest(source, ids, job.plan.hashes_captures) != record.captures:
             raise CaptureError(
                 f"build_dataset: a file of the captures {ids[0]!r} to {ids[-1]!r} was changed after it was read, so "
                 "the dataset would mix two states of them; let them rest and start again: only these are built anew"

@@ -28,14 +28,14 @@ class Outlook:
     hindrances: list[str] = field(default_factory=list)  # why it would not begin
 
 
-def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path) -> Outlook:
+def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path, *, hash_captures: bool = False) -> Outlook:
     """Return what ``build_dataset`` would do with these arguments.
 
     Raises:
         CaptureError: the source has no captures, or two of one id.
     """
     checked_ids("build", source)
-    plan, building = plan_of(config, source), building_at(folder)
+    plan, building = plan_of(config, source, hash_captures=hash_captures), building_at(folder)
     hindrances = []
     try:
         building.check_target(overwrite=True)
@@ -55,7 +55,9 @@ def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path) -> O
         )
     records = building.finished(plan) if different == [] else {}
     done = [
-        record for shard, record in records.items() if captures_digest(source, plan.ids_of(shard)) == record.captures
+        record
+        for shard, record in records.items()
+        if captures_digest(source, plan.ids_of(shard), hash_captures) == record.captures
     ]
     files = files_of(source, plan.ids)
     return Outlook(

@@ -43,6 +43,11 @@ class Plan:
         return digest_of({"settings": self.settings, "ids": digest_of(self.ids), "shard_size": self.shard_size})
 
     @property
+    def hashes_captures(self) -> bool:
+        """Whether files of captures are compared by their content alone."""
+        return bool(self.settings["hash_captures"])
+
+    @property
     def num_shards(self) -> int:
         """How many shards there are."""
         return -(-len(self.ids) // self.shard_size)
@@ -82,8 +87,11 @@ class Plan:
         return different or ["schema"]
 
 
-def plan_of(config: BuildConfig, source: CaptureSource) -> Plan:
-    """Return the plan for a configuration and its captures; no capture is loaded."""
+def plan_of(config: BuildConfig, source: CaptureSource, *, hash_captures: bool = False) -> Plan:
+    """Return the plan for a configuration and its captures; no capture is loaded.
+
+    ``hash_captures``: whether a large file counts as changed by its content, or by its size and time.
+    """
     ids = tuple(source.ids)
     size = shard_size_of(len(ids), config.output.shard_size)
     steps = step_names(config.pipeline.split()[0].sections()) if imported_files() else set()
@@ -99,6 +107,7 @@ def plan_of(config: BuildConfig, source: CaptureSource) -> Plan:
         "steps": config.pipeline.stored_fingerprint(),
         "output": config.output.model_dump(exclude={"shard_size"}),
         "source": state_of(source),
+        "hash_captures": hash_captures,
         "imports": needed,
         "versions": {"pcdata": pcdata.__version__, "torch": str(torch.__version__), "numpy": np.__version__},
     }

@@ -124,7 +124,7 @@ class _ShardWork:
         """Store what can be stored; return it, what failed, the state of the captures, and the signals."""
         job, source = self.job, self.job.work.source
         ids = job.plan.ids_of(self.shard)
-        captures = captures_digest(source, ids)
+        captures = captures_digest(source, ids, job.plan.hashes_captures)
         inputs = inputs_of(source)
         samples: list[BuiltSample] = []
         signals: list[Mapping[str, Signal]] = []

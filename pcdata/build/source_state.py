@@ -34,10 +34,13 @@ def state_of(source: CaptureSource) -> dict[str, Any]:
     }
 
 
-def captures_digest(source: CaptureSource, ids: Sequence[str]) -> str:
-    """Return the SHA-256 of the state of the files that captures are read from, as :class:`Inputs` compares files."""
+def captures_digest(source: CaptureSource, ids: Sequence[str], by_content: bool) -> str:
+    """Return the SHA-256 of the state of the files that captures are read from, as :class:`Inputs` compares files.
+
+    ``by_content`` reads all of them.
+    """
     files = files_of(source, ids)
-    return digest_of(list(zip(files.values(), states_of(files))))
+    return digest_of(list(zip(files.values(), states_of(files, by_content=by_content))))
 
 
 def files_of(source: CaptureSource, ids: Sequence[str]) -> dict[Path, str]:

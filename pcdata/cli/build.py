@@ -98,6 +98,11 @@ def _add_ways(build: argparse.ArgumentParser) -> None:
         help="fail where a step drops more than is usual or a capture is an outlier of the rest (default: say so)",
     )
     ways.add_argument(
+        "--hash-captures",
+        action="store_true",
+        help="tell captures that changed by the content of all their files (default: large ones by size and time)",
+    )
+    ways.add_argument(
         "--engine", default="pool", metavar="NAME", help="pool: processes of this machine; ray: a cluster"
     )
     ways.add_argument("--num-shards", type=positive, metavar="N", help="of jobs that share the work: how many they are")
@@ -129,7 +134,7 @@ def _build(arguments: argparse.Namespace) -> int:
     source = config.source.open()
     part = _part(arguments)
     if arguments.dry_run:
-        print(plan_text(config, source, arguments.out))
+        print(plan_text(config, source, arguments.out, hash_captures=arguments.hash_captures))
         return 0
     with ProgressBar("build") as progress:
         report = build_dataset(
@@ -145,6 +150,7 @@ def _build(arguments: argparse.Namespace) -> int:
             part=part,
             finalize=arguments.finalize,
             strict=arguments.strict,
+            hash_captures=arguments.hash_captures,
             retry_quarantined=arguments.retry_quarantined,
             progress=progress,
             note=progress.note,

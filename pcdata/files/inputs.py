@@ -16,6 +16,7 @@ from typing import BinaryIO, NamedTuple
 
 from pcdata.errors import CaptureError
 
+_BLOCK = 1 << 22  # bytes
 _SMALL = 1 << 16  # bytes: reading so many again takes no longer than to open the file
 
 
@@ -102,20 +103,31 @@ def note_input(path: str | os.PathLike[str], file: BinaryIO) -> None:
         inputs.note(path, file)
 
 
-def states_of(paths: Iterable[str | os.PathLike[str]]) -> list[list[str | int]]:
-    """Return what files are compared by, as they are now; of one that is missing or no file, nothing."""
+def states_of(paths: Iterable[str | os.PathLike[str]], *, by_content: bool = False) -> list[list[str | int]]:
+    """Return what files are compared by, as they are now; of one that is missing or no file, nothing.
+
+    ``by_content`` reads them all: otherwise large ones are compared by size and time.
+    """
     found: list[list[str | int]] = []
     for path in paths:
         try:
             status = os.stat(path)
-            if status.st_size > _SMALL or not stat.S_ISREG(status.st_mode):
+            is_file = stat.S_ISREG(status.st_mode)
+            if not is_file or (status.st_size > _SMALL and not by_content):
                 found.append([status.st_size, status.st_mtime_ns])
                 continue
             with open(path, "rb") as file:
-                found.append(_told(_state(file)))
+                found.append([status.st_size, _hash_of(file)] if by_content else _told(_state(file)))
         except OSError:
             found.append([])
     return found
+
+
+def _hash_of(file: BinaryIO) -> str:
+    total = hashlib.sha256()
+    while block := file.read(_BLOCK):
+        total.update(block)
+    return total.hexdigest()
 
 
 def _told(state: _State) -> list[str | int]:

@@ -33,9 +33,9 @@ def build_text(report: BuildReport) -> str:
     return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
 
 
-def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path) -> str:
+def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, *, hash_captures: bool = False) -> str:
     """Tell what a build would do, how large the result may become, and what of it is finished."""
-    plan = outlook(config, source, folder)
+    plan = outlook(config, source, folder, hash_captures=hash_captures)
     left = plan.num_shards - plan.num_finished
     rows = [
         ["captures", f"{plan.num_samples:,} in {plan.num_shards:,} shards of {plan.shard_size:,}"],

@@ -16,6 +16,7 @@ import fsspec
 import pytest
 import torch
 
+from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset, outlook
 from pcdata.build.building_url import BuildingUrl
 from pcdata.errors import CacheError, ConfigError
@@ -114,6 +115,14 @@ def test_a_build_at_a_url_has_the_bytes_of_one_in_a_folder(url, tmp_path, form):
     assert objects(url) == wanted
     assert beside(url) == {"set"}
     assert os.listdir(tmp_path / "scratch") == []
+
+
+@IN_MEMORY
+def test_what_was_built_at_a_url_is_read_where_it_is(url):
+    build(url, "webdataset")
+    data = CachedCloudDataset(url)
+    assert [data[n].num_points for n in (0, 10)] == [20, 30]
+    assert data.manifest.identity == outlook(config_of("webdataset"), Counted(), url).identity
 
 
 def test_a_file_url_is_a_folder(tmp_path):

@@ -192,6 +192,37 @@ def test_only_shards_of_captures_that_changed_are_built_anew(tmp_path):
     assert CachedCloudDataset(tmp_path / "out")[1].num_points == 50
 
 
+@pytest.mark.parametrize("hash_captures", [False, True])
+def test_a_large_file_with_other_content_of_the_same_size_and_time_is_told_by_its_hash(tmp_path, hash_captures):
+    (tmp_path / "in").mkdir()
+    paths = [tmp_path / "in" / f"c{n}.ply" for n in range(3)]
+    for path in paths:
+        write_ply(path, cloud(9000))
+    assert paths[0].stat().st_size > 1 << 16
+    config = config_from_yaml("cloud: [Center]\noutput: {format: npz, shard_size: 1}")
+
+    def stop(done: int, total: int, name: str) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    def go_on(**how):
+        return build_dataset(config, open_source(tmp_path / "in"), tmp_path / "out", **how)
+
+    with pytest.raises(KeyboardInterrupt):
+        go_on(progress=stop, hash_captures=hash_captures)
+    before = paths[0].stat()
+    content = bytearray(paths[0].read_bytes())
+    content[-12:] = bytes(12)
+    paths[0].write_bytes(content)
+    os.utime(paths[0], ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(CacheError, match="differs in its hash_captures"):
+        go_on(hash_captures=not hash_captures)
+    found = outlook(config, open_source(tmp_path / "in"), tmp_path / "out", hash_captures=hash_captures)
+    assert found.num_finished == 1 - hash_captures
+    told = "1 finished shards are built anew, since a file of their captures has changed"
+    assert (told in go_on(hash_captures=hash_captures).notes) is hash_captures
+
+
 def test_captures_that_change_after_their_shard_was_finished_are_not_mixed(tmp_path):
     (tmp_path / "in").mkdir()
     for n in range(4):
@@ -278,7 +309,7 @@ def test_a_process_that_lives_keeps_its_claim_without_locks_too(tmp_path, monkey
 def test_builds_killed_at_any_moment_end_in_the_same_bytes(tmp_path):
     """benchmarks/kill_builds.py does the same fifty times, in more ways."""
     random.seed(0)
-    build(tmp_path / "whole")
+    build(tmp_path / "whole", source=_Slow())  # whose class is in the identity
     for workers in (0, 2):
         for _ in range(4):
             pid = os.fork()
