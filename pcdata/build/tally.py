@@ -25,8 +25,11 @@ def most_bad(max_bad: int | str | None, num_samples: int) -> int | None:
     if max_bad is None:
         return None
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(%?)", str(max_bad))
-    if isinstance(max_bad, bool) or found is None or (not found[2] and "." in found[1]) or float(found[1]) > 1e15:
-        raise ConfigError(f'build: max_bad must be a number of captures, or a share such as "1%", got {max_bad!r:.60}')
+    most = 100 if found is not None and found[2] else 1e15
+    if isinstance(max_bad, bool) or found is None or (not found[2] and "." in found[1]) or float(found[1]) > most:
+        raise ConfigError(
+            f'build: max_bad must be a number of captures, or a share from "0%" to "100%", got {max_bad!r:.60}'
+        )
     return math.floor(float(found[1]) / 100 * num_samples) if found[2] else int(found[1])
 
 

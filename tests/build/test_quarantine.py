@@ -167,7 +167,7 @@ def test_more_than_max_bad_stop_the_build_which_goes_on_when_more_are_allowed(tm
 
 def test_max_bad_is_a_count_or_a_share():
     assert [most_bad(one, 250) for one in (None, 3, "3", "1%", "0.5%", "0", "100%")] == [None, 3, 3, 2, 1, 0, 250]
-    for wrong in ("1 %", "x", -1, 0.5, True, "-1%", "1.5", "%", ""):
+    for wrong in ("1 %", "x", -1, 0.5, True, "-1%", "1.5", "%", "101%", ""):
         with pytest.raises(ConfigError, match="max_bad"):
             most_bad(wrong, 250)
 
