@@ -106,6 +106,10 @@ def op(
             device = contract.device(arguments)
             backend = _choose(operation, backend, device, wants_gradient)
             body: Callable[..., R] | None = operation.kernels.get(backend)
+            if wants_gradient and operation.serves_by_steps(backend):
+                body = (
+                    None  # the reference, on the kernels of its steps, has the gradient that a kernel of its own lacks
+                )
             _tidy(arguments, detach=body is not None or not gradient, contiguous=backend != REFERENCE)
             if body is None and steps:
                 arguments["backend"] = backend

@@ -1,7 +1,7 @@
 """Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
-decimated, resized, undistorted and filled depth, undistorted images, disparity, Chamfer distance, distances and
+decimated, resized, undistorted and filled depth, undistorted images, disparity, distances between clouds, distances and
 covariances of neighbors. None flow through decisions (indices, masks, labels, planes, sizes, which points are
 neighbors), nor through estimated normals, ``register_depth``, ``spatial_filter`` and TSDF volumes.
 """
@@ -17,7 +17,7 @@ from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.metrics import chamfer_distance
+from pcdata.functional.metrics import chamfer_distance, earth_movers_distance, f_score, hausdorff_distance
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
@@ -68,13 +68,16 @@ __all__ = [
     "disparity_to_depth",
     "distort_normalized",
     "duplicate_mask",
+    "earth_movers_distance",
     "estimate_normals",
+    "f_score",
     "farthest_point_groups",
     "farthest_point_sample",
     "fill_holes",
     "fill_rows",
     "find_voxel_size",
     "flying_pixel_mask",
+    "hausdorff_distance",
     "knn",
     "neighborhood_covariance",
     "orient_normals",

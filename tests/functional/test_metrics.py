@@ -1,13 +1,18 @@
-"""Chamfer distance against brute force and its laws."""
+"""Distances between clouds against brute force, SciPy and their laws."""
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
+from scipy.spatial.distance import directed_hausdorff
 from torch import Tensor
 
-from pcdata.errors import TooFewPointsError
+from pcdata import functional as F
+from pcdata.errors import ConfigError, TooFewPointsError
 from pcdata.functional.metrics import chamfer_distance
+from pcdata.rng import seeded
 
 
 def brute_force(a: Tensor, b: Tensor, *, squared: bool) -> Tensor:
@@ -66,3 +71,79 @@ def test_an_empty_cloud_is_named():
     ptr = torch.tensor([0, 3, 3])
     with pytest.raises(TooFewPointsError, match="cloud 1 of points_b is empty"):
         chamfer_distance(torch.rand(4, 3), torch.tensor([0, 2, 4]), torch.rand(3, 3), ptr)
+
+
+def pairs():
+    a, b = (torch.rand(count, 3, generator=seeded(count)) for count in (70, 55))
+    return a, torch.tensor([0, 40, 70]), b, torch.tensor([0, 15, 55])
+
+
+def test_sides_norms_and_normals_are_those_of_all_pairs_in_float64():
+    a, ptr_a, b, ptr_b = pairs()
+    normals = [torch.nn.functional.normalize(torch.randn(len(p), 3, generator=seeded(len(p))), dim=1) for p in (a, b)]
+    for norm, power in (("l2", 2), ("l1", 1)):
+        for squared in (True, False):
+            found = {
+                sides: F.chamfer_distance(
+                    a,
+                    ptr_a,
+                    b,
+                    ptr_b,
+                    norm=norm,
+                    squared=squared,
+                    sides=sides,
+                    normals_a=normals[0],
+                    normals_b=normals[1],
+                )
+                for sides in ("a_to_b", "b_to_a", "both")
+            }
+            for cloud, (one, other) in enumerate(((slice(0, 40), slice(0, 15)), (slice(40, 70), slice(15, 55)))):
+                offset = a[one, None].double() - b[None, other].double()
+                nearest = offset.norm(dim=2)
+                for sides, axis in (("a_to_b", 1), ("b_to_a", 0)):
+                    row = nearest.argmin(axis)
+                    pick = (torch.arange(len(row)), row) if axis == 1 else (row, torch.arange(len(row)))
+                    apart = offset.norm(p=power, dim=2)[pick]
+                    wanted = (apart.square() if squared else apart).mean()
+                    cosine = (normals[0][one][pick[0]] * normals[1][other][pick[1]]).sum(1).double()
+                    torch.testing.assert_close(found[sides][cloud, 0].double(), wanted, rtol=1e-5, atol=0)
+                    torch.testing.assert_close(
+                        found[sides][cloud, 1].double(), (1 - cosine.abs()).mean(), rtol=1e-5, atol=0
+                    )
+            torch.testing.assert_close(found["both"], found["a_to_b"] + found["b_to_a"])
+
+
+def test_hausdorff_is_scipys_each_way():
+    a, ptr_a, b, ptr_b = pairs()
+    found = F.hausdorff_distance(a, ptr_a, b, ptr_b)
+    for cloud, (one, other) in enumerate(((slice(0, 40), slice(0, 15)), (slice(40, 70), slice(15, 55)))):
+        wanted = [
+            directed_hausdorff(a[one].numpy(), b[other].numpy())[0],
+            directed_hausdorff(b[other].numpy(), a[one].numpy())[0],
+        ]
+        assert found[cloud].tolist() == pytest.approx(wanted, rel=1e-5)
+
+
+def test_f_scores_count_what_is_near():
+    a = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    b = torch.tensor([[0.05, 0, 0], [1, 0.05, 0], [9, 0, 0]])
+    score, precision, recall = F.f_score(a, None, b, None, threshold=0.1)[0].tolist()
+    assert precision == pytest.approx(2 / 4)
+    assert recall == pytest.approx(2 / 3)
+    assert score == pytest.approx(2 * 0.5 * (2 / 3) / (0.5 + 2 / 3))
+    assert F.f_score(a, None, b + 100, None, threshold=0.1).tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_the_best_matching_is_that_of_all_permutations():
+    a, b = torch.rand(6, 3, generator=seeded(1)), torch.rand(6, 3, generator=seeded(2))
+    costs = torch.cdist(a.double(), b.double())
+    for squared in (False, True):
+        cost = costs.square() if squared else costs
+        best = min(float(cost[range(6), order].mean()) for order in itertools.permutations(range(6)))
+        leaf = a.clone().requires_grad_()
+        found = F.earth_movers_distance(leaf, None, b, None, squared=squared)
+        assert found.item() == pytest.approx(best, rel=1e-6)
+        found.sum().backward()
+        assert float(leaf.grad.norm()) > 0
+    with pytest.raises(ConfigError, match="clouds 0 have 6 and 5 points; sample both"):
+        F.earth_movers_distance(a, None, b[:5], None)

@@ -85,6 +85,18 @@ def two_clouds(count: int, seed: int) -> dict[str, Tensor]:
     return {"points_a": points(count, seed), "points_b": points(count // 2 + 1, seed + 50)}
 
 
+def two_equal_clouds(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points_a": points(count, seed), "points_b": points(count, seed + 50)}
+
+
+def two_clouds_with_normals(count: int, seed: int) -> dict[str, Tensor]:
+    clouds = two_clouds(count, seed)
+    for side in "ab":
+        normals = torch.randn(len(clouds[f"points_{side}"]), 3, generator=seeded(seed + 9))
+        clouds[f"normals_{side}"] = torch.nn.functional.normalize(normals, dim=1)
+    return clouds
+
+
 INTRINSICS = torch.tensor([[[30.0, 0.1, 8.2], [0.0, 31.0, 6.1], [0.0, 0.0, 1.0]]], dtype=torch.float64)
 LENS = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=torch.float64)
 
@@ -167,6 +179,10 @@ EXAMPLES = [
     Example("ball_query", with_queries, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
     Example("box_mask", one_cloud, ("row",), {"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}),
     Example("chamfer_distance", two_clouds, ("cloud",)),
+    Example("chamfer_distance", two_clouds_with_normals, ("cloud",), {"norm": "l1", "squared": False}),
+    Example("earth_movers_distance", two_equal_clouds, ("cloud",)),
+    Example("f_score", two_clouds, ("cloud",), {"threshold": 0.02}),
+    Example("hausdorff_distance", two_clouds, ("cloud",)),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),

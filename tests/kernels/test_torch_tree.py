@@ -76,11 +76,14 @@ def test_a_gradient_comes_through_the_tree():
     assert bool((found[0] != 0).any())
 
 
+_SEARCHES = ("neighborhood_covariance", "radius_neighbors")
+
+
 def test_the_tree_serves_every_search():
     assert why_unavailable("torch_tree") is None
     served = {name for name, operation in OPERATIONS.items() if operation.serves("torch_tree")}
     searches = {"knn", "ball_query", "chamfer_distance", "statistical_outlier_mask", "radius_outlier_mask"}
-    assert served == searches | {"dbscan", "estimate_normals", "neighborhood_covariance", "radius_neighbors"}
+    assert served == searches | {"dbscan", "estimate_normals", "f_score", "hausdorff_distance", *_SEARCHES}
 
 
 def test_looking_at_every_pair_takes_memory_for_a_bounded_number_of_them(monkeypatch):

@@ -13,7 +13,7 @@ from torch import Tensor
 # The operations must be registered before their kernels.
 import pcdata.functional.clusters
 import pcdata.functional.outliers  # noqa: F401
-from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud
 from pcdata.functional.radius import largest_squared, require_cells
@@ -43,10 +43,39 @@ def nearest_rows(
 
 
 @kernel("chamfer_distance", "cpu")
-def chamfer_distance(*, points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
-    """Run the reference's contract in the core, without gradients."""
-    forth = _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
-    return (forth + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)).float()
+def chamfer_distance(
+    *,
+    points_a: Tensor,
+    ptr_a: Tensor,
+    points_b: Tensor,
+    ptr_b: Tensor,
+    squared: bool,
+    sides: str,
+    norm: str,
+    normals_a: Tensor | None,
+    normals_b: Tensor | None,
+) -> Tensor:
+    """Run the reference's contract in the core, without gradients; it measures distances alone."""
+    if norm != "l2" or normals_a is not None or normals_b is not None:
+        found: Tensor = OPERATIONS["chamfer_distance"].reference(
+            points_a,
+            ptr_a,
+            points_b,
+            ptr_b,
+            squared=squared,
+            sides=sides,
+            norm=norm,
+            normals_a=normals_a,
+            normals_b=normals_b,
+            backend="cpu",
+        )
+        return found
+    total = torch.zeros(len(ptr_a) - 1, dtype=torch.float64, device="cpu")
+    if sides != "b_to_a":
+        total = total + _mean_to_nearest(points_a, ptr_a, points_b, ptr_b, squared)
+    if sides != "a_to_b":
+        total = total + _mean_to_nearest(points_b, ptr_b, points_a, ptr_a, squared)
+    return total.float()
 
 
 @kernel("statistical_outlier_mask", "cpu")

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(w
 # Compared in ways of their own: a direction may be free, a fit may add in another order.
 OWN_CHECKS = {"estimate_normals", "ransac_plane"}
 # Sums of what knn and ball_query find, in torch.
-OWN_CHECKS |= {"neighborhood_covariance"}
+OWN_CHECKS |= {"f_score", "hausdorff_distance", "neighborhood_covariance"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
 
 
