@@ -6,7 +6,7 @@ covariances of neighbors. None flow through decisions (indices, masks, labels, p
 neighbors), nor through estimated normals, ``register_depth``, ``spatial_filter`` and TSDF volumes.
 """
 
-from pcdata.functional.clusters import dbscan
+from pcdata.functional.clusters import core_point_mask, dbscan
 from pcdata.functional.depth.average import DepthAverage, average_depth
 from pcdata.functional.depth.deproject import deproject_depth, pixel_rays, project_points, range_to_depth
 from pcdata.functional.depth.depth_to_color import RegisteredDepth, register_depth
@@ -59,6 +59,7 @@ __all__ = [
     "box_mask",
     "chamfer_distance",
     "convex_hull",
+    "core_point_mask",
     "dbscan",
     "decimate_depth",
     "deproject_depth",

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pcdata import functional as F
 from pcdata.errors import ConfigError
 from pcdata.functional.clusters import dbscan
 
@@ -133,3 +134,37 @@ def test_labels_equal_open3d_on_a_real_frame_border_points_too(frame_points: tor
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(frame_points.double().numpy()))
     expected = torch.from_numpy(np.asarray(cloud.cluster_dbscan(eps, min_points))).long()
     assert torch.equal(dbscan(frame_points, eps=eps, min_points=min_points), expected)
+
+
+def heaps(seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    centers = torch.rand(5, 3, generator=generator)
+    return centers.repeat(24, 1) + 0.05 * torch.randn(120, 3, generator=generator)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_weight_counts_as_so_many_points_in_one_place(seed):
+    points, times = heaps(seed), torch.randint(0, 4, (120,), generator=torch.Generator().manual_seed(seed))
+    times = times.clamp(min=1)
+    repeated = points.repeat_interleave(times, 0)
+    first = times.cumsum(0) - times
+    for min_points in (4, 9):
+        options = {"eps": 0.06, "min_points": min_points}
+        weighted = F.dbscan(points, weights=times.float(), **options)
+        assert torch.equal(weighted, F.dbscan(repeated, **options)[first])
+        core = F.core_point_mask(points, weights=times.float(), **options)
+        assert torch.equal(core, F.core_point_mask(repeated, **options)[first])
+        assert torch.equal(F.dbscan(points, weights=torch.ones(120), **options), F.dbscan(points, **options))
+
+
+def test_core_points_have_enough_neighbors_and_every_cloud_its_own_eps():
+    points, ptr, eps = torch.cat([heaps(1), heaps(2)]), torch.tensor([0, 120, 240]), [0.04, 0.08]
+    core = F.core_point_mask(points, ptr, eps=eps, min_points=6)
+    labels = F.dbscan(points, ptr, eps=eps, min_points=6)
+    for b, part in enumerate((slice(0, 120), slice(120, 240))):
+        near = torch.cdist(points[part].double(), points[part].double()) < eps[b]
+        assert torch.equal(core[part], near.sum(1) >= 6)
+        assert torch.equal(labels[part], F.dbscan(points[part], eps=eps[b], min_points=6))
+    assert bool((labels[core] >= 0).all())
+    assert bool(core.any())
+    assert not bool(core.all())

@@ -22,6 +22,7 @@ from pcdata.rng import seeded
 # documented to give none.
 WITHOUT = {
     "box_mask",
+    "core_point_mask",
     "dbscan",
     "duplicate_mask",
     "estimate_normals",

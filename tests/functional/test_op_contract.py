@@ -73,6 +73,10 @@ def with_seeds(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "seeds": torch.tensor([seed + 7])}
 
 
+def with_weights(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "weights": torch.rand(count, generator=seeded(seed)) * 2}
+
+
 def with_labels(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "labels": torch.randint(-1, 3, (count,), generator=seeded(seed))}
 
@@ -183,6 +187,8 @@ EXAMPLES = [
     Example("earth_movers_distance", two_equal_clouds, ("cloud",)),
     Example("f_score", two_clouds, ("cloud",), {"threshold": 0.02}),
     Example("hausdorff_distance", two_clouds, ("cloud",)),
+    Example("core_point_mask", with_weights, ("row",), {"eps": 0.03, "min_points": 4}),
+    Example("dbscan", with_weights, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("decimate_depth", depth_alone, ("row", "row"), {"factor": 3}),
     Example("deproject_depth", depth_image, ("row", "ptr", "row")),

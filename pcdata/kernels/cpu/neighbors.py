@@ -178,8 +178,8 @@ def radius_outlier_mask(
     return outlier
 
 
-@kernel("dbscan", "cpu")
-def dbscan(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
+@kernel("density_clusters", "cpu")
+def density_clusters(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
     """Join cells that hold core points, then number the clusters and label their borders."""
     label = room(len(points), torch.int64)
     largest = room(1, torch.float64)

@@ -25,8 +25,8 @@ _PAIRS_PER_CHUNK = 1 << 15
 _ROWS_PER_CHUNK = 1 << 18
 
 
-@kernel("dbscan", "torch_tree")
-def dbscan(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
+@kernel("density_clusters", "torch_tree")
+def density_clusters(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
     """Find the core points, join the cells that hold them, number the clusters and label their borders."""
     core = _core_mask(points, ptr, eps, min_points)
     label = torch.full_like(core, -1, dtype=torch.int64)

@@ -228,6 +228,7 @@ def fuzz_neighborhoods(rng: np.random.Generator, points: Tensor, ptr: Tensor, gr
     check("statistical_outlier_mask", seen, ptr, num_neighbors=k, std_ratio=float(rng.choice([0.5, 2.0])), grid=grid)
     check("radius_outlier_mask", seen, ptr, min_neighbors=int(rng.integers(1, 20)), radius=radius, grid=grid)
     check_normals(seen, ptr, radius=radius, max_neighbors=k, grid=grid)
+    check("core_point_mask", seen, ptr, eps=radius, min_points=int(rng.integers(1, 12)))
     check("dbscan", seen, ptr, eps=radius, min_points=int(rng.integers(1, 12)))
 
 
