@@ -17,7 +17,7 @@ from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.metrics import chamfer_distance, earth_movers_distance, f_score, hausdorff_distance
+from pcdata.functional.metrics import chamfer_distance, f_score, hausdorff_distance
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
@@ -69,7 +69,6 @@ __all__ = [
     "disparity_to_depth",
     "distort_normalized",
     "duplicate_mask",
-    "earth_movers_distance",
     "estimate_normals",
     "f_score",
     "farthest_point_groups",

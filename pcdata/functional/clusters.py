@@ -24,7 +24,7 @@ from pcdata.functional.rows import cloud_of_rows, ptr_after_mask, ptr_from_count
 def checked_eps(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one length for every cloud, or one per cloud (B,); bodies get (B,) float64."""
     value: Any = arguments[name]
-    if isinstance(value, str) or not isinstance(value, (Tensor, Sequence)):
+    if not isinstance(value, (Tensor, list, tuple)):
         require_length(where, name, value)
     lengths = checked_lengths(where, name, arguments)
     for extreme in (lengths.min().item(), lengths.max().item()):

@@ -1,4 +1,4 @@
-"""How far two clouds are apart: Chamfer and Hausdorff distance, F-score, earth mover's distance."""
+"""How far two clouds are apart: Chamfer and Hausdorff distance, F-score."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import inner, op
+from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_length, checked_word
-from pcdata.errors import ConfigError, ShapeError
+from pcdata.errors import ShapeError
 from pcdata.functional.nearest import squared_distance
 from pcdata.functional.neighbors import nearest_rows
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, segment_max
@@ -159,64 +159,6 @@ def f_score(
     return torch.stack([score, precision, recall], dim=1).float()
 
 
-@inner
-def best_matches(points_a: Tensor, ptr_a: Tensor, points_b: Tensor, ptr_b: Tensor, squared: bool) -> Tensor:
-    """Return (N,) int64: the row of b that each row of a is matched to, by SciPy, cloud by cloud on the CPU."""
-    from scipy.optimize import linear_sum_assignment  # imported late: only this operation needs it
-
-    matches = []
-    a, b = points_a.detach().cpu().double(), points_b.detach().cpu().double()
-    bounds = zip(ptr_a.tolist(), ptr_a.tolist()[1:], ptr_b.tolist(), ptr_b.tolist()[1:])
-    for start, stop, first, last in bounds:
-        cost = torch.cdist(a[start:stop], b[first:last], compute_mode="donot_use_mm_for_euclid_dist")
-        _, chosen = linear_sum_assignment((cost * cost if squared else cost).numpy())
-        matches.append(first + torch.from_numpy(chosen))
-    return torch.cat(matches).to(points_a.device)
-
-
-@op(points_a="N 3", ptr_a="ptr N B >= 1", points_b="M 3", ptr_b="ptr M B >= 1")
-def earth_movers_distance(
-    points_a: Tensor,  # (N, 3) float32
-    ptr_a: Tensor | None,  # (B+1,); None = one cloud
-    points_b: Tensor,  # (M, 3) float32
-    ptr_b: Tensor | None,  # (B+1,); None = one cloud
-    *,
-    squared: bool = False,
-    backend: str = "auto",
-) -> Tensor:  # (B,) float32
-    """Return the mean distance between the points of two clouds in the best one-to-one matching.
-
-    Exact (SciPy's ``linear_sum_assignment``), on the CPU, time cubic in the number of points: 1,000 points take about
-    0.1 s, 10,000 minutes and 800 MB. Cloud b of both must have as many points. The result carries gradients to both
-    clouds for the matching as it is.
-
-    Args:
-        points_a: one of the clouds.
-        ptr_a: row pointers.
-        points_b: the other.
-        ptr_b: row pointers.
-        squared: match, and average, squared distances.
-        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
-
-    Raises:
-        TooFewPointsError: a cloud is empty; the message names it.
-        ConfigError: two clouds of different numbers of points.
-        ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
-
-    Source: Rubner et al., The earth mover's distance as a metric for image retrieval, IJCV 40(2), 2000.
-    """
-    assert ptr_a is not None  # @op fills both
-    assert ptr_b is not None
-    for cloud, (one, other) in enumerate(zip(counts_from_ptr(ptr_a).tolist(), counts_from_ptr(ptr_b).tolist())):
-        if one != other:
-            raise ConfigError(
-                f"earth_movers_distance: clouds {cloud} have {one} and {other} points; sample both to the same number"
-            )
-    matched = points_b[best_matches(points_a, ptr_a, points_b, ptr_b, squared)]
-    distance = squared_distance(points_a, matched)
-    return mean_per_cloud(distance if squared else _root(distance), ptr_a).float()
-
-
 def _to_nearest(
     queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool, norm: str, backend: str
 ) -> tuple[Tensor, Tensor]:
@@ -228,10 +170,11 @@ def _to_nearest(
         distance = (x + y) + z
         return nearest, distance * distance if squared else distance
     distance = squared_distance(queries, points[nearest])
-    return nearest, distance if squared else _root(distance)
+    return nearest, distance if squared else root(distance)
 
 
-def _root(squared: Tensor) -> Tensor:
+def root(squared: Tensor) -> Tensor:
+    """Return square roots with a gradient that is 0 at 0."""
     apart = squared > 0
     return torch.where(apart, torch.where(apart, squared, 1.0).sqrt(), 0.0)
 

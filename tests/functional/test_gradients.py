@@ -50,7 +50,6 @@ WITH = {
     "chamfer_distance",
     "decimate_depth",
     "deproject_depth",
-    "earth_movers_distance",
     "fill_holes",
     "hausdorff_distance",
     "knn",

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 import torch
 from scipy.spatial.distance import directed_hausdorff
 from torch import Tensor
 
 from pcdata import functional as F
-from pcdata.errors import ConfigError, TooFewPointsError
+from pcdata.errors import TooFewPointsError
 from pcdata.functional.metrics import chamfer_distance
 from pcdata.rng import seeded
 
@@ -132,18 +130,3 @@ def test_f_scores_count_what_is_near():
     assert recall == pytest.approx(2 / 3)
     assert score == pytest.approx(2 * 0.5 * (2 / 3) / (0.5 + 2 / 3))
     assert F.f_score(a, None, b + 100, None, threshold=0.1).tolist() == [[0.0, 0.0, 0.0]]
-
-
-def test_the_best_matching_is_that_of_all_permutations():
-    a, b = torch.rand(6, 3, generator=seeded(1)), torch.rand(6, 3, generator=seeded(2))
-    costs = torch.cdist(a.double(), b.double())
-    for squared in (False, True):
-        cost = costs.square() if squared else costs
-        best = min(float(cost[range(6), order].mean()) for order in itertools.permutations(range(6)))
-        leaf = a.clone().requires_grad_()
-        found = F.earth_movers_distance(leaf, None, b, None, squared=squared)
-        assert found.item() == pytest.approx(best, rel=1e-6)
-        found.sum().backward()
-        assert float(leaf.grad.norm()) > 0
-    with pytest.raises(ConfigError, match="clouds 0 have 6 and 5 points; sample both"):
-        F.earth_movers_distance(a, None, b[:5], None)

@@ -89,10 +89,6 @@ def two_clouds(count: int, seed: int) -> dict[str, Tensor]:
     return {"points_a": points(count, seed), "points_b": points(count // 2 + 1, seed + 50)}
 
 
-def two_equal_clouds(count: int, seed: int) -> dict[str, Tensor]:
-    return {"points_a": points(count, seed), "points_b": points(count, seed + 50)}
-
-
 def two_clouds_with_normals(count: int, seed: int) -> dict[str, Tensor]:
     clouds = two_clouds(count, seed)
     for side in "ab":
@@ -184,7 +180,6 @@ EXAMPLES = [
     Example("box_mask", one_cloud, ("row",), {"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}),
     Example("chamfer_distance", two_clouds, ("cloud",)),
     Example("chamfer_distance", two_clouds_with_normals, ("cloud",), {"norm": "l1", "squared": False}),
-    Example("earth_movers_distance", two_equal_clouds, ("cloud",)),
     Example("f_score", two_clouds, ("cloud",), {"threshold": 0.02}),
     Example("hausdorff_distance", two_clouds, ("cloud",)),
     Example("core_point_mask", with_weights, ("row",), {"eps": 0.03, "min_points": 4}),
