@@ -5,9 +5,9 @@ import itertools
 import pytest
 import torch
 
-from pcdata.alignment.earth_movers import earth_movers_distance
 from pcdata.errors import ConfigError, TooFewPointsError
 from pcdata.rng import seeded
+from pcdata.validation.measures.earth_movers import earth_movers_distance
 
 
 def test_the_best_matching_is_that_of_all_permutations():

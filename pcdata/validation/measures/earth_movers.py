@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -65,7 +67,7 @@ def _best_matches(points_a: Tensor, ptr: Tensor, points_b: Tensor, *, squared: b
     matches = []
     a, b = points_a.detach().cpu().double(), points_b.detach().cpu().double()
     bounds = ptr.tolist()
-    for start, stop in zip(bounds, bounds[1:]):
+    for start, stop in pairwise(bounds):
         cost = torch.cdist(a[start:stop], b[start:stop], compute_mode="donot_use_mm_for_euclid_dist")
         _, chosen = linear_sum_assignment((cost * cost if squared else cost).numpy())
         matches.append(start + torch.from_numpy(chosen))
