@@ -33,7 +33,7 @@ EXTRAS = {
     for extra in (
         _Extra("matplotlib", "viz", "pictures (pcdata demo, pcdata.report)"),
         _Extra("cv2", "calib", "calibration boards and InpaintDepth"),
-        _Extra("small_gicp", "calib", "refining camera poses from clouds"),
+        _Extra("small_gicp", "calib", "refining camera poses, and aligning clouds by GICP"),
         _Extra("numcodecs", "zarr", "zarr chunks packed with Blosc, Zstandard or LZ4"),
         _Extra("OpenEXR", "exr", "depth in OpenEXR files (.exr)"),
         _Extra("av", "av", "recordings of an Azure Kinect (.mkv) and videos of LeRobot datasets"),
@@ -42,7 +42,7 @@ EXTRAS = {
         _Extra("s3fs", "remote", "datasets at s3://"),
         _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
-        _Extra("open3d", "open3d", "viewing and comparing with Open3D"),
+        _Extra("open3d", "open3d", "global alignment, viewing and comparing with Open3D"),
         _Extra(
             "torch_cluster",
             "cluster",

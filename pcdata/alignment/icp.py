@@ -20,7 +20,7 @@ from pcdata.geometry import rigid
 from pcdata.geometry.robust import KERNELS
 from pcdata.geometry.small_motions import motion_along
 
-_ANY_ANGLE = 2.0  # radians: beyond a quarter turn, so every pair of normals without sign agrees
+ANY_ANGLE = 2.0  # radians: beyond a quarter turn, so every pair of normals without sign agrees
 _SMALL = 1e-6  # radians and units
 _ENOUGH = 1e-3  # of a distance: finer ones follow
 _MAX_SEARCHES = 4  # after the first; better poses than these find are out of reach
@@ -37,7 +37,7 @@ _MOST_OPEN = 3  # directions: a plane's, a sphere's
 
 
 @dataclass(frozen=True, eq=False)
-class _Alignment:
+class Alignment:
     """Where a source cloud lies in a target's frame, and how far that can be trusted."""
 
     target_from_source: Tensor  # (4, 4) float64 rigid
@@ -68,7 +68,7 @@ def icp_point_to_plane(
     max_normal_angle: float = 0.6,
     normal_radius: float | None = None,
     max_iterations: int = 30,
-) -> _Alignment:
+) -> Alignment:
     """Find the rigid motion that brings one cloud onto the surface of another, and say whether it can be trusted.
 
     Each round pairs every source point with its nearest target point (closer than the scale's distance, normals within
@@ -123,12 +123,12 @@ def icp_point_to_plane(
         if len(cloud) < MIN_MATCHES:
             raise TooFewPointsError(f"{where}: {name} has {len(cloud)} points; at least {MIN_MATCHES} must overlap")
     if target_normals is None:
-        target_normals = _normals_of(where, "target", target, normal_radius)
+        target_normals = normals_of(where, "target", target, normal_radius)
     if source_normals is None:
-        source_normals = _normals_of(where, "source", source, normal_radius)
+        source_normals = normals_of(where, "source", source, normal_radius)
     pair = CloudPair(source, source_normals, target, target_normals, kernel, scale, max_normal_angle)
     distances = pair.distances_for(pose) if max_distances is None else tuple(max_distances)
-    found = pair.match(pose, distances[0], _ANY_ANGLE if len(distances) > 1 else max_normal_angle)
+    found = pair.match(pose, distances[0], ANY_ANGLE if len(distances) > 1 else max_normal_angle)
     if len(found.residual) < MIN_MATCHES:
         raise TooFewPointsError(
             f"{where}: only {len(found.residual)} of {len(source)} source points have a target point within "
@@ -138,7 +138,7 @@ def icp_point_to_plane(
 
     def search(start: Tensor, distances: Sequence[float], num_open: int | None = None) -> Descent:
         def measure(motions: Tensor, distance: float) -> Step | None:
-            angle = _ANY_ANGLE if distance == distances[0] and len(distances) > 1 else max_normal_angle
+            angle = ANY_ANGLE if distance == distances[0] and len(distances) > 1 else max_normal_angle
             enough = _SMALL if distance == distances[-1] else _ENOUGH * distance
             return pair.step(motions[0] @ start, distance, angle, pivot, num_open, enough)
 
@@ -168,7 +168,7 @@ def icp_point_to_plane(
         # Over so long a way a surface that is flat here may bend: then the found pose stays. Fewer partners are none.
         if not held.lost and pair.gain(held.motions[0], best.motions[0], finest, per_partner=True) > -_BEND:
             best = held
-    return _judged(pair, best, pivot, finest, iterations, num_open, still_better=gain > _BETTER)
+    return judged(pair, best, pivot, finest, iterations, num_open, still_better=gain > _BETTER)
 
 
 def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tensor, pivot: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ def _nearest_along(directions: Tensor, pose: Tensor, start: Tensor, source: Tens
     return pose
 
 
-def _judged(
+def judged(
     pair: CloudPair,
     descent: Descent,
     pivot: Tensor,
@@ -193,7 +193,7 @@ def _judged(
     num_open: int,
     *,
     still_better: bool,
-) -> _Alignment:
+) -> Alignment:
     """Measure the result at its pose and say why it could not be trusted."""
     pose = descent.motions[0]
     found = pair.match(pose, distance)
@@ -224,7 +224,7 @@ def _judged(
         reason = f"searching again from the result kept finding better poses, {_MAX_SEARCHES} times"
     elif not descent.settled:
         reason = f"steps had not become small after {descent.iterations} rounds; allow more iterations"
-    return _Alignment(
+    return Alignment(
         target_from_source=pose,
         rmse=rmse,
         overlap=len(found.residual) / len(pair.source),
@@ -238,7 +238,7 @@ def _judged(
     )
 
 
-def _normals_of(where: str, name: str, points: Tensor, radius: float | None) -> Tensor:
+def normals_of(where: str, name: str, points: Tensor, radius: float | None) -> Tensor:
     """Estimate normals from neighborhoods that hold enough points; without neighbors all would be (0, 0, 1)."""
     distance = knn(points, k=3, queries=points)[1]  # to itself, the nearest, the next
     if radius is None:

@@ -2,8 +2,9 @@
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
 decimated, resized, undistorted and filled depth, undistorted images, disparity, distances between clouds, distances and
-covariances of neighbors. None flow through decisions (indices, masks, labels, planes, sizes, which points are
-neighbors), nor through estimated normals, ``register_depth``, ``spatial_filter`` and TSDF volumes.
+covariances of neighbors, the motion between paired points. None flow through decisions (indices, masks, labels, planes,
+sizes, which points are neighbors), nor through estimated normals, ``register_depth``, rendering, ``spatial_filter`` and
+TSDF volumes.
 """
 
 from pcdata.functional.clusters import core_point_mask, dbscan
@@ -22,6 +23,7 @@ from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covaria
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
+from pcdata.functional.paired_points import PairedMotion, fit_paired_points
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.rendering import (
     RenderedPoints,
@@ -50,6 +52,7 @@ __all__ = [
     "SHAPE_FEATURES",
     "DepthAverage",
     "ImageGrid",
+    "PairedMotion",
     "RegisteredDepth",
     "RenderedPoints",
     "RenderedTriangles",
@@ -76,6 +79,7 @@ __all__ = [
     "fill_holes",
     "fill_rows",
     "find_voxel_size",
+    "fit_paired_points",
     "flying_pixel_mask",
     "hausdorff_distance",
     "knn",

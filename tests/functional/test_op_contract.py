@@ -139,6 +139,12 @@ def depth_alone(count: int, seed: int) -> dict[str, Tensor]:
     return {"depth": depth_image(count, seed)["depth"]}
 
 
+def in_pairs(count: int, seed: int) -> dict[str, Tensor]:
+    cloud = points(count, seed)
+    targets = cloud[:, [1, 2, 0]] + 0.01 * torch.rand(count, 3, generator=seeded(seed + 7))
+    return {"points": cloud, "targets": targets, "weights": torch.rand(count, generator=seeded(seed + 9))}
+
+
 def ranges_alone(count: int, seed: int) -> dict[str, Tensor]:
     return {"ranges": depth_image(count, seed)["depth"]}
 
@@ -200,6 +206,7 @@ EXAMPLES = [
     Example("farthest_point_groups", with_seeds, ("index", "ptr", "group", "row"), {"ratio": 0.3}),
     Example("fill_holes", depth_alone, ("row", "row"), {"rule": "nearest"}),
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
+    Example("fit_paired_points", in_pairs, ("cloud",) * 3, {"with_scale": True}),
     Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
