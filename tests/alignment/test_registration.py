@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pcdata.alignment import align_clouds
+from pcdata.alignment import align_clouds, registration
 from pcdata.errors import ConfigError, TooFewPointsError
 from pcdata.geometry import rigid
 from tests.alignment.test_icp import apart, corner, moved, small_motion
@@ -101,3 +101,20 @@ def test_what_cannot_be_aligned_is_refused():
         align_clouds(cloud, cloud, search="global", initial=torch.eye(4))
     with pytest.raises(TooFewPointsError, match="source has 5 points"):
         align_clouds(cloud[:5], cloud)
+
+
+def test_global_searches_that_end_elsewhere_as_well_or_meet_little_are_not_trusted(monkeypatch):
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    starts = [torch.eye(4, dtype=torch.float64), turned]
+    monkeypatch.setattr(registration, "_global_poses", lambda source, target: (starts, 0.02))
+    ball = torch.nn.functional.normalize(torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)), dim=1) * 0.1
+    found = align_clouds(ball[::2].clone(), ball[1::2].clone(), search="global")
+    assert not found.is_trusted
+    assert "the shape fits in several ways" in found.reason
+    monkeypatch.setattr(registration, "_global_poses", lambda source, target: (starts[:1], 0.02))
+    source, target = corner(2000, 1), corner(2000, 0)
+    found = align_clouds(source, target[target[:, 0] > 0.25], search="global")
+    assert not found.is_trusted
+    assert "of the source has a partner" in found.reason
+    assert align_clouds(source, target, search="global").is_trusted
