@@ -78,6 +78,7 @@ def test_point_to_point_ends_where_small_gicp_does():
     assert angle < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.open3d
 def test_any_motion_is_found_by_a_global_search():
     pytest.importorskip("open3d")
