@@ -87,8 +87,8 @@ def align_clouds(
         method: ``point_to_plane``: :func:`icp_point_to_plane`, without another library. ``gicp`` and
             ``point_to_point`` run in small_gicp.
         search: ``local`` starts at the initial pose and finds what lies within the basin. ``global`` needs no start:
-            descriptors (FPFH) are matched and a pose drawn that most agree with (RANSAC), by Open3D; the method refines
-            it.
+            descriptors (FPFH) are matched and a pose drawn that most agree with (RANSAC), by Open3D, whose own random
+            generator this seeds; the method refines it.
         initial: where a local search starts.
         max_distance: largest distance of partners at first, in the points' unit: the basin. None = by the clouds.
 
@@ -215,8 +215,10 @@ def _global_poses(source: Tensor, target: Tensor) -> tuple[list[Tensor], float]:
         clouds.append(cloud)
         features.append(registration.compute_fpfh_feature(cloud, wide))
     reach, poses = _PAIR_VOXELS * voxel, []
+    # Open3D has one generator of its own and takes no other: without its seed the same clouds would get other poses.
+    generator = open3d.utility.random
     for seed in _SEEDS:
-        open3d.utility.random.seed(seed)
+        generator.seed(seed)
         result = registration.registration_ransac_based_on_feature_matching(
             *clouds,
             *features,
