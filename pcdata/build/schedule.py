@@ -57,8 +57,8 @@ class Schedule:
             self._give_up(task.shard, task.sample_id, error)
         self._again(task.shard, task.is_alone)
 
-    def ended(self, task: Task, sample_id: str | None, what: str, *, was_killed: bool) -> None:
-        """Note that a process ended, or was ended, in the middle of a task.
+    def ended(self, task: Task, sample_id: str | None, what: str, *, was_killed: bool) -> bool:
+        """Note that a process ended, or was ended, in the middle of a task; say whether the capture is given up.
 
         Args:
             task: what it did.
@@ -81,9 +81,11 @@ class Schedule:
         elif task.sample_id is not None or (task.shard, sample_id) in self._strikes:
             self._give_up(task.shard, sample_id, what)
             self._again(task.shard, alone)
+            return True
         else:
             self._strikes[task.shard, sample_id] = what
             (self._alone if alone else self._waiting).append(Task(task.shard, {}, sample_id, alone))
+        return False
 
     def _give_up(self, shard: int, sample_id: str, error: str) -> None:
         self._given_up.setdefault(shard, {})[sample_id] = error

@@ -135,6 +135,13 @@ def test_the_first_eight_failing_stop_the_build_with_the_type_of_their_error(tmp
     assert [path.name for path in tmp_path.iterdir()] == ["times"]
 
 
+def test_the_first_eight_that_end_their_process_stop_the_build(tmp_path, moody):
+    source = moody(**{f"c{n}": ["exit"] for n in range(10)})
+    with pytest.raises(CaptureError, match=r"all of the first 8 captures failed.* exit code 7"):
+        build_dataset(config_from_yaml(CONFIG.replace("3}", "10}")), source, tmp_path / "out", workers=1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_seven_that_fail_first_do_not_stop_it(tmp_path, moody):
     source = moody(**{f"c{n}": [FrameError("camera")] for n in range(7)})
     report = build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out")

@@ -84,7 +84,8 @@ def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: 
     except ray.exceptions.RayError as error:
         sample_id, what = _marked(job, task.shard)
         reason = what or f"ProcessEnded: {type(error).__name__} of Ray"
-        schedule.ended(task, sample_id, reason, was_killed=not what)
+        if schedule.ended(task, sample_id, reason, was_killed=not what) and sample_id is not None:
+            tally.captured(task.shard, sample_id, reason)
         return
     if kind == "tried":
         schedule.tried(task, *told)

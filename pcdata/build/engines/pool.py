@@ -65,7 +65,7 @@ def work_in_pool(job: Job, shards: Iterable[int], tally: Tally, *, workers: int,
                 elif timeout is not None and worker.sample_id is not None and time.monotonic() - worker.since > timeout:
                     worker.end()
                     what = f"TimeoutError: took longer than {timeout:g} s"
-                    schedule.ended(worker.taken(), worker.sample_id, what, was_killed=False)
+                    _end(worker, schedule, tally, what, was_killed=False)
             pool[:] = [worker for worker in pool if worker.is_alive]
         for worker in pool:
             worker.dismiss()
@@ -114,7 +114,7 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
     try:
         kind, *told = worker.pipe.recv()
     except (EOFError, OSError):
-        _bury(worker, schedule)
+        _bury(worker, schedule, tally)
         return
     worker.since = time.monotonic()
     if kind == "started":
@@ -136,7 +136,7 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
         raise stopped(*told)
 
 
-def _bury(worker: _Worker, schedule: Schedule) -> None:
+def _bury(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
     worker.end()
     code = worker.process.exitcode or 0
     if not worker.is_ready and code >= 0:
@@ -145,7 +145,14 @@ def _bury(worker: _Worker, schedule: Schedule) -> None:
             'needs `if __name__ == "__main__":` around its call, since workers import it; workers=0 starts none'
         )
     what = _signal_name(-code) if code < 0 else f"exit code {code}"
-    schedule.ended(worker.taken(), worker.sample_id, f"ProcessEnded: its process ended by {what}", was_killed=code < 0)
+    _end(worker, schedule, tally, f"ProcessEnded: its process ended by {what}", was_killed=code < 0)
+
+
+def _end(worker: _Worker, schedule: Schedule, tally: Tally, what: str, *, was_killed: bool) -> None:
+    """Note what became of the task of a worker that has ended."""
+    task, sample_id = worker.taken(), worker.sample_id
+    if schedule.ended(task, sample_id, what, was_killed=was_killed) and sample_id is not None:
+        tally.captured(task.shard, sample_id, what)  # so that a build of which all fail ends soon
 
 
 def _signal_name(number: int) -> str:
