@@ -56,8 +56,8 @@ def page() -> str:
         "# Operations on clouds, and what others call them",
         "",
         "Made by `tests/functional/test_peers.py` from the registered operations; all are called as "
-        "`pcdata.functional.NAME` and take ragged batches (`polygon_mask`: each point by itself). Compiled bodies know three "
-        "coordinates and Open3D's voxel grid; all else runs in torch.",
+        "`pcdata.functional.NAME` and take ragged batches (`polygon_mask`: each point by itself). Compiled "
+        "bodies know three coordinates and Open3D's voxel grid; all else runs in torch.",
         "",
         "| operation | gradients | compiled | held to an oracle in | others call it |",
         "|---|---|---|---|---|",
