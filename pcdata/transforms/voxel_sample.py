@@ -64,7 +64,11 @@ class _OnePerVoxel(SelectTransform, abstract=True):
 
 
 class VoxelSample(_OnePerVoxel):
-    """Keep one point of every occupied voxel of a stated grid, as it is: the first, or the nearest to the center."""
+    """Keep one point of every occupied voxel of a stated grid, as it is.
+
+    Args:
+        keep: which one: the first of the rows, or the nearest to the center of the voxel.
+    """
 
     keep: Literal["first", "nearest"] = "first"
 

@@ -24,6 +24,7 @@ WITHOUT = {
     "box_mask",
     "core_point_mask",
     "dbscan",
+    "depth_normals",
     "duplicate_mask",
     "estimate_normals",
     "f_score",
@@ -35,6 +36,9 @@ WITHOUT = {
     "radius_outlier_mask",
     "ransac_plane",
     "register_depth",
+    "render_points",
+    "render_ranges",
+    "render_triangles",
     "spatial_filter",
     "statistical_outlier_mask",
     # steps of fusion
@@ -50,13 +54,17 @@ WITH = {
     "chamfer_distance",
     "decimate_depth",
     "deproject_depth",
+    "deproject_ranges",
     "fill_holes",
+    "fit_paired_points",  # tests/functional/test_paired_points.py
     "hausdorff_distance",
     "knn",
     "neighborhood_covariance",
     "project_points",
     "radius_neighbors",
     "resize_depth",
+    "undistort_depth",
+    "undistort_image",  # tests/functional/depth/test_undistortion.py
     "voxel_downsample",
 }
 LENS = torch.tensor([[0.18, -0.02, 0.001, -0.002, 0.0]], dtype=torch.float64)
@@ -100,6 +108,9 @@ def test_every_operation_is_on_one_of_the_two_lists():
         (lambda d: resize_depth(d, size=(9, 11), max_jump=0.5)[0], image()),
         (lambda d: resize_depth(d, size=(9, 11))[0], image()),
         (lambda d: F.fill_holes(d)[0], image()),
+        (lambda d: F.undistort_depth(d, INTRINSICS, LENS)[0], image()),
+        (lambda d: F.undistort_depth(d, INTRINSICS, LENS, rule="surface")[0], image()),
+        (lambda d: F.deproject_ranges(d)[0], image()),
         (lambda d: F.range_to_depth(d, INTRINSICS, LENS), image()),
         (lambda k: F.range_to_depth(image(), k, LENS), INTRINSICS),
         (lambda d: depth_to_disparity(d, INTRINSICS[:, 0, 0], 0.05), image()),
@@ -107,6 +118,7 @@ def test_every_operation_is_on_one_of_the_two_lists():
     ],
     ids=[
         *("deproject depth", "deproject K", "deproject lens", "median", "mean", "resize", "nearest", "fill"),
+        *("undistort", "undistort by surface", "lidar"),
         *("range", "range K", "to disparity", "from disparity"),
     ],
 )  # fmt: skip
