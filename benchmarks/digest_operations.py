@@ -260,11 +260,13 @@ def _into_box(lens: str, *, moved: bool) -> Arguments:
     return _images(lens)[0], {**box, "matrix": matrix}
 
 
+_BYTES = np.concatenate([np.arange(40, dtype=np.uint8), np.arange(100, 140, dtype=np.uint8)])
+
+
 def _blocks() -> Arguments:
-    sources = [np.arange(40, dtype=np.uint8), np.arange(100, 140, dtype=np.uint8)]
-    numbers = [[0, 9, 20], [0, 1, 0], [3, 0, 30], [9, 11, 4]]  # where to, of which, from where, how many
-    begins, which, starts, sizes = (np.array(row, np.int64) for row in numbers)
-    return (torch.zeros(24, dtype=torch.uint8), begins, sources, which, starts, sizes), {}
+    numbers = [[0, 9, 20], [3, 40, 30], [9, 11, 4]]  # where to, from where, how many
+    begins, starts, sizes = (np.array(row, np.int64) for row in numbers)
+    return (torch.zeros(24, dtype=torch.uint8), begins, starts + _BYTES.ctypes.data, sizes), {}
 
 
 def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:

@@ -75,8 +75,19 @@ PointStep = Tensor | tuple[Tensor, float, float | None]
 
 
 @inner
-def move_points(points: Tensor, ptr: Tensor, steps: Sequence[PointStep], *, in_place: bool = False) -> Tensor:
-    """Move (N, 3) float32 points by some steps, rounded to float32 after each; ``in_place`` in their own memory."""
+def move_points(
+    points: Tensor,
+    ptr: Tensor,
+    steps: Sequence[PointStep],
+    kept: tuple[Tensor, Tensor] | None = None,
+    *,
+    in_place: bool = False,
+) -> Tensor:
+    """Move (N, 3) float32 points by some steps, rounded to float32 after each; ``in_place`` in their own memory.
+
+    Args:
+        kept: which are returned: a (N,) bool mask, and the (B+1,) row pointers of those.
+    """
     before = points
     for step in steps:
         if isinstance(step, Tensor):
@@ -85,6 +96,9 @@ def move_points(points: Tensor, ptr: Tensor, steps: Sequence[PointStep], *, in_p
             seeds, sigma, clip = step
             noise = normal_rows(ptr, seeds) * sigma
             points = points + (noise if clip is None else noise.clamp(-clip, clip))
+    if kept is not None:
+        points = points[kept[0]]
+        before = before[: len(points)]
     return before.copy_(points) if in_place else points
 
 

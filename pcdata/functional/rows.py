@@ -8,6 +8,7 @@ taken in row order.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
@@ -59,27 +60,29 @@ def count_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
 
 
 @inner
-def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask."""
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False) -> dict[str, Tensor]:
+    """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask.
+
+    ``in_place`` the rows of a mask are moved to the beginning of their field's own memory, which is the result.
+    """
     index = torch.nonzero(rows).squeeze(1) if rows.dtype is torch.bool else rows
+    if in_place:
+        return {name: field[: len(index)].copy_(field[index]) for name, field in fields.items()}
     return {name: field[index] for name, field in fields.items()}
 
 
 @inner
 def copy_blocks(
     into: Tensor,  # (bytes,) uint8
-    begins: NDArray[np.int64],  # (...) where each block goes
-    sources: Sequence[NDArray[np.uint8]],
-    which: NDArray[np.int64],  # (...) the source of each block
-    starts: NDArray[np.int64],  # (...) where it begins there
+    begins: NDArray[np.int64],  # (...) where each block goes, in bytes; no two overlap
+    addresses: NDArray[np.int64],  # (...) of what is copied: of arrays in memory, or mapped files, that somebody holds
     sizes: NDArray[np.int64],  # (...) bytes
 ) -> None:
-    """Copy blocks of bytes out of arrays in memory, or of mapped files, that hold them; all numbers broadcast."""
+    """Copy blocks of bytes from where they lie in memory."""
     held = into.numpy()
-    for begin, source, start, size in zip(
-        *(one.ravel().tolist() for one in np.broadcast_arrays(begins, which, starts, sizes))
-    ):
-        held[begin : begin + size] = sources[source][start : start + size]
+    for begin, address, size in zip(begins.ravel().tolist(), addresses.ravel().tolist(), sizes.ravel().tolist()):
+        if size:
+            held[begin : begin + size] = (ctypes.c_uint8 * size).from_address(address)
 
 
 @inner

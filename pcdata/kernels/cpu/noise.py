@@ -15,17 +15,36 @@ from pcdata.kernels.cpu.native import call, numbers, room, room_for
 
 
 @kernel("move_points", "cpu")
-def move_points(points: Tensor, ptr: Tensor, steps: Sequence[PointStep], *, in_place: bool = False) -> Tensor:
+def move_points(
+    points: Tensor,
+    ptr: Tensor,
+    steps: Sequence[PointStep],
+    kept: tuple[Tensor, Tensor] | tuple[None, None] | None = None,
+    *,
+    in_place: bool = False,
+) -> Tensor:
     """Take every point through all steps while it is in the cache."""
     fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and len(ptr) > 1 and int(ptr[-1]) == len(points)
     if not fits or not steps or int(ptr[0]) != 0 or (in_place and not points.is_contiguous()):
-        return INNER["move_points"].reference(points, ptr, steps, in_place=in_place)
-    (moved,) = [points] if in_place else room_for((points.shape, points.dtype))
-    _run(points.contiguous(), ptr, steps, moved)
+        return INNER["move_points"].reference(points, ptr, steps, kept, in_place=in_place)
+    if kept is None:
+        kept, count, moved = (None, None), len(points), points
+    else:
+        count = int(kept[1][-1])
+        moved = points[:count]
+    if not in_place:
+        (moved,) = room_for(((count, 3), points.dtype))
+    _run(points.contiguous(), ptr, steps, kept, moved)
     return moved
 
 
-def _run(points: Tensor, ptr: Tensor, steps: Sequence[PointStep], moved: Tensor) -> None:
+def _run(
+    points: Tensor,
+    ptr: Tensor,
+    steps: Sequence[PointStep],
+    kept: tuple[Tensor, Tensor] | tuple[None, None],
+    moved: Tensor,
+) -> None:
     clouds = len(ptr) - 1
     matrices = torch.zeros((len(steps), clouds, 4, 4), dtype=torch.float64, device="cpu")
     seeds = torch.zeros((len(steps), clouds), dtype=torch.int64, device="cpu")
@@ -42,7 +61,7 @@ def _run(points: Tensor, ptr: Tensor, steps: Sequence[PointStep], moved: Tensor)
         *(points, ptr.contiguous(), clouds, len(steps)),
         *(numbers(not isinstance(step, Tensor) for step in steps), matrices, seeds),
         *(torch.tensor(values, dtype=torch.float64, device="cpu") for values in (sigmas, clips)),
-        moved,
+        *(*kept, moved),
     )
 
 

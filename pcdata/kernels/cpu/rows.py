@@ -26,25 +26,31 @@ _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at
 
 
 @kernel("pick_rows", "cpu")
-def pick_rows(fields: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False) -> dict[str, Tensor]:
     """Copy the rows of all fields piece by piece."""
     sources = list(fields.values())
     num_rows = len(sources[0]) if sources and sources[0].ndim else 0
     if num_rows == 0 or rows.ndim != 1 or not _are_plain(sources, num_rows):
-        return _reference("pick_rows", fields, rows)
+        return _reference("pick_rows", fields, rows, in_place=in_place)
     if rows.dtype is torch.bool and len(rows) == num_rows:
-        return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
-    if rows.dtype is torch.int64:
+        if not in_place:
+            return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
+        if all(source.is_contiguous() for source in sources):
+            return dict(zip(fields, _keep_rows(sources, rows.contiguous(), in_place=True)))
+    elif rows.dtype is torch.int64 and not in_place:
         picked = _take_rows(sources, rows.contiguous())
         if picked is not None:
             return dict(zip(fields, picked))
-    return _reference("pick_rows", fields, rows)
+    return _reference("pick_rows", fields, rows, in_place=in_place)
 
 
-def _keep_rows(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
+def _keep_rows(fields: Sequence[Tensor], mask: Tensor, *, in_place: bool = False) -> list[Tensor]:
     starts = room(-(-len(mask) // _ROWS_PER_PIECE) + 1, torch.int64)
     call("pc_count_kept", mask, len(mask), starts)
-    sources, picked, sizes = _sources_and_picked(fields, int(starts[-1]))
+    count = int(starts[-1])
+    sources, picked, sizes = _sources_and_picked(fields, 0 if in_place else count)
+    if in_place:
+        picked = [field[:count] for field in fields]
     call("pc_keep_rows", mask, len(mask), starts, len(fields), addresses(sources), sizes, addresses(picked))
     return picked
 
@@ -76,19 +82,11 @@ def _are_plain(fields: Sequence[Tensor], num_rows: int) -> bool:
 
 @kernel("copy_blocks", "cpu")
 def copy_blocks(
-    into: Tensor,
-    begins: NDArray[np.int64],
-    sources: Sequence[NDArray[np.uint8]],
-    which: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    sizes: NDArray[np.int64],
+    into: Tensor, begins: NDArray[np.int64], addresses: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> None:
     """Copy all in one call."""
-    places = np.array([source.__array_interface__["data"][0] for source in sources])
-    blocks = np.broadcast_arrays(places[which] + starts, sizes, begins + address(into))
-    source, size, to = (torch.from_numpy(np.ascontiguousarray(one).reshape(-1)) for one in blocks)
-    one_byte, all_rows = torch.ones_like(size), torch.zeros_like(size)
-    call("pc_copy_blocks", len(size), source, size, one_byte, all_rows, to)
+    blocks = (np.ascontiguousarray(one).reshape(-1) for one in (addresses, sizes, begins + address(into)))
+    call("pc_copy_blocks", sizes.size, *map(torch.from_numpy, blocks))
 
 
 @kernel("join_rows", "cpu")
@@ -186,5 +184,5 @@ def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -
     return inside if finite else None
 
 
-def _reference(function: str, *args: Any) -> Any:
-    return INNER[function].reference(*args)
+def _reference(function: str, *args: Any, **options: Any) -> Any:
+    return INNER[function].reference(*args, **options)

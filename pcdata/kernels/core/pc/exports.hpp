@@ -79,7 +79,7 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
 // mask (rows,) -> starts (pieces + 1,): the true rows before each piece of 16384 rows, and their number.
 PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts);
 
-// Copy the rows where the mask is true; starts are those of pc_count_kept.
+// Copy the rows where the mask is true; starts are those of pc_count_kept. Rows may be picked within their own memory.
 PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked);
@@ -95,11 +95,9 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
                                 const int64_t* starts, int64_t num_fields, const int64_t* sources,
                                 const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks);
 
-// Copy blocks of rows from addresses to addresses that do not overlap. Of rows (blocks,) each, all, or, where the
-// address of a mask (blocks,) is not 0, those that are true in it.
+// Copy blocks of sizes (blocks,) bytes from addresses to addresses; no two may overlap.
 PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
-                                 const int64_t* rows, const int64_t* row_bytes, const int64_t* masks,
-                                 const int64_t* destinations);
+                                 const int64_t* sizes, const int64_t* destinations);
 
 // moved (N, 3) = matrix (clouds, 4, 4) of each point's cloud @ point, in float64, rounded once.
 PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* points, const int64_t* ptr,
@@ -110,12 +108,15 @@ PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* po
 PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float* directions, const int64_t* ptr,
                                           int64_t num_clouds, const double* linear, float* turned);
 
-// moved (N, 3) = the points after num_steps steps, rounded to float after each; points and moved may be the same. Step
-// s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum with normal
-// numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size.
+// moved (M, 3) = the points (N, 3) after num_steps steps, rounded to float after each; points and moved may be the same.
+// Step s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum with
+// normal numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size. Of the points only
+// those where the mask kept (N,) is true are written, one after another, those of each cloud to kept_ptr (clouds + 1,);
+// both may be null: then all are.
 PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                  int64_t num_steps, const int64_t* is_noise, const double* matrices,
-                                 const int64_t* seeds, const double* sigma, const double* clip, float* moved);
+                                 const int64_t* seeds, const double* sigma, const double* clip, const uint8_t* kept,
+                                 const int64_t* kept_ptr, float* moved);
 
 // mask (sum of counts,): of each cloud's counts (clouds,) rows the wanted (clouds,) become 1 that its seed chooses, the
 // others 0.

@@ -13,14 +13,25 @@ constexpr int64_t kPointsPerPiece = 64 * kBlock;
 struct Block {
   float axis[3][kBlock];
 
+  // A whole block has a loop of its own: with a fixed count it becomes vector code.
   void load(const float* points, int64_t count) {
-    if (count < kBlock) std::memset(axis, 0, sizeof axis);
-    for (int64_t i = 0; i < count; ++i)
-      for (int a = 0; a < 3; ++a) axis[a][i] = points[3 * i + a];
+    if (count == kBlock) return load_rows(points, std::integral_constant<int, kBlock>());
+    std::memset(axis, 0, sizeof axis);
+    load_rows(points, count);
   }
   void store(float* points, int64_t count) const {
-    for (int64_t i = 0; i < count; ++i)
-      for (int a = 0; a < 3; ++a) points[3 * i + a] = axis[a][i];
+    if (count == kBlock) return store_rows(points, std::integral_constant<int, kBlock>());
+    store_rows(points, count);
+  }
+  // Write the rows that are kept one after another; returns how many.
+  int64_t store_kept(float* points, const uint8_t* kept, int64_t count) const {
+    int64_t written = 0;
+    for (int64_t i = 0; i < count; ++i) {
+      if (!kept[i]) continue;
+      for (int a = 0; a < 3; ++a) points[3 * written + a] = axis[a][i];
+      ++written;
+    }
+    return written;
   }
   void move(const double* matrix) {
     const math::Affine affine(matrix);
@@ -45,6 +56,39 @@ struct Block {
           axis[a][half * kHalf + i] += change;
         }
   }
+
+ private:
+  template <class Count>
+  void load_rows(const float* points, Count count) {
+    for (int64_t i = 0; i < count; ++i)
+      for (int a = 0; a < 3; ++a) axis[a][i] = points[3 * i + a];
+  }
+  template <class Count>
+  void store_rows(float* points, Count count) const {
+    for (int64_t i = 0; i < count; ++i)
+      for (int a = 0; a < 3; ++a) points[3 * i + a] = axis[a][i];
+  }
+};
+
+// Steps that points are taken through, as pc_move_points has them.
+struct Steps {
+  int64_t count, num_clouds;
+  const int64_t* is_noise;
+  const double* matrices;
+  const int64_t* seeds;
+  const double *sigma, *clip;
+
+  // Take a block of a cloud through all.
+  void run(Block& block, int64_t cloud, int64_t number) const {
+    for (int64_t step = 0; step < count; ++step) {
+      const int64_t at = step * num_clouds + cloud;
+      if (is_noise[step])
+        block.jitter(static_cast<uint64_t>(seeds[at]), number, static_cast<float>(sigma[step]),
+                     static_cast<float>(clip[step]));
+      else
+        block.move(matrices + 16 * at);
+    }
+  }
 };
 
 }  // namespace
@@ -52,10 +96,29 @@ struct Block {
 
 PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                  int64_t num_steps, const int64_t* is_noise, const double* matrices,
-                                 const int64_t* seeds, const double* sigma, const double* clip, float* moved) {
+                                 const int64_t* seeds, const double* sigma, const double* clip, const uint8_t* kept,
+                                 const int64_t* kept_ptr, float* moved) {
   using namespace pc;
   using namespace pc::noise;
   return guarded([&] {
+    const Steps steps{num_steps, num_clouds, is_noise, matrices, seeds, sigma, clip};
+    if (kept != nullptr) {
+      // In the same memory a cloud is written where those before it were.
+      const pc_context alone{1, context->poll};
+      parallel_for(points == moved ? alone : *context, num_clouds, 1, [&](int64_t first, int64_t last, int64_t) {
+        for (int64_t cloud = first; cloud < last; ++cloud) {
+          float* to = moved + 3 * kept_ptr[cloud];
+          for (int64_t row = ptr[cloud], number = 0; row < ptr[cloud + 1]; row += kBlock, ++number) {
+            const int64_t count = std::min<int64_t>(kBlock, ptr[cloud + 1] - row);
+            Block block;
+            block.load(points + 3 * row, count);
+            steps.run(block, cloud, number);
+            to += 3 * block.store_kept(to, kept + row, count);
+          }
+        }
+      });
+      return;
+    }
     // A piece is a part of the rows of all clouds; blocks begin at a cloud's first row, so that noise keeps its pairs.
     parallel_for(*context, ptr[num_clouds], kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       int64_t cloud = std::upper_bound(ptr, ptr + num_clouds + 1, first) - ptr - 1;
@@ -67,14 +130,7 @@ PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points,
           const int64_t count = std::min<int64_t>(kBlock, end - row);
           Block block;
           block.load(points + 3 * row, count);
-          for (int64_t step = 0; step < num_steps; ++step) {
-            const int64_t at = step * num_clouds + cloud;
-            if (is_noise[step])
-              block.jitter(static_cast<uint64_t>(seeds[at]), (row - begin) / kBlock, static_cast<float>(sigma[step]),
-                           static_cast<float>(clip[step]));
-            else
-              block.move(matrices + 16 * at);
-          }
+          steps.run(block, cloud, (row - begin) / kBlock);
           block.store(moved + 3 * row, count);
         }
       }

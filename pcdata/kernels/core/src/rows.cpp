@@ -41,18 +41,19 @@ void with_row_size(int64_t bytes, const Body& body) {
   }
 }
 
-// Copy runs of rows one after another.
+// Copy runs of rows one after another; `picked` may lie before the rows in the same memory, or where they begin.
 template <class Bytes>
 void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_runs, char* picked) {
   constexpr int64_t kShort = 8;  // below it, calling memcpy costs more than the copy
   for (int64_t r = 0; r < num_runs; ++r) {
     const char* from = source + runs[r].start * bytes;
     const int64_t length = runs[r].length;
-    if (length < kShort)
+    if (from == picked) {  // in the same memory, and no row has been left out yet
+    } else if (length < kShort)
       for (int64_t i = 0; i < length; ++i)
         std::memcpy(picked + i * bytes, from + i * bytes, static_cast<size_t>(bytes));
     else
-      std::memcpy(picked, from, static_cast<size_t>(length * bytes));
+      std::memmove(picked, from, static_cast<size_t>(length * bytes));
     picked += length * bytes;
   }
 }
@@ -82,7 +83,11 @@ PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, i
   using namespace pc::rows;
   return guarded([&] {
     const Fields fields{num_fields, sources, row_bytes, picked};
-    parallel_for(*context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+    bool in_place = false;
+    for (int64_t f = 0; f < num_fields; ++f) in_place |= sources[f] == picked[f];
+    // In the same memory a piece writes where the rows of those before it were.
+    const pc_context alone{1, context->poll};
+    parallel_for(in_place ? alone : *context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       Run runs[kRowsPerPiece / 2];
       const int64_t num_runs = find_runs(mask, first, last, runs);
       const int64_t start = starts[first / kRowsPerPiece];
@@ -143,28 +148,15 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
 }
 
 PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
-                                 const int64_t* rows, const int64_t* row_bytes, const int64_t* masks,
-                                 const int64_t* destinations) {
+                                 const int64_t* sizes, const int64_t* destinations) {
   using namespace pc;
-  using namespace pc::rows;
   constexpr int64_t kBlocksPerPiece = 8;
   return guarded([&] {
     parallel_for(*context, num_blocks, kBlocksPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      for (int64_t block = first; block < last; ++block) {
-        const char* source = reinterpret_cast<const char*>(sources[block]);
-        char* to = reinterpret_cast<char*>(destinations[block]);
-        const uint8_t* mask = reinterpret_cast<const uint8_t*>(masks[block]);
-        if (mask == nullptr) {
-          if (rows[block] > 0) std::memcpy(to, source, static_cast<size_t>(rows[block] * row_bytes[block]));
-          continue;
-        }
-        for (int64_t row = 0; row < rows[block]; row += kRowsPerPiece) {
-          Run runs[kRowsPerPiece / 2];
-          const int64_t num_runs = find_runs(mask, row, std::min(row + kRowsPerPiece, rows[block]), runs);
-          with_row_size(row_bytes[block], [&](auto bytes) { copy_runs(source, bytes, runs, num_runs, to); });
-          for (int64_t r = 0; r < num_runs; ++r) to += runs[r].length * row_bytes[block];
-        }
-      }
+      for (int64_t block = first; block < last; ++block)
+        if (sizes[block] > 0)
+          std::memcpy(reinterpret_cast<char*>(destinations[block]), reinterpret_cast<const char*>(sources[block]),
+                      static_cast<size_t>(sizes[block]));
     });
   });
 }
