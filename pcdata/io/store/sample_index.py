@@ -7,11 +7,10 @@ arrays, so 100,000 samples take milliseconds, and no object is made of a sample 
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
@@ -25,6 +24,7 @@ from pcdata.files.npy import PREFIX, header_length, npy_bytes, parse_header
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.files.whole_folders import INDEX
 from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.text_table import LONGEST_TEXT, TextTable
 
 FOLDER = INDEX
 
@@ -40,11 +40,6 @@ FILES: Mapping[str, tuple[str, tuple[int, ...]]] = {  # dtype and the shape of a
     _TABLES: ("|u1", (32,)),  # of every shard, the SHA-256 of the table of its files
 }
 _MOST_POINTS = 1 << 48  # of a sample
-_LONGEST_ID = 1 << 16  # bytes
-_AT_ONCE = 1 << 18  # bytes of ids that are looked at together
-_LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e"  # where str.splitlines cuts, and beyond ASCII:
-_MORE_LINE_ENDS = tuple(end.encode() for end in ("\x85", "\u2028", "\u2029"))
-_ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True)
@@ -58,58 +53,12 @@ class Sample:
     shard: int = 0
 
 
-class SampleIds(Sequence[str]):
+class SampleIds(TextTable):
     """The ids of an index, which are unique; each is decoded when it is asked for."""
 
     def __init__(self, index: SampleIndex) -> None:
+        super().__init__(index.arrays[_LETTERS], index.arrays[_ENDS])
         self._index = index  # which does not hold this: a circle would keep the mapped files
-        self._letters: NDArray[np.uint8] = index.arrays[_LETTERS]
-        self._ends: NDArray[np.int64] = index.arrays[_ENDS]
-        self._sorted: tuple[NDArray[np.uint64], NDArray[np.int64]] | None = None  # hashes, and whose each is
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    @overload
-    def __getitem__(self, place: int) -> str: ...
-    @overload
-    def __getitem__(self, place: slice) -> list[str]: ...
-    def __getitem__(self, place: int | slice) -> str | list[str]:
-        if isinstance(place, slice):
-            return [self[number] for number in range(*place.indices(len(self)))]
-        number = range(len(self))[place]
-        begin = int(self._ends[number - 1]) if number else 0
-        return bytes(self._letters[begin : self._ends[number]]).decode("utf-8", "surrogatepass")
-
-    def __iter__(self) -> Iterator[str]:
-        for first, stop in self._parts():
-            begin = int(self._ends[first - 1]) if first else 0
-            letters = self._letters[begin : self._ends[stop - 1]].tobytes()
-            ends = (self._ends[first:stop] - begin).tolist()
-            for start, end in zip([0, *ends], ends):
-                yield letters[start:end].decode("utf-8", "surrogatepass")
-
-    def place_of(self, sample_id: object) -> int | None:
-        """Return which sample has an id, or None."""
-        if not isinstance(sample_id, str):
-            return None
-        if self._sorted is None:
-            hashes = self._hashes()
-            order = np.argsort(hashes, kind="stable")
-            self._sorted = hashes[order], order
-        letters = np.frombuffer(sample_id.encode("utf-8", "surrogatepass"), np.uint8)
-        if not 0 < len(letters) <= _LONGEST_ID:
-            return None
-        wanted = _hashes(letters, np.zeros(1, np.int64))[0]
-        hashes, order = self._sorted
-        first, stop = (int(np.searchsorted(hashes, wanted, side)) for side in ("left", "right"))
-        for number in order[first:stop].tolist():
-            if self[number] == sample_id:
-                return int(number)
-        return None
-
-    def __contains__(self, sample_id: object) -> bool:
-        return self.place_of(sample_id) is not None
 
     def index(self, value: str, start: int = 0, stop: int | None = None) -> int:
         """Return which sample has an id, as ``list.index`` does."""
@@ -117,15 +66,6 @@ class SampleIds(Sequence[str]):
         if place is None or place not in range(len(self))[start:stop]:
             raise ValueError(f"no sample has the id {value!r:.300}")
         return place
-
-    def __eq__(self, other: object) -> bool:
-        if isinstance(other, SampleIds):
-            return np.array_equal(self._ends, other._ends) and np.array_equal(self._letters, other._letters)
-        if isinstance(other, (list, tuple)):
-            return len(self) == len(other) and all(mine == one for mine, one in zip(self, other))
-        return NotImplemented
-
-    __hash__ = None  # type: ignore[assignment]  # as of a list
 
     def __repr__(self) -> str:
         return f"<{len(self)} sample ids>" if len(self) > 9 else repr(list(self))
@@ -139,61 +79,10 @@ class SampleIds(Sequence[str]):
         Raises:
             CacheError: they are not.
         """
-        for first, stop in self._parts():
-            begin = int(self._ends[first - 1]) if first else 0
-            letters = self._letters[begin : self._ends[stop - 1]]
-            starts = np.concatenate([np.zeros(1, np.int64), self._ends[first : stop - 1] - begin])
-            if bool(((letters[starts] & 0xC0) == 0x80).any()):
-                raise CacheError("its ids are cut inside a letter")
-            text = letters.tobytes()
-            beyond = not text.isascii()
-            try:
-                if beyond:
-                    text.decode("utf-8", "surrogatepass")
-            except UnicodeDecodeError as error:
-                raise CacheError(f"its ids are no text: {error}") from error
-            if len(text.translate(None, _LINE_ENDS)) < len(text) or (
-                beyond and any(end in text for end in _MORE_LINE_ENDS)
-            ):
-                raise CacheError("a sample id must be a text in one line that is not empty, and one is not")
-        hashes = self._hashes()
-        ordered = np.sort(hashes)
-        twice = ordered[1:][ordered[1:] == ordered[:-1]]
-        seen = set[str]()
-        for number in np.flatnonzero(np.isin(hashes, twice)).tolist() if len(twice) else ():
-            if self[number] in seen:
-                raise CacheError(f"two samples have the id {self[number]!r:.300}")
-            seen.add(self[number])
-
-    def _hashes(self) -> NDArray[np.uint64]:
-        found = np.empty(len(self), np.uint64)
-        for first, stop in self._parts():
-            begin = int(self._ends[first - 1]) if first else 0
-            ends = self._ends[first:stop] - begin
-            starts = np.concatenate([np.zeros(1, np.int64), ends[:-1]])
-            found[first:stop] = _hashes(self._letters[begin : begin + int(ends[-1])], starts)
-        return found
-
-    def _parts(self) -> Iterator[tuple[int, int]]:
-        """Cut the samples into parts whose ids are looked at together."""
-        first = 0
-        while first < len(self):
-            begin = int(self._ends[first - 1]) if first else 0
-            stop = max(first + 1, int(np.searchsorted(self._ends, begin + _AT_ONCE, "right")))
-            yield first, stop
-            first = stop
-
-
-@functools.cache
-def _powers() -> NDArray[np.uint64]:
-    return np.concatenate([np.ones(1, np.uint64), np.full(_AT_ONCE, _ODD).cumprod(dtype=np.uint64)])
-
-
-def _hashes(letters: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Return a 64-bit number of every text; those of equal texts are equal."""
-    # A polynomial of the letters whose lowest power depends on where the text starts; the factor lifts all to one.
-    sums = np.add.reduceat(np.multiply(letters, _powers()[: len(letters)], dtype=np.uint64), starts)
-    return sums * _powers()[_AT_ONCE - starts]
+        self.check_lines("id")
+        repeated = self.repeated()
+        if repeated is not None:
+            raise CacheError(f"two samples have the id {repeated!r:.300}")
 
 
 class SampleIndex(Sequence[Sample]):
@@ -210,8 +99,8 @@ class SampleIndex(Sequence[Sample]):
         for sample_id in ids:
             key_of(sample_id)
             texts.append(sample_id.encode("utf-8", "surrogatepass"))
-            if len(texts[-1]) > _LONGEST_ID:
-                raise CacheError(f"a sample id has at most {_LONGEST_ID} bytes, {sample_id[:100]!r}... has more")
+            if len(texts[-1]) > LONGEST_TEXT:
+                raise CacheError(f"a sample id has at most {LONGEST_TEXT} bytes, {sample_id[:100]!r}... has more")
         told = [*digests]
         for digest in told:
             if not (isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)):
@@ -272,7 +161,7 @@ class SampleIndex(Sequence[Sample]):
         # Sums of int64 wrap: every end is held to the size, not only the last.
         if bool((arrays[_ENDS] > len(arrays[_LETTERS])).any()) or bool((lengths < 1).any()):
             raise CacheError("a sample id must be a text that is not empty; the ends of its ids do not rise")
-        if int(arrays[_ENDS][-1]) != len(arrays[_LETTERS]) or int(lengths.max()) > _LONGEST_ID:
+        if int(arrays[_ENDS][-1]) != len(arrays[_LETTERS]) or int(lengths.max()) > LONGEST_TEXT:
             raise CacheError(f"its ids do not fill their {len(arrays[_LETTERS])} bytes, or one is too long")
         if bool((self.num_points < 0).any()) or bool((self.num_points > _MOST_POINTS).any()):
             raise CacheError(f"num_points must be from 0 to {_MOST_POINTS} for every sample")
