@@ -41,9 +41,19 @@ def generator_for(seed: int, epoch: int, sample_id: str, *, copy: int = 0) -> Ge
 
 def sample_key(seed: int, epoch: int, sample_id: str, *, copy: int = 0) -> int:
     """Return the key, of 63 bits, of the stream that belongs to one sample in one epoch, or to a copy of it."""
-    key = f"{seed}\0{epoch}\0{sample_id}" + (f"\0{copy}" if copy else "")
-    digest = hashlib.sha256(key.encode(errors="surrogatepass")).digest()  # file names may be no UTF-8
-    return int.from_bytes(digest[:8], "big") >> 1
+    encoded = sample_id.encode(errors="surrogatepass")  # file names may be no UTF-8
+    return int(sample_keys(seed, epoch, [encoded], [copy])[0])
+
+
+def sample_keys(seed: int, epoch: int, ids: Sequence[bytes], copies: Sequence[int]) -> NDArray[np.int64]:
+    """Return the keys of the streams of many samples."""
+    begun = hashlib.sha256(f"{seed}\0{epoch}\0".encode())
+    digests = []
+    for sample_id, copy in zip(ids, copies, strict=True):
+        total = begun.copy()
+        total.update(sample_id + b"\0%d" % copy if copy else sample_id)
+        digests.append(total.digest())
+    return (np.frombuffer(b"".join(digests), ">u8")[::4] >> np.uint64(1)).astype(np.int64)
 
 
 def words(keys: Tensor, number: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from torch.utils.data import get_worker_info
 
 from pcdata.errors import CacheError
 from pcdata.structures import PaddedClouds, PointCloud
+from pcdata.structures.read_later import StoredTexts, texts_from_bytes
 from pcdata.structures.structure import Structure, derived, with_tensors
 
 S = TypeVar("S", bound=Structure)
@@ -87,8 +88,11 @@ class _Block:
         return memory[:size]
 
     def holds(self, tensor: Tensor) -> bool:
-        begin = tensor.data_ptr() - self.begin
-        return begin >= 0 and begin + tensor.nbytes <= self.used and tensor.is_contiguous()
+        return self.holds_bytes(tensor.data_ptr(), tensor.nbytes) and tensor.is_contiguous()
+
+    def holds_bytes(self, address: int, size: int) -> bool:
+        begin = address - self.begin
+        return begin >= 0 and begin + size <= self.used
 
     def rest(self) -> Tensor:
         """Return the memory behind what was taken, while that is held."""
@@ -194,6 +198,7 @@ def sent_together(kind: type[S]) -> type[S]:
 
 def _reduced(structure: Structure) -> Any:
     """Return how a batch is pickled for another process."""
+    _SENDING.block = None, None
     if _is_worker():
         tensors: list[Tensor] = []
         with_tensors(structure, lambda tensor: tensors.append(tensor) or tensor)  # type: ignore[func-returns-value]
@@ -240,7 +245,21 @@ def _sent(structure: Structure, tensors: list[Tensor]) -> Any:
     swap = iter(places)
     state = {name: with_tensors(value, lambda tensor: next(swap)) for name, value in vars(structure).items()}
     block.content[_RECEIVER] = 1
-    return _received, (type(structure), state, _Sent(os.getpid(), block.file, block.size, block.name))
+    sent = _Sent(os.getpid(), block.file, block.size, block.name)
+    _SENDING.block = block, sent
+    return _received, (type(structure), state, sent)
+
+
+_SENDING = threading.local()  # the block of the batch that is pickled, and what is sent of it
+
+
+def _reduced_texts(texts: StoredTexts) -> Any:
+    """Return how the meta or the history of a batch is pickled: where its block has them, they stay."""
+    address, size = texts.letters.__array_interface__["data"][0], texts.letters.nbytes
+    block, sent = getattr(_SENDING, "block", (None, None))
+    if block is not None and size and block.holds_bytes(address, size):
+        return _received_texts, (sent, address - block.begin, size, texts.ends.tobytes())
+    return texts.__reduce__()
 
 
 def _size(tensors: list[Tensor]) -> int:
@@ -270,6 +289,12 @@ def _received(cls: type[Structure], state: Mapping[str, Any], sent: _Sent) -> St
     memory = _memory(_mapped(sent), _RECEIVER)
     swap: Callable[[Any], Any] = lambda place: _at(memory, place)  # noqa: E731
     return derived(object.__new__(cls), **{name: with_tensors(value, swap, _Place) for name, value in state.items()})
+
+
+def _received_texts(sent: _Sent, begin: int, size: int, ends: bytes) -> StoredTexts:
+    """Copy texts out of a block, which is free again when the tensors are gone."""
+    begin += _HEAD
+    return texts_from_bytes(_mapped(sent)[begin : begin + size], ends)
 
 
 def _mapped(sent: _Sent) -> mmap.mmap:
@@ -312,3 +337,4 @@ def _forget_the_dead() -> None:
 
 for _kind in (PointCloud, PaddedClouds):
     sent_together(_kind)
+ForkingPickler.register(StoredTexts, _reduced_texts)

@@ -7,19 +7,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from pcdata.datasets.batch_transport import batch_memory
-from pcdata.datasets.passes import shared
+from pcdata.datasets.first_touch import FirstTouch
 from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.datasets.splits import Splits
 from pcdata.errors import CacheError, ConfigError, DTypeError, PcdataWarning, ShapeError, locate
 from pcdata.imports import imported_files
+from pcdata.io.store.cloud_forms import CloudForms
 from pcdata.io.store.cloud_record import cloud_from_record, signals_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
-from pcdata.io.store.sample_index import SampleIndex
 from pcdata.io.store.shards import SIGNALS_KEY, Shards, shard_folder
 from pcdata.io.store.url_dataset import UrlShards, fetch, opened_folder
 from pcdata.rng import Streams
@@ -98,10 +99,11 @@ class CachedCloudDataset(SampleDataset):
         self.splits = self.folder / SPLITS if splits is None else Path(splits)
         if split is not None and splits is None and server is not None:
             fetch(server, self.folder, SPLITS)
-        self._rows: Sequence[int] = range(len(ids))  # of the samples in the index
+        self._rows: NDArray[np.int64] | None = None  # of the samples in the index; None = all
         if split is not None:
-            self._rows = Splits.read(self.splits, ids).rows(split, ids)
-            ids = [ids[row] for row in self._rows]
+            rows = Splits.read(self.splits, ids).rows(split, ids)
+            self._rows = np.array(rows, dtype=np.int64)
+            ids = [ids[row] for row in rows]
         elif splits is not None:
             raise ConfigError(f"splits {str(splits)!r} say nothing without split, such as split='train'")
         super().__init__(ids, transform, seed, repeats)
@@ -109,7 +111,8 @@ class CachedCloudDataset(SampleDataset):
         self._shards = (
             Shards(self.folder, form, index) if server is None else UrlShards(server, self.folder, form, index)
         )
-        self._touched = _FirstTouch(self.manifest.index)
+        self._touched = FirstTouch(self.manifest.index)
+        self._forms = CloudForms()
 
     def _stored_pipeline(self) -> Compose:
         try:
@@ -152,7 +155,7 @@ class CachedCloudDataset(SampleDataset):
     def episodes(self) -> list[Episode]:
         """The episodes over ``ids``, as the build kept them."""
         own = self.manifest.episodes
-        return list(own) if self.split is None else kept_episodes(own, self._rows)
+        return list(own) if self._rows is None else kept_episodes(own, self._rows.tolist())
 
     def signal_table(self) -> Mapping[str, Signal]:
         """Return the signals of all samples by name, (S, ...) in the order of ``ids``, as recorded; no cloud is loaded.
@@ -173,16 +176,21 @@ class CachedCloudDataset(SampleDataset):
             table = signals_from_record(record, len(self.manifest.index))
         except CacheError as error:
             raise CacheError(f"{path}: {error}; rebuild the dataset") from error
-        if self.split is None:
+        if self._rows is None:
             return table
-        rows = torch.tensor(self._rows, dtype=torch.int64, device="cpu")
+        rows = torch.from_numpy(self._rows)
         return {name: signal.rows(rows) for name, signal in table.items()}
 
+    def _rows_of(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return which samples of the index some samples are."""
+        return numbers if self._rows is None else self._rows[numbers]
+
     def _load(self, index: int) -> PointCloud:
-        row = self._rows[index]
-        with self._shards.held([row]):
-            if self._compared([row]):
-                record = self._shards.read_joined([row]) or self._shards.read(row)
+        rows = self._rows_of(np.array([index]))
+        row = int(rows[0])
+        with self._shards.held(rows):
+            if self._compared(rows):
+                record = self._shards.read_joined(rows) or self._shards.read(row)
             else:
                 record = self._shards.read(row)
                 self._check_digest(row, record.digest())
@@ -195,8 +203,10 @@ class CachedCloudDataset(SampleDataset):
             raise self._fault(row, f" has {cloud.num_points} points, but the index says {wanted}")
         return cloud
 
-    def _compared(self, rows: Sequence[int]) -> bool:
+    def _compared(self, rows: NDArray[np.int64]) -> bool:
         """Compare the digests of samples that nobody has read yet; False where every read must compare its own."""
+        if self._touched.has_all(rows, self._shards.closed):
+            return True
         files = self._shards.identities(rows)
         if files is None:
             return False
@@ -215,23 +225,23 @@ class CachedCloudDataset(SampleDataset):
         locate(error, path=path)
         return error
 
-    def _load_at_once(self, numbers: Sequence[int]) -> PointCloud | None:
+    def _load_at_once(self, numbers: NDArray[np.int64]) -> PointCloud | None:
         """Return the clouds of some samples as one batch; None where that of one by one would be another."""
-        rows = [self._rows[number] for number in numbers]
+        rows = self._rows_of(numbers)
         with self._shards.held(rows):
             record = self._shards.read_joined(rows, batch_memory) if self._compared(rows) else None
         if record is None:
-            single = [self._load(number) for number in numbers]
+            single = [self._load(number) for number in numbers.tolist()]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
                 return None
             clouds = PointCloud.cat(single)
         else:
-            clouds = cloud_from_record(record)
+            clouds = self._forms.cloud(record)
         # One cloud each, since none has fewer.
-        wanted = self.manifest.index.num_points[rows].tolist()
-        return clouds if clouds.num_clouds == len(numbers) and clouds.counts.tolist() == wanted else None
+        counts = np.diff(clouds.ptr.numpy())
+        return clouds if np.array_equal(counts, self.manifest.index.num_points[rows]) else None
 
-    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
+    def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         if not runs_on_batches(self.transform):
             return None
         batches = []
@@ -246,61 +256,20 @@ class CachedCloudDataset(SampleDataset):
                 batches.append(self._transformed(clouds, own))
         return Unbatched(batches)
 
-    def _parts(self, numbers: Sequence[int], each: int = 1) -> Iterator[slice]:
+    def _parts(self, numbers: NDArray[np.int64], each: int = 1) -> Iterator[slice]:
         """Cut samples, ``each`` of which belong together, into parts that the memory of a processor can hold."""
-        begin = points = 0
-        counts = self.manifest.index.num_points[[self._rows[number] for number in numbers]].tolist()
-        if sum(counts) <= _MOST_POINTS:
+        counts = self.manifest.index.num_points[self._rows_of(numbers)]
+        if int(counts.sum()) <= _MOST_POINTS:
             yield slice(0, len(numbers))
             return
-        for place in range(0, len(numbers), each):
-            own = sum(counts[place : place + each])
+        begin = points = 0
+        for place, own in enumerate(counts.reshape(-1, each).sum(axis=1).tolist()):
             if points and points + own > _MOST_POINTS:
-                yield slice(begin, place)
-                begin, points = place, 0
+                yield slice(begin, place * each)
+                begin, points = place * each, 0
             points += own
         yield slice(begin, len(numbers))
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f" of {self.split}"
         return f"CachedCloudDataset({str(self._shown)!r}, {len(self)} samples{split}, {self.manifest.format})"
-
-
-class _FirstTouch:
-    """Which records were compared with their digests, in shared memory: workers that start anew compare none again.
-
-    The marks are of the files that :meth:`fresh` was asked about first; a process that meets another file under the
-    name of one begins anew with its records, for itself.
-    """
-
-    def __init__(self, index: SampleIndex) -> None:
-        self._index = index
-        self._seen = shared(torch.zeros(len(index), dtype=torch.bool, device="cpu"))
-        self._files = shared(torch.zeros(index.num_shards, 4, dtype=torch.int64, device="cpu"))  # 0: not known yet
-        self._mine: dict[int, tuple[int, ...]] = {}  # what this process has seen of them
-
-    def fresh(self, numbers: Sequence[int], files: Mapping[int, tuple[int, ...]]) -> list[int]:
-        """Return those of some records that nobody has compared yet; ``files`` tells the files of their shards."""
-        for shard, identity in files.items():
-            if self._mine.get(shard) != identity:
-                known = tuple(self._files[shard].tolist())
-                if known != identity and any(known):
-                    self._seen = self._seen.clone()
-                    own = self._index.of_shard(shard)
-                    self._seen[own.start : own.stop] = False
-                else:
-                    self._files[shard] = torch.tensor(identity, dtype=torch.int64, device="cpu")
-                self._mine[shard] = identity
-        seen = self._seen[torch.tensor(numbers, dtype=torch.int64, device="cpu")].tolist()
-        return [number for number, is_seen in zip(numbers, seen, strict=True) if not is_seen]
-
-    def note(self, number: int) -> None:
-        """Note that a record is what was written."""
-        self._seen[number] = True
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_index": self._index, "_seen": self._seen, "_files": self._files}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update({name: shared(one) if isinstance(one, Tensor) else one for name, one in state.items()})
-        self._mine = {}

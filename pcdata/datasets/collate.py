@@ -83,14 +83,14 @@ def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
         ShapeError: the counts differ.
     """
     _check("collate_fixed", clouds)
-    batch = PointCloud.cat_padded(clouds)
-    if not bool(batch.mask.all()):
-        counts = batch.mask.sum(dim=1).tolist()
+    batches = clouds.batches if isinstance(clouds, Unbatched) else clouds
+    counts = {count for batch in batches for count in batch.counts.tolist()}
+    if len(counts) > 1:
         raise ShapeError(
             f"collate_fixed: clouds must have one count, got {min(counts)} to {max(counts)} points; end the pipeline "
             "with FarthestPointSample or RandomSample, or use collate_padded or collate_packed"
         )
-    return batch
+    return PointCloud.cat_padded(clouds)
 
 
 @register_collate

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import PcdataWarning
@@ -60,15 +61,15 @@ class PassWatch:
             stacklevel=4,
         )
 
-    def note_all(self, indices: Sequence[int], what: str) -> None:
+    def note_all(self, indices: NDArray[np.int64], what: str) -> None:
         """Note that several samples are read, as :meth:`note` does one after another."""
         if int(self._again) < 0:
             return
-        which = torch.tensor(indices, dtype=torch.int64, device="cpu")
-        if len({*indices}) == len(indices) and not bool(self._seen[which].any()):
-            self._seen[which] = True
+        seen = self._seen.numpy()
+        if len(np.unique(indices)) == len(indices) and not seen[indices].any():
+            seen[indices] = True
             return
-        for index in indices:
+        for index in indices.tolist():
             self.note(index, what)
 
     def __setstate__(self, state: dict[str, Tensor]) -> None:

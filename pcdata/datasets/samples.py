@@ -6,7 +6,9 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import Dataset, get_worker_info
 
 from pcdata.contracts.dispatch import warn_if_slow
@@ -17,7 +19,7 @@ from pcdata.datasets.split_drawing import split_episodes
 from pcdata.errors import ConfigError, DTypeError, add_note
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.io.store.sample_index import SampleIds
-from pcdata.rng import GeneratorLike, Streams, sample_key
+from pcdata.rng import GeneratorLike, Streams, sample_keys
 from pcdata.structures import Episode, PointCloud, Signal
 from pcdata.structures.unbatched import Unbatched
 from pcdata.transforms import Transform
@@ -26,12 +28,12 @@ DRAWS = "stream"  # in the meta of a cloud: the key of its random draws
 
 
 class _Asked(NamedTuple):
-    """What an index means."""
+    """What K indices mean, (K,) each."""
 
-    place: int  # among the samples and their repeats
-    number: int  # of the sample
-    copy: int  # which of its draws
-    again: int  # how often a sampler has asked for it before
+    places: NDArray[np.int64]  # among the samples and their repeats
+    numbers: NDArray[np.int64]  # of the samples
+    copies: NDArray[np.int64]  # which of their draws
+    again: NDArray[np.int64]  # how often a sampler has asked for each before
 
 
 class SampleDataset(Dataset[PointCloud]):
@@ -124,13 +126,14 @@ class SampleDataset(Dataset[PointCloud]):
     def __getitem__(self, index: int | tuple[int, int] | slice) -> PointCloud:
         if isinstance(index, slice):
             raise DTypeError("a dataset gives one sample per index; for several use torch.utils.data.Subset")
-        asked = self._asked(index)
-        sample_id = self.ids[asked.number]
+        asked = self._asked([index])
+        number = int(asked.numbers[0])
+        sample_id = self.ids[number]
         try:
-            if self.transform is not None and self.transform.is_random and not asked.again:
-                self._passes.note(asked.place, repr(self))
-            made = self._made(asked.number, self._streams([asked]))
-            return _noted(made, self._keys_of(made, self._streams([asked]))) if self.notes_draws else made
+            if self.transform is not None and self.transform.is_random and not asked.again[0]:
+                self._passes.note(int(asked.places[0]), repr(self))
+            made = self._made(number, self._streams(asked))
+            return _noted(made, self._keys_of(made, self._streams(asked))) if self.notes_draws else made
         except Exception as error:
             add_note(error, f"sample {sample_id!r} of {self!r}", sample_id=sample_id)
             if get_worker_info() is not None:
@@ -154,16 +157,16 @@ class SampleDataset(Dataset[PointCloud]):
 
         Stored clouds are read at once and go through the steps as one batch, each with its own draws.
         """
-        asked = self._all_asked(indices)
+        asked = self._asked(indices)
         is_random = self.transform is not None and self.transform.is_random
         try:
-            made = self._made_at_once([one.number for one in asked], self._streams(asked) if is_random else None)
+            made = self._made_at_once(asked.numbers, self._streams(asked) if is_random else None)
         except Exception:  # a sample is at fault: read by itself, it is named
             made = None
         if made is None:
             return [self[index] for index in indices]
-        if is_random and (places := [one.place for one in asked if not one.again]):
-            self._passes.note_all(places, repr(self))
+        if is_random and not asked.again.all():
+            self._passes.note_all(asked.places[asked.again == 0], repr(self))
         if self.notes_draws:  # clouds of one sample that is made at once share its draws
             keys = [key for key in self._streams(asked).keys for _ in range(made.each)]
             ends = [0, *itertools.accumulate(batch.num_clouds for batch in made.batches)]
@@ -171,35 +174,36 @@ class SampleDataset(Dataset[PointCloud]):
             return Unbatched([_noted(one, own) for one, own in zip(made.batches, cut, strict=True)], made.each)
         return made
 
-    def _all_asked(self, indices: Sequence[int | tuple[int, int]]) -> list[_Asked]:
+    def _asked(self, indices: Sequence[int | tuple[int, int]]) -> _Asked:
         """Return what indices mean; most are plain numbers, of which a batch has many."""
-        count = len(self.ids)
-        size = count * self.repeats
-        asked = []
-        for index in indices:
-            if type(index) is int and 0 <= index < size:
-                copy, number = divmod(index, count)
-                asked.append(_Asked(index, number, copy, 0))
-            else:
-                asked.append(self._asked(index))
-        return asked
+        given: Any = indices
+        again = np.zeros(len(indices), np.int64)
+        if {*map(type, indices)} != {int}:
+            pairs = [index if isinstance(index, tuple) else (index, 0) for index in indices]
+            given = [self._place(index) for index, _ in pairs]
+            again[:] = [times for _, times in pairs]
+        try:
+            places = np.array(given, dtype=np.int64)
+        except OverflowError:  # no sample has so large a number: see below
+            places = np.full(len(given), -1)
+        if len(places) and (places.min() < 0 or places.max() >= len(self)):
+            places = np.array([self._place(index) for index in given], dtype=np.int64)
+        copies, numbers = np.divmod(places, max(1, len(self.ids)))
+        return _Asked(places, numbers, copies + again * self.repeats, again)
 
-    def _asked(self, index: int | tuple[int, int]) -> _Asked:
-        given, again = index if isinstance(index, tuple) else (index, 0)
-        place = self._place(given)
-        copy, number = divmod(place, len(self.ids))
-        return _Asked(place, number, copy + again * self.repeats, again)
-
-    def _streams(self, asked: Sequence[_Asked]) -> Streams:
+    def _streams(self, asked: _Asked) -> Streams:
         """Return the stream of each sample."""
-        seed, epoch = self.seed, self.epoch
-        return Streams([sample_key(seed, epoch, self.ids[one.number], copy=one.copy) for one in asked])
+        if isinstance(self.ids, SampleIds):
+            ids = self.ids.encoded(asked.numbers)
+        else:
+            ids = [self.ids[number].encode(errors="surrogatepass") for number in asked.numbers.tolist()]
+        return Streams(sample_keys(self.seed, self.epoch, ids, asked.copies.tolist()))
 
     def _keys_of(self, made: PointCloud, streams: Streams) -> list[int]:
         """Return the key of the stream that random steps would draw from for each cloud of a sample."""
         return Streams.of(streams, made.num_clouds).keys
 
-    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
+    def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         """Return what :meth:`_made` does for each, or None where that must be done; None = nothing is drawn."""
         return None
 

@@ -133,7 +133,7 @@ class EpisodeWindows(SampleDataset):
         """Return the places (horizon,) of a window's steps among the ids of ``dataset``, repeated ones as they are."""
         return self._steps([self._place(index) % len(self.ids)])[0]
 
-    def _steps(self, numbers: Sequence[int]) -> NDArray[np.int64]:
+    def _steps(self, numbers: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
         episode = self.places.episode[numbers]
         steps = window_steps(self.places.start[numbers], self._lengths[episode], self.horizon)
         return self._firsts[episode][:, None] + steps
@@ -154,11 +154,11 @@ class EpisodeWindows(SampleDataset):
             clouds = PointCloud.cat([clouds[int(place)] for place in again.tolist()])
         return self._with_actions(clouds, [number], steps[None])
 
-    def _made_at_once(self, numbers: Sequence[int], streams: Streams | None) -> Unbatched | None:
+    def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         if not isinstance(self.dataset, CachedCloudDataset) or not runs_on_batches(self.transform):
             return None
         steps = self._steps(numbers)
-        shown = steps[:, : self.num_obs].ravel().tolist()
+        shown = steps[:, : self.num_obs].ravel()
         batches = []
         for part in self.dataset._parts(shown, self.num_obs):
             clouds = self.dataset._load_at_once(shown[part])
@@ -167,7 +167,7 @@ class EpisodeWindows(SampleDataset):
             windows = slice(part.start // self.num_obs, part.stop // self.num_obs)
             # The clouds of a window get the same draws.
             made = self._transformed(clouds, None if streams is None else streams.part(windows, self.num_obs))
-            batches.append(self._with_actions(made, numbers[windows], steps[windows]))
+            batches.append(self._with_actions(made, numbers[windows].tolist(), steps[windows]))
         return Unbatched(batches, self.num_obs)
 
     def _keys_of(self, made: PointCloud, streams: Streams) -> list[int]:

@@ -85,8 +85,7 @@ def move_points(
 ) -> Tensor:
     """Move (N, 3) float32 points by some steps, rounded to float32 after each; ``in_place`` in their own memory.
 
-    Args:
-        kept: which are returned: a (N,) bool mask, and the (B+1,) row pointers of those.
+    ``kept`` says which are returned: a (N,) bool mask, and the (B+1,) row pointers of those.
     """
     before = points
     for step in steps:

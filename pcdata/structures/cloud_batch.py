@@ -15,30 +15,12 @@ from pcdata.geometry import rigid
 from pcdata.structures.image_layout import ImageLayout, joined_layout
 from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
 from pcdata.structures.pose_layouts import motion_by
+from pcdata.structures.read_later import Histories, Metas, ReadLater, Step
 from pcdata.structures.signal_joining import joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, attached, refuse_mirror, signals_now
-from pcdata.structures.stored_steps import Histories, Step
 from pcdata.structures.structure import Structure, derived
 
 Clouds = TypeVar("Clouds", bound="CloudBatch")
-
-
-class _Histories:
-    """The attribute ``history`` of clouds: a tuple of the steps of each, as everybody sees it.
-
-    ``vars(clouds)["history"]`` is what they hold: :class:`Histories` where nobody has read them yet.
-    """
-
-    def __get__(self, clouds: Any, owner: type) -> Sequence[Sequence[Step]]:
-        if clouds is None:
-            return ()  # the default, as dataclasses ask for it
-        held: Any = vars(clouds)["history"]
-        if isinstance(held, Histories):
-            held = vars(clouds)["history"] = tuple(held)
-        return held
-
-    def __set__(self, clouds: Any, value: Sequence[Any]) -> None:
-        vars(clouds)["history"] = value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,8 +50,8 @@ class CloudBatch(Structure):
     source_frame: str = ""
     frames: Mapping[str, Tensor] = field(default_factory=dict)
     layout: ImageLayout | None = None
-    meta: Sequence[Mapping[str, Any]] = ()
-    history: Sequence[Sequence[Step]] = _Histories()  # type: ignore[assignment]
+    meta: Sequence[Mapping[str, Any]] = ReadLater(Metas)  # type: ignore[assignment]
+    history: Sequence[Sequence[Step]] = ReadLater(Histories)  # type: ignore[assignment]
     recorded_signals: Mapping[str, Signal] = field(default_factory=dict)
 
     def kind(self, name: str) -> Kind:
@@ -186,7 +168,7 @@ class CloudBatch(Structure):
             "viewpoint": None if self.viewpoint is None else self.viewpoint[clouds],
             "source_from_cloud": self.source_from_cloud[clouds],
             "frames": {name: matrix[clouds] for name, matrix in self.frames.items()},
-            "meta": self.meta[clouds],
+            "meta": vars(self)["meta"][clouds],
             "history": vars(self)["history"][clouds],
             "recorded_signals": signals,
         }
@@ -227,7 +209,7 @@ def joined_facts(clouds: Sequence[CloudBatch]) -> dict[str, Any]:
         "viewpoint": torch.cat([v for v in viewpoints if v is not None]) if None not in viewpoints else None,
         "source_from_cloud": torch.cat([cloud.source_from_cloud for cloud in clouds]),
         "frames": {name: torch.cat([cloud.frames[name] for cloud in clouds]) for name in shared},
-        "meta": tuple(entry for cloud in clouds for entry in cloud.meta),
+        "meta": Metas(vars(cloud)["meta"] for cloud in clouds),
         "history": Histories(vars(cloud)["history"] for cloud in clouds),
         "recorded_signals": joined_signals([cloud.recorded_signals for cloud in clouds])
         if clouds[0].recorded_signals

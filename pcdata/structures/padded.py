@@ -86,15 +86,19 @@ class PaddedClouds(CloudBatch):
 
 def padded_clouds(clouds: Sequence[CloudBatch], rows: Mapping[str, Tensor], counts: Sequence[int]) -> PaddedClouds:
     """Put together fields (B, M, ...) and what the clouds know about themselves."""
-    device, width = rows["points"].device, rows["points"].shape[1]
+    device, (batch, width) = rows["points"].device, rows["points"].shape[:2]
     first = clouds[0]
+    if min(counts) == width:
+        mask = torch.ones((batch, width), dtype=torch.bool, device=device)
+    else:
+        ends = torch.tensor(counts, dtype=torch.int64, device=device)[:, None]
+        mask = torch.arange(width, dtype=torch.int64, device=device) < ends
     return PaddedClouds(
-        mask=torch.arange(width, dtype=torch.int64, device=device)
-        < torch.tensor(counts, dtype=torch.int64, device=device)[:, None],
+        mask=mask,
         frame_id=first.frame_id,
         unit=first.unit,
         source_frame=first.source_frame,
         kinds=first.kinds,
         **attributes(rows),
-        **joined_facts(clouds),
+        **(first._facts_of(slice(0, batch)) if len(clouds) == 1 else joined_facts(clouds)),
     )

@@ -22,8 +22,8 @@ from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
+from pcdata.structures.read_later import Histories, Metas, OfClouds, Step
 from pcdata.structures.signals import told_signals
-from pcdata.structures.stored_steps import Histories, OfClouds, Step, StoredSteps
 from pcdata.structures.structure import checked_copy, derived
 from pcdata.structures.unbatched import Unbatched
 
@@ -77,10 +77,9 @@ class PointCloud(CloudBatch):
                 torch.eye(4, dtype=torch.float64, device="cpu").repeat(num_clouds, 1, 1).to(self.device),
             )
         fill(self, "source_frame", self.source_frame or self.frame_id)
-        fill(self, "meta", tuple(self.meta) or tuple([{} for _ in range(num_clouds)]))
-        if isinstance(given["history"], StoredSteps):
-            fill(self, "history", Histories([given["history"]]))
-        elif not isinstance(given["history"], Histories):
+        if not isinstance(given["meta"], Metas):
+            fill(self, "meta", tuple(given["meta"]) or tuple([{} for _ in range(num_clouds)]))
+        if not isinstance(given["history"], Histories):
             fill(self, "history", tuple(map(tuple, given["history"])) or ((),) * num_clouds)
         fill(self, "kinds", dict(zip(self.kinds, map(Kind, self.kinds.values()))))
 
@@ -194,7 +193,10 @@ class PointCloud(CloudBatch):
         Raises:
             ValueError: there is not one mapping for each cloud.
         """
-        return derived(self, meta=tuple([{**old, **new} for old, new in zip(self.meta, entries, strict=True)]))
+        held = vars(self)["meta"]
+        if isinstance(held, Metas) and len(entries) == len(held):
+            return derived(self, meta=held.then([*map(dict, entries)]))
+        return derived(self, meta=tuple([{**old, **new} for old, new in zip(held, entries, strict=True)]))
 
     def with_steps(self, steps: Sequence[Step] | OfClouds) -> PointCloud:
         """Add one JSON-able step to the history of each cloud.

@@ -9,6 +9,7 @@ import pickle
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader, Subset
@@ -28,7 +29,7 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.datasets import RepeatedEpochWarning, cached
 from pcdata.errors import CacheError
 from pcdata.io.store.shards import Shards
-from pcdata.structures.stored_steps import Histories, StoredSteps
+from pcdata.structures.read_later import Histories, StoredMeta, StoredSteps, StoredTexts
 from pcdata.structures.unbatched import Unbatched
 from pcdata.synthetic import TeleopSource
 from pcdata.transforms import RandomJitter, RandomPointDropout, RandomRotation
@@ -153,7 +154,8 @@ def test_workers_give_the_batches_of_single_samples(stores, start):
         for place, batch in enumerate(loader):
             wanted = PointCloud.cat([singly[index] for index in order[2 * place : 2 * place + 2]])
             assert_same_cloud(batch, wanted)
-    assert dataset._touched.fresh(order, dataset._shards.identities(order)) == []  # the workers compared them, once
+    rows = np.array(order)
+    assert dataset._touched.fresh(rows, dataset._shards.identities(rows)) == []  # the workers compared them, once
 
 
 def test_a_history_that_nobody_read_crosses_to_another_process_and_is_read_there(stores):
@@ -167,10 +169,26 @@ def test_a_history_that_nobody_read_crosses_to_another_process_and_is_read_there
 
 
 def test_a_history_that_is_none_is_told_when_it_is_read():
-    for text in (b"{", b"{}", b"[1e999]"):
-        cloud = PointCloud(points=torch.zeros(1, 3), frame_id="base", history=StoredSteps([text]))
+    for text in (b"{", b"{}", b"[1e999]", b"[{}]", b"[[], []]", b"[]"):
+        cloud = PointCloud(points=torch.zeros(1, 3), frame_id="base", history=StoredSteps(StoredTexts.of([text])))
         with pytest.raises(CacheError, match="history"):
             cloud.history  # noqa: B018
+
+
+def test_meta_that_is_none_is_told_when_it_is_read():
+    for text in (
+        b"{",
+        b"[]",
+        b"5",
+        b"{}",
+        b'{"meta":[]}',
+        b'{"meta":[[]]}',
+        b'{"meta":[{},{}]}',
+        b'{"meta":[{"a":NaN}]}',
+    ):
+        cloud = PointCloud(points=torch.zeros(1, 3), frame_id="base", meta=StoredMeta(StoredTexts.of([text])))
+        with pytest.raises(CacheError, match="meta"):
+            cloud.meta  # noqa: B018
 
 
 def test_counted_and_repeated_samples_keep_their_draws(stores):

@@ -23,15 +23,15 @@ from pcdata.files.strict_json import json_object, parse_json
 from pcdata.io.store.compact_fields import compacted, expanded
 from pcdata.structures import PointCloud, Signal
 from pcdata.structures.kinds import FIELDS
+from pcdata.structures.read_later import StoredMeta, StoredSteps
 from pcdata.structures.signals import checked_signal
-from pcdata.structures.stored_steps import StoredSteps
 
 SCHEMA = "pcdata.cloud/1"
 SIGNALS_SCHEMA = "pcdata.signals/1"
 
 _CLOUD_FIELDS = ("ptr", "source_from_cloud", "viewpoint")
 _BFLOAT16 = "bfloat16"
-EXTRA, _FRAMES, _SIGNALS = "extra.", "frames.", "signals."
+EXTRA, FRAMES, SIGNALS = "extra.", "frames.", "signals."
 DERIVED = ("intrinsics", "extrinsics")  # repeat the facts, for other tools
 
 
@@ -45,6 +45,7 @@ class Record:
 
     arrays: Mapping[str, np.ndarray]
     info: Mapping[str, Any]
+    form: Any = None  # the same for records that differ in the rows, the meta and the history alone; None = unknown
 
     def info_text(self) -> str:
         """The facts as canonical JSON."""
@@ -82,7 +83,7 @@ def record_from_cloud(cloud: PointCloud, *, compact: bool = False) -> Record:
         arrays["labels"] = _labels_as_int32(arrays["labels"])
     arrays |= {EXTRA + name: _array(name, value) for name, value in cloud.extra.items()}
     # Frames may be called "robot/base_link", and a slash would open a group in HDF5.
-    frames = _array_names(_FRAMES, cloud.frames)
+    frames = _array_names(FRAMES, cloud.frames)
     arrays |= {frames[name]: _array(name, matrix) for name, matrix in cloud.frames.items()}
     arrays |= {"ptr": cloud.ptr.numpy(), "source_from_cloud": _array("source_from_cloud", cloud.source_from_cloud)}
     if cloud.viewpoint is not None:
@@ -118,12 +119,12 @@ def cloud_from_record(record: Record) -> PointCloud:
     tensors = expanded(tensors)
     extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
     frames = {
-        unquote(name.removeprefix(_FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(_FRAMES)
+        unquote(name.removeprefix(FRAMES)): tensors.pop(name) for name in list(tensors) if name.startswith(FRAMES)
     }
     recorded = {
-        unquote(name.removeprefix(_SIGNALS)): tensors.pop(name) for name in list(tensors) if name.startswith(_SIGNALS)
+        unquote(name.removeprefix(SIGNALS)): tensors.pop(name) for name in list(tensors) if name.startswith(SIGNALS)
     }
-    if len(frames) + len(recorded) != sum(name.startswith((_FRAMES, _SIGNALS)) for name in record.arrays):
+    if len(frames) + len(recorded) != sum(name.startswith((FRAMES, SIGNALS)) for name in record.arrays):
         raise CacheError("two arrays are of one frame or signal, written differently")
     unknown = tensors.keys() - {*FIELDS, *_CLOUD_FIELDS}
     if unknown:
@@ -173,9 +174,9 @@ def signals_from_record(record: Record, num_samples: int) -> dict[str, Signal]:
     info = record.info
     if info.get("schema") != SIGNALS_SCHEMA:
         raise CacheError(f"not a record of signals: schema must be {SIGNALS_SCHEMA!r}, got {info.get('schema')!r:.100}")
-    if unknown := [name for name in record.arrays if not name.startswith(_SIGNALS)]:
+    if unknown := [name for name in record.arrays if not name.startswith(SIGNALS)]:
         raise CacheError(f"a record of signals has no arrays {unknown}")
-    tensors = {unquote(name.removeprefix(_SIGNALS)): _tensor(name, array) for name, array in record.arrays.items()}
+    tensors = {unquote(name.removeprefix(SIGNALS)): _tensor(name, array) for name, array in record.arrays.items()}
     try:
         signals = _signals(info.get("signals"), tensors)
     except (PcdataError, TypeError, ValueError) as error:
@@ -212,16 +213,16 @@ def _check_info(info: Mapping[str, Any]) -> None:
             raise CacheError(f"{name} must be a text, got {info.get(name)!r:.100}")
     if not isinstance(info.get("kinds"), dict):
         raise CacheError(f"kinds must be an object, got {info.get('kinds')!r:.100}")
-    for name, kind in (("meta", dict), ("history", list)):
+    for name, kind, unread in (("meta", dict, StoredMeta), ("history", list, StoredSteps)):
         entries = info.get(name)
-        if isinstance(entries, StoredSteps) and name == "history":
+        if isinstance(entries, unread):
             continue
         if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
             raise CacheError(f"{name} must be a list with one {kind.__name__} per cloud, got {entries!r:.100}")
 
 
 def _signal_arrays(signals: Mapping[str, Signal]) -> dict[str, np.ndarray]:
-    names = _array_names(_SIGNALS, signals)
+    names = _array_names(SIGNALS, signals)
     return {
         names[name]: _array(f"signal {name!r}", _bits(signal.values))
         for name, signal in signals.items()

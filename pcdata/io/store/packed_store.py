@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError
-from pcdata.io.store.cloud_record import DERIVED, Record, Room
-from pcdata.io.store.joined_record import joined_record, merged_info, own_info, split_info
-from pcdata.io.store.packed_file import PackedFile, PackedWriter, Place, join_rows, open_packed
+from pcdata.io.store.cloud_record import Record, Room
+from pcdata.io.store.joined_record import merged_info, own_info, split_info
+from pcdata.io.store.packed_batches import HISTORY, PackedBatches
+from pcdata.io.store.packed_file import PackedFile, open_packed
+from pcdata.io.store.packed_writer import PackedWriter
 from pcdata.io.store.store import INFO, Compression, Store, damage_named, register_store, writing
-
-_HISTORY = f"{INFO}.history"  # apart from the other facts: it is long, and seldom read
+from pcdata.io.store.text_table import TextTable
 
 
 @register_store
@@ -48,7 +47,7 @@ class _PackedStore(Store):
         text, history = (np.frombuffer(one.encode(), np.uint8) for one in texts)
         with writing(self.path):
             writer, self._writer = self._writer or PackedWriter(self.path), None
-            writer.add(key, common, {**record.arrays, INFO: text, _HISTORY: history})
+            writer.add(key, common, {**record.arrays, INFO: text, HISTORY: history})
             self._writer = writer  # one that failed is not gone on with
 
     def close(self) -> None:
@@ -61,42 +60,35 @@ class _PackedStore(Store):
     def read(self, key: str) -> Record:
         """Read one record; its arrays are the caller's own."""
         with damage_named(self.path):
-            file = self._mapped()
-            record = _as_it_lies(file.place_of(key))
+            record = self._as_it_lies(key)
             return Record({name: array.copy() for name, array in record.arrays.items()}, record.info)
 
     def digest(self, key: str) -> str:
         """Return the digest of one record, computed where it lies."""
         with damage_named(self.path):
-            file = self._mapped()
-            return _as_it_lies(file.place_of(key)).digest()
+            return self._as_it_lies(key).digest()
 
     @classmethod
-    def read_joined(cls, records: Sequence[tuple[Store, str]], room: Room | None = None) -> Record | None:
-        """Read records, of one file or several, as one; every array is copied once."""
-        places: list[Place] = []
-        store: Store | None = None
-        try:
-            for store, key in records:
-                assert isinstance(store, _PackedStore)
-                places.append((store._opened_file or store._mapped()).place_of(key))
-        except Exception:
-            with damage_named(records[len(places)][0].path_of("")):
-                raise
-        with damage_named(records[0][0].path_of("")):
-            joined = join_rows(places, DERIVED, room)
-            if joined is None:
-                return None
-            arrays, rows = joined
-            own, history = (_texts(arrays.pop(name), rows.pop(name)) for name in (INFO, _HISTORY))
-            # The strict parser looked at each when its digest was compared.
-            owns = json.loads(b"[" + b",".join(own) + b"]")
-            return joined_record(arrays, rows, places[0].facts, owns, history)
+    def batch_reader(cls) -> _Reader:
+        """Return what reads records of one file, or of several, as one; every array is copied once."""
+        return _Reader()
 
     def identity(self) -> tuple[int, ...]:
         """Return what tells the mapped file from another of its name."""
         with damage_named(self.path):
             return self._mapped().identity
+
+    def _as_it_lies(self, key: str) -> Record:
+        """Return a record whose arrays are those of the mapped file."""
+        file = self._mapped()
+        facts, arrays = file.record(file.number_of(key))
+        own, history = (arrays.pop(name, None) for name in (INFO, HISTORY))
+        if own is None or history is None or own.dtype != np.uint8 or history.dtype != np.uint8:
+            raise CacheError(f"has a record without the texts {INFO!r} and {HISTORY!r}")
+        info = merged_info(facts, own_info(own.tobytes(), history.tobytes()))
+        if "meta" in info and "ptr" in arrays and len(info["meta"]) != arrays["ptr"].size - 1:  # of signals alone: none
+            raise CacheError(f"meta must be a list with one object per cloud, got {info['meta']!r:.100}")
+        return Record(arrays, info)
 
     def _mapped(self) -> PackedFile:
         if self._writer is not None:
@@ -110,16 +102,22 @@ class _PackedStore(Store):
         return {**self.__dict__, "_writer": None, "_opened_file": None}
 
 
-def _as_it_lies(place: Place) -> Record:
-    """Return a record whose arrays are those of the mapped file."""
-    arrays = place.arrays()
-    own, history = (arrays.pop(name, None) for name in (INFO, _HISTORY))
-    if own is None or history is None or own.dtype != np.uint8 or history.dtype != np.uint8:
-        raise CacheError(f"has a record without the texts {INFO!r} and {_HISTORY!r}")
-    return Record(arrays, merged_info(place.facts, own_info(own.tobytes(), history.tobytes())))
+class _Reader:
+    """Reads batches of the files that stores have mapped."""
 
+    def __init__(self) -> None:
+        self._batches = PackedBatches()
 
-def _texts(letters: NDArray[Any], counts: NDArray[np.int64]) -> list[bytes]:
-    ends = counts.cumsum().tolist()
-    together = letters.tobytes()
-    return [together[begin:end] for begin, end in zip([0, *ends], ends)]
+    def places(self, store: _PackedStore, keys: TextTable) -> NDArray[np.int64]:
+        """Return where records lie."""
+        with damage_named(store.path):
+            file = store._mapped()
+            first = self._batches.places_in(file)
+            if file.keys == keys:  # as builds write them
+                return np.arange(first, first + len(keys))
+            numbers = {key: number for number, key in enumerate(file.keys, start=first)}
+            return np.array([numbers.get(key, -1) for key in keys], dtype=np.int64)
+
+    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
+        """Return the record of all clouds."""
+        return self._batches.read(places, room)

@@ -6,10 +6,14 @@ import hashlib
 import re
 from urllib.parse import quote
 
+import numpy as np
+
 from pcdata.errors import CacheError
+from pcdata.io.store.text_table import TextTable
 
 _MAX_KEY = 200  # file names end at 255 bytes
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,199}")
+_IS_PLAIN = np.array([_PLAIN.fullmatch(f"a{chr(byte)}") is not None for byte in range(256)])
 
 
 def key_of(sample_id: str) -> str:
@@ -32,3 +36,14 @@ def key_of(sample_id: str) -> str:
         digest = hashlib.sha256(key.encode()).hexdigest()[:32]
         key = f"{key[: _MAX_KEY - 33]}~{digest}"
     return key
+
+
+def keys_of(ids: TextTable) -> TextTable:
+    """Return the keys of many sample ids."""
+    if not len(ids):
+        return ids
+    begins = np.concatenate([np.zeros(1, np.int64), ids.ends[:-1]])
+    is_short = (ids.ends - begins <= _MAX_KEY).all()
+    if is_short and _IS_PLAIN[ids.letters].all() and not (ids.letters[begins] == ord(".")).any():
+        return ids
+    return TextTable.of(map(key_of, ids))

@@ -16,11 +16,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pcdata.errors import CacheError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input, read_bytes
 from pcdata.io.store.cloud_record import Record, Room
 from pcdata.io.store.sample_index import SampleIndex
-from pcdata.io.store.sample_keys import key_of
+from pcdata.io.store.sample_keys import key_of, keys_of
+from pcdata.io.store.store import BatchReader
 from pcdata.io.store.stores import STORES, Store
 
 FOLDER, TABLE = "shards", "files.tsv"
@@ -146,6 +150,9 @@ class Shards:
         self._form = form
         self._index = index
         self._stores: dict[int, Store] = {}
+        self.closed = 0  # how many stores were closed: what was known of their files may not hold any more
+        self._reader: BatchReader | None = None
+        self._places: NDArray[np.int64] | None = None  # of all samples, from 1, for the reader; 0 = not known
 
     def path_of(self, number: int) -> Path:
         """Return the file that holds the record of a sample."""
@@ -172,7 +179,7 @@ class Shards:
         """
         return self.store(int(self._index.shards[number])).digest(key_of(self._index.ids[number]))
 
-    def read_joined(self, numbers: Sequence[int], room: Room | None = None) -> Record | None:
+    def read_joined(self, numbers: NDArray[np.int64], room: Room | None = None) -> Record | None:
         """Read the records of some samples as one, in this order; None where the store, or these records, cannot.
 
         ``room`` gives memory for the arrays, (bytes,) uint8, or None; a store may leave it unasked.
@@ -180,11 +187,21 @@ class Shards:
         Raises:
             CacheError: as for :meth:`read`.
         """
-        shards = self._index.shards[numbers].tolist()
-        records = [(self.store(shard), key_of(self._index.ids[number])) for shard, number in zip(shards, numbers)]
-        return STORES[self._form].read_joined(records, room)
+        if self._reader is None or self._places is None:
+            self._reader = STORES[self._form].batch_reader()
+            if self._reader is None:
+                return None
+            self._places = np.zeros(len(self._index), np.int64)
+        places = self._places[numbers]
+        if not places.all():
+            for shard in {*self._index.shards[numbers[places == 0]].tolist()}:
+                own = self._index.of_shard(shard)
+                found = self._reader.places(self.store(shard), keys_of(self._index.ids.part(own)))
+                self._places[own.start : own.stop] = found + 1
+            places = self._places[numbers]
+        return self._reader.read(places - 1, room) if places.all() else None
 
-    def identities(self, numbers: Sequence[int]) -> dict[int, tuple[int, ...]] | None:
+    def identities(self, numbers: NDArray[np.int64]) -> dict[int, tuple[int, ...]] | None:
         """Return what tells the files of the shards of some samples from others of their names, by shard.
 
         None where files are opened again for every record: see :meth:`pcdata.io.Store.identity`.
@@ -220,16 +237,17 @@ class Shards:
         """Forget records that were held."""
 
     @contextmanager
-    def held(self, numbers: Sequence[int]) -> Iterator[None]:
+    def held(self, numbers: NDArray[np.int64]) -> Iterator[None]:
         """Hold some records while they are asked for several times."""
         if not self.reads_ahead:
             yield
             return
-        self.hold(numbers)
+        own = numbers.tolist()
+        self.hold(own)
         try:
             yield
         finally:
-            self.let_go(numbers)
+            self.let_go(own)
 
     def signals(self) -> Record:
         """Read the record of the signals of all samples.
@@ -252,6 +270,8 @@ class Shards:
     def close(self) -> None:
         """Close what this process has open."""
         stores, self._stores = self._stores, {}
+        self.closed += len(stores)
+        self._reader = self._places = None
         for store in stores.values():
             store.close()
 
@@ -259,8 +279,12 @@ class Shards:
         store = STORES[self._form](shard_folder(self.folder, shard))
         if store.holds_file and len(self._stores) >= _MOST_OPEN:
             self._stores.pop(next(iter(self._stores))).close()
+            self.closed += 1
         self._check_sizes(shard)
         return store
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_reader": None, "_places": None}  # addresses of this process
 
     def _check_sizes(self, shard: int) -> None:
         folder = shard_folder(self.folder, shard)

@@ -11,18 +11,44 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal
+from typing import Any, BinaryIO, ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pcdata.errors import CacheError, ConfigError, locate, write_fault
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.files.urls import UrlFolder
 from pcdata.files.zip_archive import ZipArchive
 from pcdata.io.store.cloud_record import Record, Room
+from pcdata.io.store.text_table import TextTable
 from pcdata.registry import Registry
 
 Compression = Literal["none", "lzf", "gzip"]
 
 INFO = "pcdata"  # the name that the JSON text is stored under
+
+
+class BatchReader(Protocol):
+    """What a process knows of some stores of one class, and reads records of several of them as one with."""
+
+    def places(self, store: Any, keys: TextTable) -> NDArray[np.int64]:
+        """Return where records of a store lie, by their keys: a number each, -1 where it has none of the key.
+
+        Raises:
+            CacheError: as for :meth:`Store.read`.
+        """
+        ...
+
+    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
+        """Return the record of all clouds of some places in a row; None where these records can have none.
+
+        ``room`` gives memory for the arrays; a reader may leave it unasked.
+
+        Raises:
+            CacheError: as for :meth:`Store.read`.
+        """
+        ...
 
 
 class Store:
@@ -85,15 +111,10 @@ class Store:
         return self.read(key).digest()
 
     @classmethod
-    def read_joined(cls, records: Sequence[tuple[Store, str]], room: Room | None = None) -> Record | None:
-        """Read some records as one, that of their clouds in a row; None where such stores, or these records, cannot.
+    def batch_reader(cls) -> BatchReader | None:
+        """Return what reads records of stores of this class as one; None where nothing does.
 
-        Each is told by its store, one of this class, and its key.
-
-        The digests of the records were compared before: see :meth:`identity`.
-
-        Raises:
-            CacheError: as for :meth:`read`.
+        The digests of the records are compared before: see :meth:`identity`.
         """
         return None
 

@@ -7,7 +7,7 @@ over the arrays.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import overload
 
 import numpy as np
@@ -34,6 +34,19 @@ class TextTable(Sequence[str]):
         self.letters = letters
         self.ends = ends
         self._sorted: tuple[NDArray[np.uint64], NDArray[np.int64]] | None = None  # hashes, and whose each is
+
+    @classmethod
+    def of(cls, texts: Iterable[str]) -> TextTable:
+        """Return a table of texts."""
+        encoded = [text.encode("utf-8", "surrogatepass") for text in texts]
+        ends = np.cumsum([len(one) for one in encoded], dtype=np.int64)
+        return TextTable(np.frombuffer(b"".join(encoded), np.uint8), ends)
+
+    def part(self, which: range) -> TextTable:
+        """Return some texts in a row; the memory is shared."""
+        begin = int(self.ends[which.start - 1]) if which.start else 0
+        ends = self.ends[which.start : which.stop] - begin
+        return TextTable(self.letters[begin : begin + (int(ends[-1]) if len(ends) else 0)], ends)
 
     def __len__(self) -> int:
         return len(self.ends)

@@ -16,9 +16,10 @@ import torch
 
 from pcdata import PointCloud
 from pcdata.errors import CacheError
-from pcdata.io.store import packed_file
+from pcdata.io.store import packed_writer
 from pcdata.io.store.cloud_record import Record, cloud_from_record, record_from_cloud
 from pcdata.io.store.stores import STORES
+from pcdata.io.store.text_table import TextTable
 from tests.io.memory import memory_limit
 from tests.io.store.test_stores import assert_same_cloud, full_cloud
 
@@ -33,7 +34,8 @@ def write(folder: Path, clouds: list[PointCloud]) -> Path:
 
 
 def joined(store, keys):
-    return store.read_joined([(store, key) for key in keys])
+    reader = type(store).batch_reader()
+    return reader.read(reader.places(store, TextTable.of(keys)))
 
 
 def plain(count: int, seed: int = 0) -> PointCloud:
@@ -66,7 +68,7 @@ def refused(path: Path, key: str = "k0") -> str:
 
 @pytest.mark.parametrize("group", [1, 3_000, 1 << 20])
 def test_records_come_back_whichever_group_they_fall_in(tmp_path, monkeypatch, group):
-    monkeypatch.setattr(packed_file, "_GROUP", group)
+    monkeypatch.setattr(packed_writer, "_GROUP", group)
     clouds = [full_cloud(0), plain(5, 1), plain(0, 2), full_cloud(3), plain(7, 4), plain(5, 5)]
     write(tmp_path, clouds)
     store = STORES["packed"](tmp_path)
@@ -78,7 +80,7 @@ def test_records_come_back_whichever_group_they_fall_in(tmp_path, monkeypatch, g
 @pytest.mark.parametrize("group", [1, 1 << 20])
 @pytest.mark.parametrize("which", [[0], [0, 1], [3, 0, 0, 2, 1], [2, 2]])
 def test_records_read_as_one_are_the_batch_of_their_clouds(tmp_path, monkeypatch, group, which):
-    monkeypatch.setattr(packed_file, "_GROUP", group)
+    monkeypatch.setattr(packed_writer, "_GROUP", group)
     clouds = [full_cloud(0), full_cloud(1), full_cloud(2)[0], full_cloud(3)[1:]]
     write(tmp_path, clouds)
     record = joined(STORES["packed"](tmp_path), [f"k{number}" for number in which])
