@@ -13,24 +13,27 @@ ones on the CPU, torch's own way is taken.
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import secrets
 import threading
+import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
 from pcdata.errors import CacheError
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.read_later import StoredTexts, texts_from_bytes
-from pcdata.structures.structure import Structure, derived, with_tensors
+from pcdata.structures.structure import Structure, derived
 
 S = TypeVar("S", bound=Structure)
 
@@ -41,14 +44,19 @@ _WORKER, _RECEIVER = 0, 1  # bytes of the head, 1 = holds it
 _MOST_BLOCKS = 32  # of one worker; a receiver that keeps more batches gets the others as torch sends them
 _MOST_FREE = 8  # that wait to be used again
 _SPARE = 1 << 16  # bytes
+_NUMPY = {
+    **{torch.bool: "?", torch.uint8: "u1", torch.int8: "i1", torch.int16: "i2", torch.int32: "i4"},
+    **{torch.int64: "i8", torch.float16: "f2", torch.float32: "f4", torch.float64: "f8"},
+}
 
 
 class _Place(NamedTuple):
-    """Where a tensor lies in its block."""
+    """Where a tensor lies in its block, and in its batch."""
 
     begin: int
-    dtype: torch.dtype
+    dtype: str | torch.dtype  # NumPy's word for it, where it has one
     shape: tuple[int, ...]
+    path: tuple[str, ...]  # of attributes and of keys
 
 
 class _Sent(NamedTuple):
@@ -83,7 +91,7 @@ class _Block:
     def take(self, size: int) -> Tensor:
         """Return so many bytes of the memory, which is held until nothing uses it."""
         self.content[_WORKER] = 1
-        memory = _memory(self.content, _WORKER)
+        memory = torch.from_numpy(_memory(self.content, _WORKER))
         self.begin, self.used = memory.data_ptr(), size
         return memory[:size]
 
@@ -172,18 +180,18 @@ def _can_be_opened() -> bool:
 _OPENS: bool | None = None
 
 
-def _memory(content: mmap.mmap, holder: int) -> Tensor:
-    """Return what lies behind the head as a tensor; when its last view is gone, the holder's mark is taken away."""
+def _memory(content: mmap.mmap, holder: int) -> NDArray[np.uint8]:
+    """Return what lies behind the head; when its last view is gone, the holder's mark is taken away."""
     array = np.frombuffer(content, np.uint8, offset=_HEAD)
     # Not in a process that was forked since: it has copies of these objects, and holds nothing.
     weakref.finalize(array, _let_go, content, holder, os.getpid()).atexit = False
-    return torch.from_numpy(array)
+    return array
 
 
 def _let_go(content: mmap.mmap, holder: int, process: int) -> None:
     if os.getpid() == process:
         content[holder] = 0
-        if holder == _RECEIVER:
+        if holder == _RECEIVER and time.monotonic() > _LOOK_AGAIN + _LAST_LOOK:
             _forget_the_dead()
 
 
@@ -200,13 +208,25 @@ def _reduced(structure: Structure) -> Any:
     """Return how a batch is pickled for another process."""
     _SENDING.block = None, None
     if _is_worker():
-        tensors: list[Tensor] = []
-        with_tensors(structure, lambda tensor: tensors.append(tensor) or tensor)  # type: ignore[func-returns-value]
-        if tensors and all(map(_is_plain, tensors)):
-            sent = _sent(structure, tensors)
+        found: list[tuple[tuple[str, ...], Tensor]] = []
+        state = {name: _taken_apart(value, (name,), found) for name, value in vars(structure).items()}
+        if found and all(_is_plain(tensor) for _, tensor in found):
+            sent = _sent(found)
             if sent is not None:
-                return sent
+                return _received, (type(structure), state, *sent)
     return structure.__reduce_ex__(4)
+
+
+def _taken_apart(value: Any, path: tuple[str, ...], found: list[tuple[tuple[str, ...], Tensor]]) -> Any:
+    """Return a value of structures without its tensors, which are listed with their paths."""
+    if isinstance(value, Tensor):
+        found.append((path, value))
+        return None
+    if isinstance(value, Structure):
+        return derived(value, **{name: _taken_apart(one, (*path, name), found) for name, one in vars(value).items()})
+    if isinstance(value, Mapping) and any(isinstance(one, (Tensor, Structure)) for one in value.values()):
+        return {name: _taken_apart(one, (*path, name), found) for name, one in value.items()}
+    return value
 
 
 def _is_plain(tensor: Tensor) -> bool:
@@ -220,7 +240,9 @@ def _is_plain(tensor: Tensor) -> bool:
     )
 
 
-def _sent(structure: Structure, tensors: list[Tensor]) -> Any:
+def _sent(found: Sequence[tuple[tuple[str, ...], Tensor]]) -> tuple[list[_Place], _Sent] | None:
+    """Lay tensors into a block, but for those that are in it; return where each is, or None where there is no block."""
+    tensors = [tensor for _, tensor in found]
     block = _BLOCKS.holding(max(tensors, key=lambda tensor: tensor.nbytes))
     rest = None
     if block is not None:  # what else there is goes behind it, such as a mask
@@ -235,19 +257,17 @@ def _sent(structure: Structure, tensors: list[Tensor]) -> Any:
     begin, free = block.begin, rest.data_ptr() - block.begin
     laid = {id(tensor) for tensor in others}
     places = []
-    for tensor in tensors:
-        if id(tensor) not in laid:
-            places.append(_Place(tensor.data_ptr() - begin, tensor.dtype, tuple(tensor.shape)))
-            continue
-        places.append(_Place(free, tensor.dtype, tuple(tensor.shape)))
-        _at(rest, places[-1]._replace(begin=free + begin - rest.data_ptr())).copy_(tensor)
-        free += _aligned(tensor.nbytes)
-    swap = iter(places)
-    state = {name: with_tensors(value, lambda tensor: next(swap)) for name, value in vars(structure).items()}
+    for path, tensor in found:
+        is_laid = id(tensor) in laid
+        place = free if is_laid else tensor.data_ptr() - begin
+        places.append(_Place(place, _NUMPY.get(tensor.dtype, tensor.dtype), tuple(tensor.shape), path))
+        if is_laid:
+            _at(rest.numpy(), places[-1]._replace(begin=free + begin - rest.data_ptr())).copy_(tensor)
+            free += _aligned(tensor.nbytes)
     block.content[_RECEIVER] = 1
     sent = _Sent(os.getpid(), block.file, block.size, block.name)
     _SENDING.block = block, sent
-    return _received, (type(structure), state, sent)
+    return places, sent
 
 
 _SENDING = threading.local()  # the block of the batch that is pickled, and what is sent of it
@@ -270,25 +290,30 @@ def _aligned(size: int) -> int:
     return size + -size % _ALIGNED
 
 
-def _at(memory: Tensor, place: _Place) -> Tensor:
-    begin, dtype, shape = place
-    size = dtype.itemsize
-    for length in shape:
-        size *= length
-    return memory[begin : begin + size].view(dtype).view(shape)
+def _at(memory: NDArray[np.uint8], place: _Place) -> Tensor:
+    if isinstance(place.dtype, str):
+        return torch.from_numpy(np.ndarray(place.shape, place.dtype, memory, place.begin))
+    size = math.prod(place.shape) * place.dtype.itemsize
+    return torch.from_numpy(memory[place.begin : place.begin + size]).view(place.dtype).view(place.shape)
 
 
 # -- receiving --------------------------------------------------------------------------------------------------------
 
 _MAPPED: dict[bytes, tuple[int, mmap.mmap]] = {}  # name -> worker, block
 _MAPPED_BY = os.getpid()
+_LAST_LOOK, _LOOK_AGAIN = 0.0, 1.0  # seconds: when it was seen which workers live, and after how long it is again
 
 
-def _received(cls: type[Structure], state: Mapping[str, Any], sent: _Sent) -> Structure:
+def _received(cls: type[Structure], state: dict[str, Any], places: Sequence[_Place], sent: _Sent) -> Structure:
     """Put a batch together from where the worker laid it."""
     memory = _memory(_mapped(sent), _RECEIVER)
-    swap: Callable[[Any], Any] = lambda place: _at(memory, place)  # noqa: E731
-    return derived(object.__new__(cls), **{name: with_tensors(value, swap, _Place) for name, value in state.items()})
+    for place in places:
+        holder: Any = state
+        for name in place.path[:-1]:
+            holder = holder[name]
+            holder = vars(holder) if isinstance(holder, Structure) else holder
+        holder[place.path[-1]] = _at(memory, place)
+    return derived(object.__new__(cls), **state)
 
 
 def _received_texts(sent: _Sent, begin: int, size: int, ends: bytes) -> StoredTexts:
@@ -326,6 +351,8 @@ def _mapped(sent: _Sent) -> mmap.mmap:
 
 def _forget_the_dead() -> None:
     """Give back the memory of workers that have ended; batches that are still held keep theirs."""
+    global _LAST_LOOK
+    _LAST_LOOK = time.monotonic()
     for name, (process, _) in list(_MAPPED.items()):
         try:
             os.kill(process, 0)

@@ -65,12 +65,12 @@ class Structure:
         return mapped
 
 
-def with_tensors(value: Any, swap: Callable[[Any], Any], kind: type = Tensor) -> Any:
-    """Return a value of structures with every tensor in them swapped, in order; or whatever stands for tensors."""
-    if isinstance(value, kind):
+def with_tensors(value: Any, swap: Callable[[Tensor], Tensor]) -> Any:
+    """Return a value of structures with every tensor in them swapped."""
+    if isinstance(value, Tensor):
         return swap(value)
     if isinstance(value, Structure):
-        return derived(value, **{name: with_tensors(one, swap, kind) for name, one in vars(value).items()})
-    if isinstance(value, Mapping) and any(isinstance(one, (kind, Structure)) for one in value.values()):
-        return {name: with_tensors(one, swap, kind) for name, one in value.items()}
+        return derived(value, **{name: with_tensors(one, swap) for name, one in vars(value).items()})
+    if isinstance(value, Mapping) and any(isinstance(one, (Tensor, Structure)) for one in value.values()):
+        return {name: with_tensors(one, swap) for name, one in value.items()}
     return value
