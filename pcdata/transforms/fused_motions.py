@@ -1,23 +1,27 @@
-"""Motions and jitter in a row as one pass over the points.
+"""Motions and jitter in a row, and a dropout behind them, as one pass over the points.
 
 Each step by itself would read all points from memory and fill as much memory anew. What is decided without a look at
 the points can be decided for all these steps first; :class:`Compose` then takes every point through them at once,
-rounded after each step as the single steps round. The clouds and their histories are those of the single steps, bit for
-bit; and whatever they would refuse is left to them.
+rounded after each step as the single steps round, and writes those that stay. The clouds and their histories are those
+of the single steps, bit for bit; and whatever they would refuse is left to them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from torch import Tensor
+
 from pcdata.errors import PcdataError
 from pcdata.functional.noise import PointStep, move_points
+from pcdata.functional.rows import pick_rows
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
+from pcdata.structures.kinds import attributes
 from pcdata.structures.structure import derived
 from pcdata.transforms.base import Transform
 from pcdata.transforms.families import SpatialTransform
-from pcdata.transforms.random_jitter import RandomJitter
+from pcdata.transforms.random_jitter import RandomJitter, RandomPointDropout
 from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
 
 
@@ -25,6 +29,10 @@ def motions_from(steps: Sequence[Transform], position: int) -> int:
     """Return how many steps, from one on, can run as one."""
     count = 0
     for step in steps[position:]:
+        if step._forward_hooks or step._forward_pre_hooks:  # somebody watches it
+            break
+        if type(step) is RandomPointDropout:  # the rows behind it are other ones
+            return count + 1
         if not _is_blind(step):
             break
         count += 1
@@ -33,8 +41,6 @@ def motions_from(steps: Sequence[Transform], position: int) -> int:
 
 def _is_blind(step: Transform) -> bool:
     """Whether a step moves points, or adds noise, without having looked at them."""
-    if step._forward_hooks or step._forward_pre_hooks:  # somebody watches it
-        return False
     # Exact types: a subclass may do something else.
     if type(step) in (RandomRotation, RandomScale, RandomFlip):
         return vars(step)["about"] == "origin"
@@ -46,7 +52,7 @@ def run_motions(
 ) -> PointCloud | None:
     """Run steps that :func:`motions_from` found; None where they must be run one by one, with the same draws.
 
-    ``in_place``: the points are nobody else's, and their memory takes the result.
+    ``in_place``: the rows are nobody else's, and their memory takes the result.
     """
     before = streams.place
     try:
@@ -57,8 +63,9 @@ def run_motions(
 
 
 def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool) -> PointCloud:
-    points, layout = cloud.points, cloud.layout
+    points, ptr, layout = cloud.points, cloud.ptr, cloud.layout
     done: list[PointStep] = []
+    kept: tuple[Tensor, Tensor] | None = None
     for step in steps:
         step.check_input(cloud)
         params = step.make_params(cloud, streams)
@@ -66,9 +73,18 @@ def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_pla
             moved = cloud.with_facts_moved(params["matrix"])
             layout = layout and moved.layout
             done.append(params["matrix"])
-        else:
-            assert isinstance(step, RandomJitter)
+        elif isinstance(step, RandomJitter):
             moved, layout = cloud, None
             done.append(step.point_step(params))
+        else:
+            kept = params["index"], params["ptr"]
+            moved = derived(cloud, ptr=params["ptr"])
         cloud = step.recorded(cloud, moved, params)
-    return derived(cloud, points=move_points(points, cloud.ptr, done, in_place=in_place), layout=layout)
+    # Nothing is refused from here on: memory may change.
+    rows = cloud.fields()
+    if done:
+        rows["points"] = move_points(points, ptr, done, kept, in_place=in_place)
+    if kept is not None:
+        others = {name: value for name, value in rows.items() if name != "points" or not done}
+        rows |= pick_rows(others, kept[0], in_place=in_place)
+    return derived(cloud, **attributes(rows), layout=layout)

@@ -1,6 +1,7 @@
 // Points that are moved and jittered, and rows chosen at random.
 #include "pc/math/affine.hpp"
 #include "pc/noise/normal.hpp"
+#include "pc/rows/runs.hpp"
 #include "pc/threads.hpp"
 
 namespace pc::noise {
@@ -25,12 +26,16 @@ struct Block {
   }
   // Write the rows that are kept one after another; returns how many.
   int64_t store_kept(float* points, const uint8_t* kept, int64_t count) const {
+    Block packed;
     int64_t written = 0;
-    for (int64_t i = 0; i < count; ++i) {
-      if (!kept[i]) continue;
-      for (int a = 0; a < 3; ++a) points[3 * written + a] = axis[a][i];
-      ++written;
+    for (int a = 0; a < 3; ++a) {
+      int32_t words[kBlock + kLanes] = {};  // what is behind the kept ones is not written
+      written = rows::pack_rows<1>(reinterpret_cast<const char*>(axis[a]), kept, count, words);
+      std::memcpy(packed.axis[a], words, sizeof packed.axis[a]);
     }
+    float together[3 * kBlock];
+    packed.store(together, kBlock);
+    std::memcpy(points, together, static_cast<size_t>(3 * written) * sizeof(float));
     return written;
   }
   void move(const double* matrix) {

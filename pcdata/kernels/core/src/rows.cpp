@@ -42,19 +42,24 @@ void with_row_size(int64_t bytes, const Body& body) {
 }
 
 // Copy runs of rows one after another; `picked` may lie before the rows in the same memory, or where they begin.
-template <class Bytes>
-void copy_runs(const char* source, Bytes bytes, const Run* runs, int64_t num_runs, char* picked) {
-  constexpr int64_t kShort = 8;  // below it, calling memcpy costs more than the copy
+void copy_runs(const char* source, int64_t bytes, const Run* runs, int64_t num_runs, char* picked) {
   for (int64_t r = 0; r < num_runs; ++r) {
-    const char* from = source + runs[r].start * bytes;
-    const int64_t length = runs[r].length;
-    if (from == picked) {  // in the same memory, and no row has been left out yet
-    } else if (length < kShort)
-      for (int64_t i = 0; i < length; ++i)
-        std::memcpy(picked + i * bytes, from + i * bytes, static_cast<size_t>(bytes));
-    else
-      std::memmove(picked, from, static_cast<size_t>(length * bytes));
-    picked += length * bytes;
+    const auto size = static_cast<size_t>(runs[r].length * bytes);
+    std::memmove(picked, source + runs[r].start * bytes, size);
+    picked += size;
+  }
+}
+
+// Copy the rows of a mask one after another, likewise; rows of one word, or three.
+template <int kWords>
+void copy_kept(const char* source, const uint8_t* mask, int64_t first, int64_t last, char* picked) {
+  constexpr int64_t kBytes = 4 * kWords;
+  int32_t packed[kWords * kStretch + kLanes];
+  for (int64_t begin = first; begin < last; begin += kStretch) {
+    const int64_t count = std::min(kStretch, last - begin);
+    const int64_t kept = pack_rows<kWords>(source + begin * kBytes, mask + begin, count, packed);
+    std::memcpy(picked, packed, static_cast<size_t>(kept * kBytes));
+    picked += kept * kBytes;
   }
 }
 
@@ -89,10 +94,14 @@ PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, i
     const pc_context alone{1, context->poll};
     parallel_for(in_place ? alone : *context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
       Run runs[kRowsPerPiece / 2];
-      const int64_t num_runs = find_runs(mask, first, last, runs);
       const int64_t start = starts[first / kRowsPerPiece];
+      int64_t num_runs = -1;
       fields.each([&](const char* source, int64_t row_size, char* to) {
-        with_row_size(row_size, [&](auto bytes) { copy_runs(source, bytes, runs, num_runs, to + start * bytes); });
+        to += start * row_size;
+        if (row_size == 12) return copy_kept<3>(source, mask, first, last, to);
+        if (row_size == 4) return copy_kept<1>(source, mask, first, last, to);
+        if (num_runs < 0) num_runs = find_runs(mask, first, last, runs);
+        copy_runs(source, row_size, runs, num_runs, to);
       });
     });
   });
