@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import itertools
 
 import pytest
@@ -88,3 +89,14 @@ def test_wrong_generators_are_refused():
         rng.Streams.of([rng.seeded(0), rng.seeded(1)], 3)
     with pytest.raises(DTypeError, match=r"torch\.Generator"):
         rng.Streams.of([0, 1], 2)
+
+
+def test_the_keys_of_a_batch_are_the_hashes_of_its_samples_one_by_one():
+    ids, copies = ["scene/7", "bü", "\udcff.npz"], [0, 1, 12]
+    wanted = []
+    for name, copy in zip(ids, copies, strict=True):
+        text = f"3\0-1\0{name}" + (f"\0{copy}" if copy else "")
+        wanted.append(int.from_bytes(hashlib.sha256(text.encode(errors="surrogatepass")).digest()[:8], "big") >> 1)
+    encoded = [name.encode(errors="surrogatepass") for name in ids]
+    assert rng.sample_keys(3, -1, encoded, copies).tolist() == wanted
+    assert [rng.sample_key(3, -1, name, copy=copy) for name, copy in zip(ids, copies, strict=True)] == wanted

@@ -18,7 +18,6 @@ import mmap
 import os
 import secrets
 import threading
-import time
 import weakref
 from collections.abc import Mapping, Sequence
 from multiprocessing.reduction import ForkingPickler
@@ -191,7 +190,7 @@ def _memory(content: mmap.mmap, holder: int) -> NDArray[np.uint8]:
 def _let_go(content: mmap.mmap, holder: int, process: int) -> None:
     if os.getpid() == process:
         content[holder] = 0
-        if holder == _RECEIVER and time.monotonic() > _LOOK_AGAIN + _LAST_LOOK:
+        if holder == _RECEIVER:
             _forget_the_dead()
 
 
@@ -301,7 +300,6 @@ def _at(memory: NDArray[np.uint8], place: _Place) -> Tensor:
 
 _MAPPED: dict[bytes, tuple[int, mmap.mmap]] = {}  # name -> worker, block
 _MAPPED_BY = os.getpid()
-_LAST_LOOK, _LOOK_AGAIN = 0.0, 1.0  # seconds: when it was seen which workers live, and after how long it is again
 
 
 def _received(cls: type[Structure], state: dict[str, Any], places: Sequence[_Place], sent: _Sent) -> Structure:
@@ -351,13 +349,12 @@ def _mapped(sent: _Sent) -> mmap.mmap:
 
 def _forget_the_dead() -> None:
     """Give back the memory of workers that have ended; batches that are still held keep theirs."""
-    global _LAST_LOOK
-    _LAST_LOOK = time.monotonic()
-    for name, (process, _) in list(_MAPPED.items()):
+    for worker in {process for process, _ in _MAPPED.values()}:
         try:
-            os.kill(process, 0)
+            os.kill(worker, 0)
         except ProcessLookupError:
-            _MAPPED.pop(name, None)
+            for name in [name for name, (process, _) in _MAPPED.items() if process == worker]:
+                _MAPPED.pop(name, None)
         except OSError:
             continue
 

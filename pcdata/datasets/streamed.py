@@ -84,7 +84,7 @@ class StreamedCloudDataset(IterableDataset[Any]):
         if self.rank >= self.num_replicas:
             raise ConfigError(f"{where}: rank must be below num_replicas {self.num_replicas}, got {self.rank}")
         index = dataset.manifest.index
-        shards = index.shards[np.asarray(dataset._rows)]
+        shards = index.shards[dataset._rows_of(np.arange(len(dataset.ids)))]
         starts = np.flatnonzero(np.diff(shards, prepend=-1))  # of each shard, its first sample
         self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._counts: NDArray[np.int64] = np.diff(starts, append=len(shards)).astype(np.int64)
@@ -239,7 +239,7 @@ class _Reading:
         given: list[int],
     ) -> None:
         self._stream, self._part, self._order = stream, part, order
-        self._shards, self._rows = stream.dataset._shards, stream.dataset._rows
+        self._shards = stream.dataset._shards
         self._given = {*given}
         self._read = part.start
 
@@ -254,7 +254,8 @@ class _Reading:
         for which, own in itertools.groupby(places, lambda place: int(np.searchsorted(ends, place, "right"))):
             last = min(int(ends[which]), self._part.stop) - 1
             try:
-                self._shards.hold([self._row(place) for place in own], until=self._row(last))
+                *rows, last_row = self._rows([*own, last])
+                self._shards.hold(rows, until=last_row)
             except CacheError as error:
                 if get_worker_info() is not None:
                     raise for_the_parent(error) from error.__cause__
@@ -263,11 +264,14 @@ class _Reading:
     def forget(self, indices: list[int]) -> None:
         """Let go of samples that were given."""
         if self._shards.reads_ahead:
-            count = len(self._stream.dataset.ids)
-            self._shards.let_go([self._rows[index % count] for index in indices])
+            self._shards.let_go(self._rows_of(indices))
 
-    def _row(self, place: int) -> int:
-        return self._rows[self._stream._index(self._order, place) % len(self._stream.dataset.ids)]
+    def _rows(self, places: list[int]) -> list[int]:
+        return self._rows_of([self._stream._index(self._order, place) for place in places])
+
+    def _rows_of(self, indices: list[int]) -> list[int]:
+        dataset = self._stream.dataset
+        return dataset._rows_of(np.array(indices, dtype=np.int64) % len(dataset.ids)).tolist()
 
 
 def _at_least(where: str, name: str, value: Any, least: int) -> int:

@@ -85,6 +85,9 @@ class _Stored:
     def __getitem__(self: Any, clouds: slice) -> Any:
         return type(self)(self.texts[clouds])
 
+    def __iter__(self) -> Iterator[Any]:
+        raise NotImplementedError
+
 
 class StoredSteps(_Stored):
     """The steps of B clouds as JSON texts, a list each in a list of its own: what a record of one cloud stores."""

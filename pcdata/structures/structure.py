@@ -65,7 +65,7 @@ class Structure:
         return mapped
 
 
-def with_tensors(value: Any, swap: Callable[[Tensor], Tensor]) -> Any:
+def with_tensors(value: Any, swap: Callable[[Any], Any]) -> Any:
     """Return a value of structures with every tensor in them swapped."""
     if isinstance(value, Tensor):
         return swap(value)

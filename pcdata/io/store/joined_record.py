@@ -85,7 +85,7 @@ def joined_record(
     arrays: dict[str, NDArray[Any]],  # name -> the rows of all records, one record after another
     rows: Mapping[str, NDArray[np.int64]],  # name -> (R,) how many are of each record
     common: Mapping[str, Any],  # the facts that all have
-    texts: StoredTexts,  # (R,) the other facts of each, but for the history, as JSON
+    owns: StoredTexts | Sequence[Any],  # (R,) the other facts of each, but for the history; as JSON, or read
     histories: StoredTexts,  # (R,) as JSON
 ) -> Record | None:
     """Return the record of all clouds in a row; None where they cannot share a batch, or one is no cloud.
@@ -103,14 +103,18 @@ def joined_record(
     if joined_ptr is None:
         return None
     arrays = {**arrays, "ptr": joined_ptr}
-    if bool((clouds == 1).all()) and _has_no_texts(arrays, common):
-        if not all(_lengths(one).min() for one in (texts, histories)):
-            return None
-        return Record(arrays, {**common, "meta": StoredMeta(texts), "history": StoredSteps(histories)})
-    # The strict parser looked at each when its digest was compared.
-    owns = json.loads(b"[" + b",".join(texts) + b"]")
-    own = _joined_own(owns, histories)
-    if own is None or clouds.tolist() != [len(one["meta"]) for one in owns]:
+    read: Sequence[Any]
+    if isinstance(owns, StoredTexts):
+        if bool((clouds == 1).all()) and _has_no_texts(arrays, common):
+            if not all(_lengths(one).min() for one in (owns, histories)):
+                return None
+            return Record(arrays, {**common, "meta": StoredMeta(owns), "history": StoredSteps(histories)})
+        # The strict parser looked at each when its digest was compared.
+        read = json.loads(b"[" + b",".join(owns) + b"]")
+    else:
+        read = owns
+    own = _joined_own(read, histories)
+    if own is None or clouds.tolist() != [len(one["meta"]) for one in read]:
         return None
     return Record(arrays, merged_info(common, own))
 

@@ -278,10 +278,17 @@ class Shards:
     def _opened(self, shard: int) -> Store:
         store = STORES[self._form](shard_folder(self.folder, shard))
         if store.holds_file and len(self._stores) >= _MOST_OPEN:
-            self._stores.pop(next(iter(self._stores))).close()
-            self.closed += 1
+            self._close(next(iter(self._stores)))
         self._check_sizes(shard)
         return store
+
+    def _close(self, shard: int) -> None:
+        """Close the store of a shard; another one is opened when it is asked for again."""
+        self._stores.pop(shard).close()
+        self.closed += 1
+        if self._places is not None:
+            own = self._index.of_shard(shard)
+            self._places[own.start : own.stop] = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_reader": None, "_places": None}  # addresses of this process

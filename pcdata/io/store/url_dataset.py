@@ -111,7 +111,7 @@ class UrlShards(Shards):
         store = STORES[self._form].at_url(self.server, _name(shard))
         idle = [other for other in self._stores if not self._held.get(other)]
         if len(self._stores) >= _MOST_OPEN and idle:
-            self._stores.pop(idle[0]).close()
+            self._close(idle[0])
         fetch(self.server, self.folder, f"{_name(shard)}/{TABLE}")
         for name, told in read_table(self.folder, shard, self._index.tables[shard].tobytes()).items():
             found = self.server.status(f"{_name(shard)}/{name}").size if "/" not in name else told.size

@@ -23,6 +23,8 @@ from pcdata.io.store.cloud_record import DERIVED, Record, Room, parse_info
 from pcdata.io.store.joined_record import common_and_own, joined_record, own_info
 from pcdata.io.store.store import Compression, Store, damage_named, register_store, writing
 from pcdata.io.store.tar_shard import TarShard, TarWriter
+from pcdata.io.store.text_table import TextTable
+from pcdata.structures.read_later import StoredTexts
 
 _FILE = "clouds.tar"
 _USUAL = 128  # bytes of the header of a .npy array
@@ -93,19 +95,9 @@ class _WebDatasetStore(Store):
             return _Parts.of(key, self.opened().sample(key)).record().digest()
 
     @classmethod
-    def read_joined(cls, records: Sequence[tuple[Store, str]], room: Room | None = None) -> Record | None:
-        """Read records, of one archive or several, as one; every array is copied once."""
-        parts: list[_Parts] = []
-        store: Store | None = None
-        try:
-            for store, key in records:
-                assert isinstance(store, _WebDatasetStore)
-                parts.append(_Parts.of(key, store.opened().sample(key)))
-        except Exception:
-            with damage_named(records[len(parts)][0].place_of("")):
-                raise
-        with damage_named(records[0][0].place_of("")):
-            return _joined(parts, room)
+    def batch_reader(cls) -> _Reader:
+        """Return what reads records of one archive, or of several, as one; every array is copied once."""
+        return _Reader()
 
     def hold(self, keys: Sequence[str], until: str | None = None) -> None:
         """Read some records ahead, from a server with few requests."""
@@ -228,6 +220,29 @@ def _npy_header(start: bytes, size: int) -> NpyHeader | None:
     return parse_header(start, size) if header_length(start[:PREFIX]) == _USUAL else None
 
 
+class _Reader:
+    """Reads batches: the place of a record is its number among those that were asked about."""
+
+    def __init__(self) -> None:
+        self._records: list[tuple[_WebDatasetStore, str]] = []
+
+    def places(self, store: _WebDatasetStore, keys: TextTable) -> NDArray[np.int64]:
+        """Return where records lie; whether they do is told when they are read."""
+        first = len(self._records)
+        self._records += [(store, key) for key in keys]
+        return np.arange(first, len(self._records))
+
+    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
+        """Return the record of all clouds."""
+        parts: list[_Parts] = []
+        records = [self._records[place] for place in places.tolist()]
+        for store, key in records:
+            with damage_named(store.place_of("")):
+                parts.append(_Parts.of(key, store.opened().sample(key)))
+        with damage_named(records[0][0].place_of("")):
+            return _joined(parts, room)
+
+
 def _joined(parts: Sequence[_Parts], room: Room | None) -> Record | None:
     """Return the record of all clouds in a row; None where they do not share a batch, or one is no cloud."""
     if not all(part.history for part in parts):
@@ -240,7 +255,8 @@ def _joined(parts: Sequence[_Parts], room: Room | None) -> Record | None:
     if joined is None:
         return None
     arrays, rows = joined
-    return joined_record(arrays, rows, split[0][0], [own for _, own in split], [part.history for part in parts])
+    histories = StoredTexts.of([part.history for part in parts])
+    return joined_record(arrays, rows, split[0][0], [own for _, own in split], histories)
 
 
 def _joined_arrays(

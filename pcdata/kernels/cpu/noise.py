@@ -19,7 +19,7 @@ def move_points(
     points: Tensor,
     ptr: Tensor,
     steps: Sequence[PointStep],
-    kept: tuple[Tensor, Tensor] | tuple[None, None] | None = None,
+    kept: tuple[Tensor, Tensor] | None = None,
     *,
     in_place: bool = False,
 ) -> Tensor:
@@ -27,14 +27,12 @@ def move_points(
     fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and len(ptr) > 1 and int(ptr[-1]) == len(points)
     if not fits or not steps or int(ptr[0]) != 0 or (in_place and not points.is_contiguous()):
         return INNER["move_points"].reference(points, ptr, steps, kept, in_place=in_place)
-    if kept is None:
-        kept, count, moved = (None, None), len(points), points
-    else:
-        count = int(kept[1][-1])
-        moved = points[:count]
+    mask, kept_ptr = (None, None) if kept is None else kept
+    count = len(points) if kept_ptr is None else int(kept_ptr[-1])
+    moved = points if kept_ptr is None else points[:count]
     if not in_place:
         (moved,) = room_for(((count, 3), points.dtype))
-    _run(points.contiguous(), ptr, steps, kept, moved)
+    _run(points.contiguous(), ptr, steps, (mask, kept_ptr), moved)
     return moved
 
 
@@ -42,7 +40,7 @@ def _run(
     points: Tensor,
     ptr: Tensor,
     steps: Sequence[PointStep],
-    kept: tuple[Tensor, Tensor] | tuple[None, None],
+    kept: tuple[Tensor | None, Tensor | None],
     moved: Tensor,
 ) -> None:
     clouds = len(ptr) - 1

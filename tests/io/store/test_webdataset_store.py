@@ -21,6 +21,7 @@ from pcdata.io.store import tar_shard
 from pcdata.io.store.cloud_record import cloud_from_record, record_from_cloud
 from pcdata.io.store.stores import STORES
 from pcdata.io.store.tar_shard import TarShard, TarWriter
+from pcdata.io.store.text_table import TextTable
 from tests.io.store.test_stores import assert_same_cloud, full_cloud, refused
 
 KEYS = ("scene.7", "b", "%2Ehidden", "long" * 40)
@@ -89,7 +90,8 @@ def test_samples_are_read_in_any_order_and_together(tmp_path):
     store = STORES["webdataset"](tmp_path)
     for number in (2, 0, 3, 1):
         assert_same_cloud(cloud_from_record(store.read(KEYS[number])), full_cloud(number))
-    joined = store.read_joined([(store, KEYS[2]), (store, KEYS[0])])
+    reader = store.batch_reader()
+    joined = reader.read(reader.places(store, TextTable.of([KEYS[2], KEYS[0]])))
     assert_same_cloud(cloud_from_record(joined), PointCloud.cat([full_cloud(2), full_cloud(0)]))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -170,3 +171,31 @@ def test_a_box_equals_the_reference_and_refuses_what_is_not_finite(bad):
     assert 0 < int(ours.sum()) < len(points)
     points[20_001, 1] = bad
     assert both("inside_box", points, *box) == (None, None)
+
+
+@pytest.mark.parametrize("count", [1, 64, 65, 40_000])
+@pytest.mark.parametrize("share", [0.0, 0.07, 0.9, 1.0])
+def test_rows_are_kept_in_their_own_memory_as_in_other(count, share):
+    mask = torch.rand(count, generator=seeded(count)) < share
+    fields = {
+        str(number): torch.rand(count, *shape, generator=seeded(number)).mul(100).to(dtype)
+        for number, (shape, dtype) in enumerate(
+            [((3,), torch.float32), ((), torch.int64), ((1,), torch.float32), ((), torch.uint8), ((7,), torch.float32)]
+        )
+    }
+    wanted = {name: field[mask] for name, field in fields.items()}
+    for body in (INNER["pick_rows"].kernels["cpu"], INNER["pick_rows"].reference):
+        own = {name: field.clone() for name, field in fields.items()}
+        for in_place in (False, True):
+            kept = body(own, mask, in_place=in_place)
+            assert all(torch.equal(kept[name], wanted[name]) for name in fields)
+        assert all(kept[name].data_ptr() == own[name].data_ptr() for name in fields if len(kept[name]))
+
+
+def test_blocks_are_copied_from_where_they_lie():
+    source = torch.arange(100, dtype=torch.uint8)
+    begins, starts, sizes = (np.array(row) for row in ([[0, 9], [20, 3]], [[3, 40], [30, 0]], [[3, 11], [4, 0]]))
+    for body in (INNER["copy_blocks"].kernels["cpu"], INNER["copy_blocks"].reference):
+        into = torch.zeros(24, dtype=torch.uint8)
+        body(into, begins, starts + source.data_ptr(), sizes)
+        assert into.tolist() == [3, 4, 5, *[0] * 6, *range(40, 51), *range(30, 34)]
