@@ -234,7 +234,7 @@ def _webdataset(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Lo
 
 def _litdata(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
     from litdata import StreamingDataLoader, StreamingDataset
-    from litdata.streaming import BinaryWriter
+    from litdata.streaming.writer import BinaryWriter
 
     target = folder / "litdata"
     target.mkdir()
