@@ -216,9 +216,8 @@ def _global_poses(source: Tensor, target: Tensor) -> tuple[list[Tensor], float]:
         features.append(registration.compute_fpfh_feature(cloud, wide))
     reach, poses = _PAIR_VOXELS * voxel, []
     # Open3D has one generator of its own and takes no other: without its seed the same clouds would get other poses.
-    generator = open3d.utility.random
     for seed in _SEEDS:
-        generator.seed(seed)
+        open3d.utility.random.seed(seed)
         result = registration.registration_ransac_based_on_feature_matching(
             *clouds,
             *features,
