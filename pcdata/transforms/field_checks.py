@@ -100,8 +100,11 @@ def validated_fields(cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
         model = _field_model(cls)(**_as_plain(fields))
     except pydantic.ValidationError as error:
         told: dict[Path, list[str]] = {}
-        for fault in error.errors():
-            told.setdefault(_place(fault["loc"]), []).append(_fault_message(cls, fault))
+        found = [(_place(fault["loc"]), fault) for fault in error.errors()]
+        entered = {path[0] for path, _ in found if len(path) > 1}  # by one alternative: what is wrong is in there
+        for path, fault in found:
+            if not (len(path) == 1 and path[0] in entered and fault["type"].endswith("_type")):
+                told.setdefault(path, []).append(_fault_message(cls, fault))
         faults = [(path, ", or: ".join(texts)) for path, texts in told.items()]
         lines = [f"{'.'.join(map(str, (cls.__name__, *path)))}: {text}" for path, text in faults]
         raise faulty_config("\n".join(lines), faults) from None

@@ -38,7 +38,11 @@ def test_print_config_of_a_model_loads_again(capsys, tmp_path, model):
 
 
 def test_set_changes_settings_with_their_types(capsys, config, captures, tmp_path):
-    words = ["cloud.FarthestPointSample.num_points=8", "output.format=npz", "augment.0.RandomRotation.degrees=[10, 20]"]
+    words = [
+        "cloud.FarthestPointSample.num_points=8",
+        "output.format=npz",
+        "augment.0.RandomRotation.degrees=[1, 2, 3, 4]",
+    ]
     call = ["build", config, "--source", captures, "--out", tmp_path / "out"]
     code, _, err = run(capsys, *call, *(word for text in words[:2] for word in ("--set", text)))
     assert code == 0, err

@@ -188,11 +188,6 @@ def test_bad_depth_is_refused():
         range_to_depth(depth, camera().repeat(2, 1, 1))
 
 
-def test_a_tilted_sensor_is_refused():
-    with pytest.raises(CaptureError, match="tilted"):
-        deproject_depth(random_depth(), camera(), distortion=torch.zeros(1, 14))
-
-
 @pytest.mark.open3d
 def test_a_real_frame_deprojects_as_open3d_does(test_data: Path):
     open3d = pytest.importorskip("open3d")

@@ -53,7 +53,7 @@ def _refused(folder: Path, content: object) -> str:
 def test_what_is_written_is_read(tmp_path):
     ids = ["a/b", "ü", "..", "x" * 300, "a b"]
     samples = [Sample(name, key_of(name), number, "d" * 64, number // 2) for number, name in enumerate(ids)]
-    manifest = Manifest("hdf5", "lzf", "f" * 64, {"depth": [], "cloud": []}, samples, {"torch": "2"})
+    manifest = Manifest("hdf5", "lzf", "f" * 64, {"depth": [], "cloud": []}, samples, versions={"torch": "2"})
     folder = tmp_path / "new"
     for shard in range(3):
         seal_shard(shard_folder(folder, shard))

@@ -13,6 +13,7 @@ import torch
 
 from pcdata import CachedCloudDataset
 from pcdata.build import verify_dataset
+from pcdata.build.written_texts import write_new_texts
 from pcdata.errors import CacheError
 from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
 from pcdata.io.store.sample_index import Sample, SampleIndex
@@ -180,6 +181,7 @@ ZEROS = "0" * 64
 )
 def test_a_table_that_leads_out_of_its_shard_or_is_none_is_refused_though_its_hash_fits(tmp_path, line):
     dataset(tmp_path, "packed")
+    write_new_texts(tmp_path, {"load.py": ""})
     table = first_shard(tmp_path) / TABLE
     table.write_text(line + "\n")
     tables = np.frombuffer(hashlib.sha256(table.read_bytes()).digest(), np.uint8)[None]
@@ -194,6 +196,7 @@ def test_a_table_that_leads_out_of_its_shard_or_is_none_is_refused_though_its_ha
 
 def test_hashes_of_files_elsewhere_are_not_looked_up(tmp_path):
     dataset(tmp_path, "npz")
+    write_new_texts(tmp_path, {"load.py": ""})
     told = {"../../etc/passwd": {"bytes": 1, "sha256": ZEROS}}
     fit_again(tmp_path, signals_files=told, signals={"digest": ZEROS})
     assert [fault.path for fault in verify_dataset(tmp_path).faults] == ["signals"]

@@ -108,11 +108,11 @@ PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* po
 PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float* directions, const int64_t* ptr,
                                           int64_t num_clouds, const double* linear, float* turned);
 
-// moved (M, 3) = the points (N, 3) after num_steps steps, rounded to float after each; points and moved may be the same.
-// Step s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum with
-// normal numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size. Of the points only
-// those where the mask kept (N,) is true are written, one after another, those of each cloud to kept_ptr (clouds + 1,);
-// both may be null: then all are.
+// moved (M, 3) = the points (N, 3) after num_steps steps, rounded to float after each; points and moved may be the
+// same. Step s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum
+// with normal numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size. Of the points
+// only those where the mask kept (N,) is true are written, one after another, those of each cloud to kept_ptr (clouds +
+// 1,); both may be null: then all are.
 PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                  int64_t num_steps, const int64_t* is_noise, const double* matrices,
                                  const int64_t* seeds, const double* sigma, const double* clip, const uint8_t* kept,
