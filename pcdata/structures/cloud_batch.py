@@ -35,7 +35,7 @@ class CloudBatch(Structure):
         source_from_cloud: (B, 4, 4) float64, back to source_frame in metres.
         source_frame: the frame that source_from_cloud leads to; "" = frame_id at construction.
         frames: frame name -> (B, 4, 4) float64 frame_from_source.
-        layout: set by Deproject, kept while rows are only dropped and moved rigidly.
+        layout: set by Deproject and by readers of organized clouds, kept while rows are only dropped and moved rigidly.
         meta: per cloud, JSON-able: what was found (planes, counts, sample id).
         history: per cloud, JSON-able: what was done, in order.
         recorded_signals: name -> what belongs to the clouds and not to their points, as it was recorded; see

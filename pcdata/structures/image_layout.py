@@ -10,6 +10,9 @@ from torch import Tensor
 
 from pcdata.structures.structure import Structure
 
+_FEWEST = 100  # points that tell a camera: four numbers are fitted
+_PIXELS_OFF = 0.1
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImageLayout(Structure):
@@ -22,6 +25,36 @@ class ImageLayout(Structure):
 
     size: tuple[int, int]
     intrinsics: Tensor
+
+
+def seen_through_pinhole(
+    points: Tensor,  # (N, 3) one cloud
+    pixel: Tensor,  # (N,) int64 row * width + column
+    size: tuple[int, int],
+) -> ImageLayout | None:
+    """Return the image that points lie on, its intrinsics told by the points themselves.
+
+    None where they are not the readings of a pinhole camera at the origin that looks along +z: rows that are no pixels,
+    a cloud that was moved, a lens that bends by more than a tenth of a pixel.
+    """
+    wide = points.double()
+    z = wide[:, 2]
+    if len(wide) < _FEWEST or not bool((z > 0).all()):
+        return None
+    rows = []
+    for axis, place in ((0, pixel % size[1]), (1, pixel // size[1])):
+        # place = focal * slope + center, by least squares about the means
+        slope, place = wide[:, axis] / z, place.double()
+        off, off_place = slope - slope.mean(), place - place.mean()
+        focal = float((off * off_place).sum() / (off * off).sum())
+        center = float(place.mean() - focal * slope.mean())
+        # NaN fails too: points in one column or row
+        if not (focal > 0 and bool(((focal * slope + center - place).abs() < _PIXELS_OFF).all())):
+            return None
+        rows.append((focal, center))
+    (fx, cx), (fy, cy) = rows
+    intrinsics = torch.tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]], dtype=torch.float64, device=points.device)
+    return ImageLayout(size=size, intrinsics=intrinsics)
 
 
 def within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:

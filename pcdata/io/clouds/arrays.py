@@ -15,6 +15,7 @@ from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, DTypeError, ShapeError
 from pcdata.io.clouds.statement import CloudStatement
 from pcdata.structures import METRE, Kind, PointCloud
+from pcdata.structures.image_layout import seen_through_pinhole
 from pcdata.structures.kinds import FIELDS, KINDS
 from pcdata.structures.point_arrays import held_tensor, metres, unit_colors, unit_normals, whole_labels
 
@@ -45,8 +46,9 @@ def to_cloud(
     """Make the cloud of all rows whose x, y and z are finite; ``source_index`` keeps their row in the file.
 
     Frame and unit are those that the file or the caller states; numbers whose unit nobody states are metres, provided
-    that they look like it. Normals get unit length, as only their direction means anything; a NaN normal becomes the
-    zero vector. Extra names that are no Python names, or are taken, are changed with underscores.
+    that they look like it. Rows that are the pixels of a pinhole camera get the layout of its image. Normals get unit
+    length, as only their direction means anything; a NaN normal becomes the zero vector. Extra names that are no Python
+    names, or are taken, are changed with underscores.
     """
     frame = statement.frame(where, frame_id)
     stated = statement.metres_per_unit(where, metres_per_unit)
@@ -66,13 +68,18 @@ def to_cloud(
         if KINDS[kinds[name]].is_length:
             extra[name] = extra[name] * unit
     source = statement.source_from_cloud
+    source_index = torch.from_numpy(np.flatnonzero(keep))
+    organized = (meta or {}).get("organized_size")
+    layout = None
+    if organized is not None and source is None:  # coordinates that were moved lie on no image
+        layout = seen_through_pinhole(torch.from_numpy(points), source_index, tuple(organized))
     return PointCloud(
         points=torch.from_numpy(points),
         frame_id=frame,
         colors=None if arrays.rgb is None else torch.from_numpy(unit_colors(where, arrays.rgb[rows])),
         normals=None if arrays.normals is None else torch.from_numpy(unit_normals(arrays.normals[rows])),
         labels=None if arrays.labels is None else torch.from_numpy(whole_labels(where, arrays.labels[rows])),
-        source_index=torch.from_numpy(np.flatnonzero(keep)),
+        source_index=source_index,
         extra=extra,
         kinds=kinds,
         viewpoint=None if viewpoint is None else torch.tensor([viewpoint], dtype=torch.float32, device="cpu") * unit,
@@ -80,6 +87,7 @@ def to_cloud(
         source_frame=statement.source_frame or "",
         frames={name: matrix[None] for name, matrix in statement.frames.items()},
         unit=statement.unit or METRE,
+        layout=layout,
         meta=(dict(meta or {}),),
     )
 

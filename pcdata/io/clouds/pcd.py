@@ -42,8 +42,9 @@ def read_pcd(
     its like (see :func:`read_ply`) ``labels``, ``vp_x vp_y vp_z`` the viewpoint of each point, every other field an
     extra. Points whose x, y or z is NaN or infinite carry no reading and are dropped; ``source_index`` keeps the row in
     the file. ``viewpoint`` is the translation of VIEWPOINT; ``meta[0]["viewpoint"]`` has all seven numbers
-    (tx ty tz qw qx qy qz), ``meta[0]["organized_size"]`` is [H, W] when the rows are the pixels of an image. A file
-    that pcdata wrote comes back in its frame and unit, with the way to its source.
+    (tx ty tz qw qx qy qz), ``meta[0]["organized_size"]`` is [H, W] when the rows are the pixels of an image; where the
+    points prove a pinhole camera, ``layout`` is that image. A file that pcdata wrote comes back in its frame and unit,
+    with the way to its source.
 
     Args:
         path: the file.

@@ -127,6 +127,28 @@ def test_rows_without_a_reading_are_dropped_and_source_index_keeps_the_pixel(tmp
     assert cloud.meta[0]["organized_size"] == [2, 3]
 
 
+@pytest.mark.parametrize("seen", ["plainly", "moved", "bent", "behind", "in one row"])
+def test_an_organized_file_lies_on_the_image_that_its_points_prove(tmp_path: Path, seen: str) -> None:
+    height, width = (10, 24) if seen != "in one row" else (240, 1)
+    row, column = np.divmod(np.arange(height * width), width)
+    depth = 1 + 0.2 * np.sin(column) + 0.01 * row
+    x, y = (column - 11.3) / 30 * depth, (row - 4.2) / 40 * depth
+    depth[7] = np.nan
+    if seen == "moved":
+        x = x + 0.05
+    elif seen == "bent":
+        x = x * (1 + 0.5 * (x / depth) ** 2)
+    elif seen == "behind":
+        x, y, depth = -x, -y, -depth
+    file = write(tmp_path / "c.pcd", pcd(XYZ, [x, y, depth], "binary", WIDTH=str(width), HEIGHT=str(height)))
+    cloud = read_pcd(file)
+    assert (cloud.layout is not None) == (seen == "plainly")
+    if cloud.layout is not None:
+        assert cloud.layout.size == (10, 24)
+        expected = torch.tensor([[[30, 0, 11.3], [0, 40, 4.2], [0, 0, 1]]], dtype=torch.float64)
+        torch.testing.assert_close(cloud.layout.intrinsics, expected, atol=1e-4, rtol=0)
+
+
 def test_the_sensor_position_and_orientation_are_kept(tmp_path: Path) -> None:
     data = pcd(XYZ, COORDINATES.T, "binary", VIEWPOINT="0.5 -1 2 0 1 0 0")
     cloud = read_pcd(write(tmp_path / "c.pcd", data))
@@ -307,6 +329,8 @@ def test_real_labels_are_those_of_the_readme(test_data: Path) -> None:
     assert labels & set(range(20, 30))  # the first object
     assert cloud.source_index is not None
     assert int(cloud.source_index.max()) < 480 * 640
+    assert cloud.layout is not None  # of a Kinect
+    assert abs(float(cloud.layout.intrinsics[0, 0, 0]) - 525) < 0.01
     # A pixel's column and row agree with its direction: right of the center x > 0, below it y > 0.
     column, row = cloud.source_index % 640, cloud.source_index // 640
     assert bool((cloud.points[column > 400, 0] > 0).all())
