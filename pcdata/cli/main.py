@@ -99,13 +99,27 @@ def _import(paths: Sequence[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     # Imported here, where a signal is heard already.
-    from pcdata.cli import build, calib, card, convert, datasets, export, fuse, models, sensors, split, validate, verify
+    from pcdata.cli import (
+        build,
+        calib,
+        card,
+        convert,
+        datasets,
+        evaluate,
+        export,
+        fuse,
+        models,
+        sensors,
+        split,
+        validate,
+        verify,
+    )
 
     parser = argparse.ArgumentParser(prog="pcdata", description="From raw depth frames to training-ready point clouds.")
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    groups = (datasets, build, split, card, verify, convert, fuse, export, validate, models, sensors, calib)
+    groups = (datasets, build, split, card, verify, convert, fuse, export, validate, evaluate, models, sensors, calib)
     for group in groups:
         group.add_to(commands)
     for command in commands.choices.values():  # also after the command, where one adds it to a line that failed

@@ -5,6 +5,7 @@ from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.run import check_of_error, validate_frame, validate_source
+from pcdata.validation.segmentation import ObjectScore, SegmentationScores, mean_scores, score_segmentation
 from pcdata.validation.summary import WHOLE, SampleReport, Summary
 
 __all__ = [
@@ -13,13 +14,17 @@ __all__ = [
     "CameraOverlap",
     "CaptureLimits",
     "Check",
+    "ObjectScore",
     "OverlapLimits",
     "OverlapResult",
     "PairOverlap",
     "SampleReport",
+    "SegmentationScores",
     "Summary",
     "check_of_error",
+    "mean_scores",
     "register_check",
+    "score_segmentation",
     "validate_frame",
     "validate_source",
     "verify_overlap",

@@ -1,0 +1,78 @@
+"""The command that scores predicted labels of objects against true ones: evaluate."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import Any
+
+from pcdata.cli.argument_types import positive, whole_numbers
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    evaluate = commands.add_parser(
+        "evaluate", help="score predicted labels of objects against true ones: overlap, boundaries, objects found"
+    )
+    evaluate.add_argument(
+        "predicted", metavar="PREDICTED", help="label image (.png) or cloud (.pcd, .ply); or a folder"
+    )
+    evaluate.add_argument(
+        "true", metavar="TRUE", help="the right labels: a file, or a folder of files of the same names"
+    )
+    for flag, whose in (("--background", "PREDICTED"), ("--true-background", "TRUE")):
+        evaluate.add_argument(
+            flag,
+            type=whole_numbers,
+            metavar="IDS",
+            help=f"labels of {whose} that are no object, such as 0,1,255, beside negative ones (default: 0 in images)",
+        )
+    evaluate.add_argument(
+        "--true-parts",
+        type=positive,
+        metavar="N",
+        help="TRUE labels objects in parts: label divided by N is the object",
+    )
+    evaluate.add_argument(
+        "--tolerance",
+        type=_tolerance,
+        default=0.003,
+        metavar="T",
+        help="of boundaries, in parts of the image's diagonal; from 1 in pixels (default: 0.003)",
+    )
+    evaluate.add_argument("--json", metavar="FILE", help="also write the scores to this file")
+    evaluate.set_defaults(run=_evaluate)
+
+
+def _tolerance(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (0 < value < math.inf):
+        raise argparse.ArgumentTypeError(f"must be a positive number, got {text!r}")
+    return value
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from pcdata.files.opening import replacing
+    from pcdata.report.segmentation_text import segmentation_text
+    from pcdata.validation.label_files import matched_labels, paired_files, read_label_file
+    from pcdata.validation.segmentation import mean_scores, score_segmentation
+
+    scores = {}
+    for name, predicted, true in paired_files(arguments.predicted, arguments.true):
+        guess, truth, blank = matched_labels(
+            read_label_file(predicted, background=arguments.background),
+            read_label_file(true, background=arguments.true_background, parts=arguments.true_parts),
+        )
+        scores[name] = score_segmentation(guess, truth, ignore=blank, tolerance=arguments.tolerance)
+    print(segmentation_text(scores))
+    if arguments.json is not None:
+        told = {"mean": mean_scores([*scores.values()]), "scenes": {name: asdict(one) for name, one in scores.items()}}
+        with replacing("evaluate --json", arguments.json) as temporary:
+            temporary.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        print(f"json  {arguments.json}")
