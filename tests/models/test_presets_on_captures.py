@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -34,14 +35,30 @@ def noisy(num_views: int) -> DepthFrame:
     return tabletop(5, num_objects=5, num_views=num_views, size=(480, 640), noise="stereo", sample_id="noisy").frame
 
 
-def affordable(name: str, data: DepthFrame | PointCloud) -> DepthFrame | PointCloud:
+@cache
+def real(capture_name: str) -> DepthFrame | PointCloud:
+    """The first capture of a folder of real ones."""
+    if "PCDATA_TEST_DATA" not in os.environ:
+        pytest.skip("PCDATA_TEST_DATA is not set: no real captures")
+    source = open_source(Path(os.environ["PCDATA_TEST_DATA"]) / capture_name)
+    return source.load(source.ids[0])
+
+
+@cache
+def decimated(capture: Callable[..., DepthFrame], which: int | str, factor: int) -> DepthFrame:
+    """A capture with fewer pixels."""
+    return DecimateDepth(factor=factor)(capture(which))
+
+
+def affordable(name: str, capture: Callable[..., DepthFrame | PointCloud], which: int | str) -> DepthFrame | PointCloud:
     """Fewer pixels for models with normals, which take seconds per view where the compiled kernels are missing."""
+    data = capture(which)
     with_normals = any(channel.name == "normals" for spec in CONTRACTS[name].tensors for channel in spec.channels)
     wide = isinstance(data, DepthFrame) and with_normals and CONTRACTS[name].voxel is None
     if wide:
-        return DecimateDepth(factor=4)(data)
+        return decimated(capture, which, 4)
     large = isinstance(data, DepthFrame) and data.size[1] > 640 and CONTRACTS[name].takes != "depth image"
-    return DecimateDepth(factor=2)(data) if large else data
+    return decimated(capture, which, 2) if large else data
 
 
 @pytest.mark.parametrize(
@@ -84,7 +101,7 @@ def test_noisy_captures_through_a_preset_are_what_its_own_check_takes(name):
     given = answers(name)
     table = {"crop": TABLE_BOX} if "crop" in given and not is_camera(CONTRACTS[name]) else {}
     made = preset(name, **given | table)
-    sample = made.pipeline(affordable(name, noisy(2)), generator=seeded(0) if made.pipeline.is_random else None)
+    sample = made.pipeline(affordable(name, noisy, 2), generator=seeded(0) if made.pipeline.is_random else None)
     assert check(made.collate([sample]), name).samples[Verdict.FAIL] == 0
 
 
@@ -110,17 +127,15 @@ def test_a_few_readings_pass_or_are_refused_with_what_to_change(name, side):
 @each_contract
 @pytest.mark.parametrize("capture_name", ["graspnet_frame", "osd", "seven_scenes"])
 def test_real_captures_through_a_preset_are_what_its_own_check_takes(name, capture_name):
-    if "PCDATA_TEST_DATA" not in os.environ:
-        pytest.skip("PCDATA_TEST_DATA is not set: no real captures")
-    source = open_source(Path(os.environ["PCDATA_TEST_DATA"]) / capture_name)
-    real = source.load(source.ids[0])
-    if isinstance(real, PointCloud) and (
+    if isinstance(real(capture_name), PointCloud) and (
         CONTRACTS[name].takes == "depth image" or CONTRACTS[name].main.content == "organized"
     ):
         pytest.skip("the model takes depth images, and this is a cloud")
     box = {**ANSWERS, "frame": "camera", "crop": ((-2.0, -2.0, 0.1), (2.0, 2.0, 3.0))}
     made = preset(name, **{choice: box[choice] for choice in CONTRACTS[name].required_choices})
-    sample = made.pipeline(affordable(name, real), generator=seeded(0) if made.pipeline.is_random else None)
+    sample = made.pipeline(
+        affordable(name, real, capture_name), generator=seeded(0) if made.pipeline.is_random else None
+    )
     assert check(made.collate([sample]), name).samples[Verdict.FAIL] == 0
 
 
