@@ -15,6 +15,7 @@ from pcdata.synthetic.viewpoints import GOLDEN_ANGLE
 SUN = (-0.42, -0.30, 0.86)  # toward the light, base frame
 SUN_SPREAD = 0.07  # half-width of the light, as the tangent of an angle: how soft the shadows are
 SUN_SAMPLES = 8
+RAYS_AT_ONCE = 8192
 SUN_COLOR = (0.92, 0.87, 0.79)
 SKY_LIGHT = (0.30, 0.33, 0.36)
 SKY_COLOR = (0.62, 0.66, 0.72)  # where a ray meets nothing
@@ -104,6 +105,10 @@ def _sunlight(shapes: Sequence[Shape], points: Tensor, normals: Tensor, index: T
     sun = _unit(SUN, points)
     side = torch.nn.functional.normalize(torch.linalg.cross(sun, _unit((0.0, 1.0, 0.0), sun)), dim=0)
     other = torch.linalg.cross(sun, side)
+    samples = torch.arange(SUN_SAMPLES, dtype=torch.float64)
+    radius, angle = SUN_SPREAD * ((samples + 0.5) / SUN_SAMPLES).sqrt(), samples * GOLDEN_ANGLE
+    across = (radius * torch.stack([angle.cos(), angle.sin()])).T.to(points)  # (SUN_SAMPLES, 2)
+    toward = sun + across @ torch.stack([side, other])
     dark = torch.zeros((SUN_SAMPLES, len(points)), dtype=torch.bool, device=points.device)
     facing = normals @ sun > 0
     for i, shape in enumerate(shapes):
@@ -114,11 +119,15 @@ def _sunlight(shapes: Sequence[Shape], points: Tensor, normals: Tensor, index: T
         aside = (shape.center.to(points) - points - along[:, None] * sun).square() @ points.new_ones(3)
         reach = shape.bounding_radius + 1.5 * SUN_SPREAD * along.clamp(min=0.0)
         rows = (facing & (index != i) & (along > -reach) & (aside < reach * reach)).nonzero().squeeze(-1)
-        for sample in range(SUN_SAMPLES):
-            radius = SUN_SPREAD * math.sqrt((sample + 0.5) / SUN_SAMPLES)
-            angle = sample * GOLDEN_ANGLE
-            toward = sun + radius * (math.cos(angle) * side + math.sin(angle) * other)
-            dark[sample, rows] |= torch.isfinite(shape.intersect(lifted[rows], toward[None])[0])
+        if not len(rows):
+            continue
+        # Few rays are cast at once, since each call costs more than they do; many, sample by sample, stay in the cache.
+        starts = lifted[rows]
+        at_once = min(SUN_SAMPLES, max(1, RAYS_AT_ONCE // len(rows)))
+        for first in range(0, SUN_SAMPLES, at_once):
+            part = toward[first : first + at_once]
+            met, _ = shape.intersect(starts.repeat(len(part), 1), part.repeat_interleave(len(rows), dim=0))
+            dark[first : first + at_once, rows] |= torch.isfinite(met).reshape(len(part), -1)
     return 1.0 - dark.float().mean(0)
 
 
