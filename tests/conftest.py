@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -24,6 +25,14 @@ for _number, _usual in (
 
 # Subprocesses keep the bytecode of pcdata, or each compiles it again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# What is collected, 20,000 tests, lives as long as the run: the collector of garbage need not look through it.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
