@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import pytest
@@ -15,7 +16,7 @@ from pcdata.functional.rows import transform_points
 from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import Camera
-from pcdata.synthetic import tabletop
+from pcdata.synthetic import Tabletop, tabletop
 
 DEPTH_CAMERA = Camera.pinhole(fx=210.0, fy=208.0, cx=160.0, cy=118.0, size=(240, 320))
 
@@ -36,10 +37,15 @@ class Pair:
     registered: RegisteredDepth
 
 
-def pair(color_camera: Camera, depth_from_color: Tensor, seed: int = 3) -> Pair:
-    scene = tabletop(seed, num_objects=6, camera=DEPTH_CAMERA)
+@functools.cache
+def scene_seen() -> Tabletop:
+    return tabletop(3, num_objects=6, camera=DEPTH_CAMERA)
+
+
+def pair(color_camera: Camera, depth_from_color: Tensor) -> Pair:
+    scene = scene_seen()
     there = scene.truth.world_from_camera @ depth_from_color
-    truth = tabletop(seed, num_objects=6, camera=color_camera, world_from_camera=there).truth.depth.float()
+    truth = tabletop(scene.seed, num_objects=6, camera=color_camera, world_from_camera=there).truth.depth.float()
     registered = register_depth(
         scene.frame.depth,
         DEPTH_CAMERA.intrinsics,
@@ -83,9 +89,9 @@ POSES = {
 }
 
 
-@pytest.fixture(scope="module")
-def pairs() -> dict[tuple[str, str], Pair]:
-    return {(size, at): pair(camera, POSES[at]) for size, camera in CAMERAS.items() for at in POSES}
+@functools.cache
+def pair_of(size: str, at: str) -> Pair:
+    return pair(CAMERAS[size], POSES[at])
 
 
 each_pair = pytest.mark.parametrize("at", POSES)
@@ -94,8 +100,8 @@ each_camera = pytest.mark.parametrize("size", CAMERAS)
 
 @each_pair
 @each_camera
-def test_what_both_cameras_see_is_registered_without_a_crack(pairs, size, at):
-    one = pairs[size, at]
+def test_what_both_cameras_see_is_registered_without_a_crack(size, at):
+    one = pair_of(size, at)
     seen = seen_by_depth_camera(one)
     assert float(seen.float().mean()) > 0.4
     assert int((seen & (one.registered.depth[0] == 0)).sum()) == 0
@@ -103,8 +109,8 @@ def test_what_both_cameras_see_is_registered_without_a_crack(pairs, size, at):
 
 @each_pair
 @each_camera
-def test_the_registered_depth_is_what_the_color_camera_would_measure(pairs, size, at):
-    one = pairs[size, at]
+def test_the_registered_depth_is_what_the_color_camera_would_measure(size, at):
+    one = pair_of(size, at)
     got = one.registered.depth[0] > 0
     error = (one.registered.depth - one.truth).abs()[0][got] / one.truth[0][got]
     assert float(error.median()) < 0.004  # half a depth pixel on a slanted table
@@ -112,8 +118,8 @@ def test_the_registered_depth_is_what_the_color_camera_would_measure(pairs, size
 
 
 @each_pair
-def test_no_background_shines_through_a_nearer_surface(pairs, at):
-    one = pairs["twice as large", at]
+def test_no_background_shines_through_a_nearer_surface(at):
+    one = pair_of("twice as large", at)
     got = one.registered.depth[0]
     behind = seen_by_depth_camera(one) & (got > 1.03 * one.truth[0])
     assert int(behind.sum()) == 0
@@ -121,8 +127,8 @@ def test_no_background_shines_through_a_nearer_surface(pairs, at):
 
 @each_pair
 @each_camera
-def test_hidden_readings_are_those_that_the_color_camera_cannot_see(pairs, size, at):
-    one = pairs[size, at]
+def test_hidden_readings_are_those_that_the_color_camera_cannot_see(size, at):
+    one = pair_of(size, at)
     camera = one.color_camera
     points, ptr, index = deproject_depth(one.depth, DEPTH_CAMERA.intrinsics)
     there = transform_points(points, ptr, rigid.invert_rigid(one.depth_from_color))
