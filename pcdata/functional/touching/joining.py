@@ -1,0 +1,228 @@
+"""From regions to objects: which regions belong together, and why.
+
+Sources: Christoph Stein et al., Object partitioning using local convexity, CVPR 2014 (concave contacts part objects);
+Richtsfeld et al., Learning of perceptual grouping for object segmentation on RGB-D data, JVCIR 2014 (parts that an
+object in front keeps apart).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import combinations
+
+import torch
+
+from pcdata.functional.touching.faces import Face, Scene
+from pcdata.functional.touching.limits import KINECT_NOISE
+
+# Regions whose contact is weaker than this on the mean are one object; contacts of few pixels are drawn toward it by as
+# many as this that are just as strong: six pixels do not part what one cannot tell.
+PARTS_FROM = 0.35
+_PRIOR_PIXELS = 6
+# Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature; regions of
+# less than 5.2 cm2 beside another are a part of it.
+_FACE, _HOLLOW, _SMALL, _SLIVER = 6.6e-4, 9.2e-4, 5.2e-4, 1.3e-3
+_CONTACT_PIXELS = 5  # fewer are no contact
+# The inside of a bowl: mean sine of the rise over tangent planes, and the part that rises. Real bowls have 0.07 to 0.29
+# and boxes and cylinders seen from outside less than 0.
+_HOLLOW_RISE, _HOLLOW_PART, _NOT_CONVEX = 0.06, 0.6, -0.05
+_RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
+# Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm; one
+# plane fits both nearly as well as each its own; they are beside each other, within 25 cm; and the way from one to the
+# other is hidden. Where they touch it is seen, and all is stricter.
+_TURN, _OFF, _APART, _BESIDE = 14.0, 0.03, 0.25, 0.5
+_PLANE_RMS, _CURVED_RMS = 0.0035, 0.012
+_MOST_FREE, _LEAST_HIDDEN, _LEAST_UNSEEN = 0.1, 0.25, 0.6
+_TOUCH_TURN, _TOUCH_APART, _TOUCH_SEEN, _TOUCH_RMS = 8.0, 0.006, 0.9, 0.004
+
+# Why regions were joined that no weak contact joined.
+REASONS = ("hollow", "occluded", "touching", "small")
+
+
+class Objects:
+    """Which object each region belongs to: the lowest of its regions."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.object_of = list(range(scene.num_regions))
+        self.joins: list[tuple[int, str]] = []
+        first, second, strength = (one.cpu() for one in scene.contacts)
+        flat = scene.label.flatten().cpu()
+        a, b = flat[first], flat[second]
+        self._contact: dict[tuple[int, int], list[int]] = {}
+        code = torch.minimum(a, b) * max(scene.num_regions, 1) + torch.maximum(a, b)
+        order = torch.argsort(code, stable=True)
+        ids, counts = torch.unique_consecutive(code[order], return_counts=True)
+        self._sums: dict[tuple[int, int], tuple[float, int]] = {}
+        self._rows: dict[tuple[int, int], torch.Tensor] = {}
+        for one, rows in zip(ids.tolist(), order.split(counts.tolist())):
+            pair = divmod(one, max(scene.num_regions, 1))
+            self._rows[pair] = rows
+            self._sums[pair] = (float(strength[rows].sum()), len(rows))
+        self._faces: dict[tuple[int, ...], Face] = {}
+
+    def members(self) -> dict[int, list[int]]:
+        """Return the regions of every object."""
+        found: dict[int, list[int]] = {}
+        for region, one in enumerate(self.object_of):
+            found.setdefault(one, []).append(region)
+        return found
+
+    def face(self, regions: list[int]) -> Face:
+        """Return the points of regions; computed once."""
+        key = tuple(regions)
+        if key not in self._faces:
+            self._faces[key] = self.scene.face(regions)
+        return self._faces[key]
+
+    def join(self, one: int, other: int, why: str | None = None) -> None:
+        """Make the objects of two regions one; ``why`` of REASONS, None where their contact is weak."""
+        a, b = sorted((self.object_of[one], self.object_of[other]))
+        if a == b:
+            return
+        self.object_of = [a if of == b else of for of in self.object_of]
+        if why is not None:
+            self.joins.append((one, why))
+
+    def contacts(self) -> dict[tuple[int, int], tuple[float, int, list[tuple[int, int]]]]:
+        """Return (sum of strengths, pixels, pairs of regions) of every two objects that touch."""
+        found: dict[tuple[int, int], tuple[float, int, list[tuple[int, int]]]] = {}
+        for (a, b), (total, count) in self._sums.items():
+            x, y = sorted((self.object_of[a], self.object_of[b]))
+            if x == y:
+                continue
+            old_total, old_count, pairs = found.get((x, y), (0.0, 0, []))
+            found[x, y] = (old_total + total, old_count + count, [*pairs, (a, b)])
+        return found
+
+    def contact_pixels(self, pairs: list[tuple[int, int]], of: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the pixels of contacts between regions: those of object ``of``, and their neighbors."""
+        rows = torch.cat([self._rows[pair] for pair in pairs])
+        first, second = self.scene.contacts.first.cpu()[rows], self.scene.contacts.second.cpu()[rows]
+        lookup = torch.tensor(self.object_of, dtype=torch.int64, device="cpu")
+        own = lookup[self.scene.label.flatten().cpu()[first]] == of
+        return torch.where(own, first, second), torch.where(own, second, first)
+
+
+def merge_weak_contacts(objects: Objects) -> None:
+    """Join the two objects with the weakest contact, until every contact is strong; contacts grow as objects do."""
+    contact = {pair: (total, count) for pair, (total, count, _) in objects.contacts().items()}
+    while contact:
+        strength, pair = min(
+            ((total + PARTS_FROM * _PRIOR_PIXELS) / (count + _PRIOR_PIXELS), pair)
+            for pair, (total, count) in contact.items()
+        )
+        if strength > PARTS_FROM:
+            return
+        kept, gone = pair
+        objects.join(kept, gone)
+        joined: dict[tuple[int, int], tuple[float, int]] = {}
+        for (a, b), (total, count) in contact.items():
+            x, y = sorted((kept if a == gone else a, kept if b == gone else b))
+            if x != y:
+                before = joined.get((x, y), (0.0, 0))
+                joined[x, y] = (before[0] + total, before[1] + count)
+        contact = joined
+
+
+def join_hollows(objects: Objects) -> None:
+    """Join what is inside a bowl, a pot or a cup to it, and the outer wall that its rim hides the foot of.
+
+    Needs heights above the table.
+    """
+    scene = objects.scene
+    if scene.height is None:
+        return
+    members = objects.members()
+    faces = {one: objects.face(regions) for one, regions in members.items()}
+    contacts = objects.contacts()
+    depth = scene.points[:, 2].cpu()
+    height = scene.height.flatten().cpu()
+    for start, face in faces.items():
+        if face.area < _HOLLOW or not (face.hollow[0] > _HOLLOW_RISE and face.hollow[1] > _HOLLOW_PART):
+            continue
+        rim, seen, todo = face.top, {start}, [start]
+        while todo:
+            one = todo.pop()
+            for pair, (_, count, regions) in contacts.items():
+                if one not in pair or count < _CONTACT_PIXELS:
+                    continue
+                other = pair[1] if pair[0] == one else pair[0]
+                if other in seen:
+                    continue
+                own, beside = objects.contact_pixels(regions, objects.object_of[one])
+                behind = float((depth[beside] - depth[own]).median())
+                touches_at = float(height[beside].median())
+                part = faces[other]
+                is_below = part.top < rim + _RIM
+                is_inside = part.hollow[0] > _NOT_CONVEX and abs(behind) < _WITHIN and is_below
+                is_wall = (
+                    part.hollow[0] <= _HOLLOW_RISE
+                    and behind < 0
+                    and touches_at > part.top - _RIM
+                    and abs(part.top - rim) < _WALL_RIM
+                )
+                if not (is_inside or is_wall or (is_below and part.area < _SLIVER)):
+                    continue
+                seen.add(other)
+                objects.join(start, other, "hollow")
+                if is_inside:
+                    todo.append(other)
+
+
+def join_occluded(objects: Objects) -> None:
+    """Join parts of one face that something in front keeps apart, and parts that noise has cut."""
+    rough = max(objects.scene.noise / KINECT_NOISE, 1.0)
+    faces = list(_plane_faces(objects))
+    for (a, one), (b, other) in combinations(faces, 2):
+        if objects.object_of[a] == objects.object_of[b]:
+            continue
+        turn = math.degrees(math.acos(max(-1.0, min(1.0, float(one.normal @ other.normal)))))
+        if turn > _TURN:
+            continue
+        way = other.center - one.center
+        if max(abs(float(way @ one.normal)), abs(float(way @ other.normal))) > _OFF:
+            continue
+        rms, least = max(one.rms, other.rms), min(one.rms, other.rms)
+        joint = one.joint_rms(other)
+        if joint > max(_PLANE_RMS * rough, 1.15 * rms + 0.0005) or rms > 2.5 * max(least, 1e-4):
+            continue
+        distance, between = one.way_to(other)
+        if distance > _APART:
+            continue
+        hidden, on, free, unseen = objects.scene.seen_between(between)
+        is_cut = turn < _TOUCH_TURN and distance < _TOUCH_APART and on > _TOUCH_SEEN and joint < _TOUCH_RMS * rough
+        is_occluded = free < _MOST_FREE and hidden > _LEAST_HIDDEN and hidden + unseen > _LEAST_UNSEEN
+        if is_cut or (is_occluded and one.overlap_across(other) > _BESIDE):
+            objects.join(a, b, "touching" if is_cut else "occluded")
+
+
+def _plane_faces(objects: Objects) -> Iterator[tuple[int, Face]]:
+    """Yield a region of each with its face: regions, then objects of several that are nearly plane as a whole."""
+    for region in range(objects.scene.num_regions):
+        face = objects.face([region])
+        if face.area >= _FACE:
+            yield region, face
+    for regions in objects.members().values():
+        if len(regions) > 1:
+            face = objects.face(regions)
+            if face.area >= _FACE and face.rms < _CURVED_RMS:
+                yield regions[0], face
+
+
+def join_small(objects: Objects) -> None:
+    """Join objects that are too small to be told apart to the one they touch most, the smallest first."""
+    areas = {one: objects.face(regions).area for one, regions in objects.members().items()}
+    for one in sorted(areas, key=lambda one: (areas[one], one)):
+        if areas[one] >= _SMALL:
+            continue
+        beside = [
+            (count, -other)
+            for pair, (_, count, _) in objects.contacts().items()
+            if objects.object_of[one] in pair
+            for other in pair
+            if other != objects.object_of[one]
+        ]
+        if beside and max(beside)[0] >= _CONTACT_PIXELS:
+            objects.join(one, -max(beside)[1], "small")
