@@ -1,12 +1,14 @@
 """Surface normals from the covariance of the nearest points, without a batched eigensolver.
 
 Source: Hoppe et al., Surface reconstruction from unorganized points, 1992; the neighborhood and the fallback are those
-of Open3D's ``estimate_normals`` with ``KDTreeSearchParamHybrid``.
+of Open3D's ``estimate_normals`` with ``KDTreeSearchParamHybrid``, without a radius with ``KDTreeSearchParamKNN``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,10 +20,15 @@ from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks
 
 
+def checked_reach(where: str, name: str, arguments: Mapping[str, Any]) -> float | None:
+    """Require a positive, finite length, or None: however far."""
+    return None if arguments[name] is None else checked_length(where, name, arguments)
+
+
 @op(
     points="N 3",
     ptr="ptr N B",
-    radius=checked_length,
+    radius=checked_reach,
     max_neighbors=checked_count,
     grid=checked_grid,
     steps=(nearest_chunks,),
@@ -31,7 +38,7 @@ def estimate_normals(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud
     *,
-    radius: float = 0.02,
+    radius: float | None = 0.02,
     max_neighbors: int = 30,
     grid: ImageGrid | None = None,
     backend: str = "auto",
@@ -48,7 +55,7 @@ def estimate_normals(
     Args:
         points: the clouds, in any unit of length.
         ptr: row pointers of the points.
-        radius: in the unit of the points.
+        radius: in the unit of the points; None = the nearest, however far.
         max_neighbors: nearest points used at most.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.

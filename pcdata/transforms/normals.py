@@ -13,18 +13,19 @@ from pcdata.transforms.field_types import Count, Metres
 
 
 class EstimateNormals(Transform):
-    """Fit a plane to the nearest neighbors within a radius; replaces any normals the cloud had.
+    """Fit a plane to the nearest neighbors, within a radius or however far; replaces any normals the cloud had.
 
     After merging, every point's normal faces the camera that saw that point.
 
     Args:
+        radius: metres; None = the nearest, however far.
         max_neighbors: the nearest within the radius, the point itself among them.
         orient: "none": the sign is arbitrary but repeatable.
     """
 
     runs_statistics = True
 
-    radius: Metres = 0.02
+    radius: Metres | None = 0.02
     max_neighbors: Count = 30
     orient: Literal["viewpoint", "none"] = "viewpoint"
 

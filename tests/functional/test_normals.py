@@ -106,10 +106,23 @@ def test_orient_normals_faces_the_viewpoint_and_keeps_edge_on_normals():
     assert torch.equal(orient_normals(points, normals, per_point), torch.tensor([[0.0, 0, -1], [0, 0, 1], [-1, 0, 0]]))
 
 
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_without_a_radius_the_nearest_count_however_far(backend: str):
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)  # of a unit cube, each with its three neighbors
+    found = estimate_normals(corners, radius=None, max_neighbors=4, backend=backend)
+    outward = orient_normals(corners, found, corners + (corners - 0.5))
+    torch.testing.assert_close(outward, (corners * 2 - 1) / 3**0.5)
+    assert estimate_normals(corners, max_neighbors=4, backend=backend).unique(dim=0).tolist() == [[0.0, 0.0, 1.0]]
+    sheet = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1e9, 1e9, 0.0])
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(200, 3)
+    torch.testing.assert_close(estimate_normals(sheet, radius=None, backend=backend), up)
+
+
 def test_bad_arguments_raise():
     points = torch.rand(4, 3)
-    with pytest.raises(ConfigError, match="radius"):
-        estimate_normals(points, radius=0.0)
+    for radius in (0.0, -1.0, float("inf"), float("nan"), "1"):
+        with pytest.raises((ConfigError, DTypeError), match="radius"):
+            estimate_normals(points, radius=radius)
     with pytest.raises(ShapeError, match="viewpoint"):
         orient_normals(points, points, torch.zeros(2, 3))
     with pytest.raises(ShapeError, match="normals"):
@@ -127,3 +140,15 @@ def test_normals_agree_with_open3d_on_a_real_frame(frame_points: torch.Tensor):
     degrees = torch.rad2deg(torch.minimum(angle, torch.pi - angle))
     # The rest are ties at the 30th neighbor: depth is in whole millimetres.
     assert float((degrees < 0.5).double().mean()) >= 0.99
+
+
+@pytest.mark.open3d
+def test_normals_of_the_nearest_agree_with_open3d():
+    open3d = pytest.importorskip("open3d")
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(2))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.double().numpy()))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
+    angle = angle_between(
+        estimate_normals(points, radius=None, max_neighbors=12), torch.from_numpy(np.asarray(cloud.normals))
+    )
+    assert float(torch.minimum(angle, torch.pi - angle).max()) < 1e-4

@@ -198,6 +198,7 @@ EXAMPLES = [
     Example("duplicate_mask", one_cloud, ("row",)),
     # Neighborhoods wide enough to have one normal: on three points in a line, backends may choose different ones.
     Example("estimate_normals", one_cloud, ("row",), {"radius": 0.05, "max_neighbors": 12}),
+    Example("estimate_normals", one_cloud, ("row",), {"radius": None, "max_neighbors": 7}),
     Example("farthest_point_sample", one_cloud, ("index", "ptr"), {"num_samples": 20}),
     Example("farthest_point_sample", with_starts, ("index", "ptr"), {"num_samples": 20}),
     Example("farthest_point_sample", with_seeds, ("index", "ptr"), {"ratio": 0.3}),

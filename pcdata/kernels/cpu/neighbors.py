@@ -96,7 +96,7 @@ def statistical_outlier_mask(
 
 @kernel("estimate_normals", "cpu")
 def estimate_normals(
-    *, points: Tensor, ptr: Tensor, radius: float, max_neighbors: int, grid: ImageGrid | None
+    *, points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None
 ) -> Tensor:
     """Run the reference's contract in the core."""
     points, ptr = _rows(points, ptr)
