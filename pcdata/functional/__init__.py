@@ -34,6 +34,7 @@ from pcdata.functional.rendering import (
     render_ranges,
     render_triangles,
 )
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
 from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, polygon_mask
 from pcdata.functional.voxels import (
@@ -61,6 +62,7 @@ __all__ = [
     "ball_query",
     "box_mask",
     "chamfer_distance",
+    "cloud_of_rows",
     "convex_hull",
     "core_point_mask",
     "dbscan",
@@ -88,6 +90,7 @@ __all__ = [
     "pixel_rays",
     "polygon_mask",
     "project_points",
+    "ptr_from_counts",
     "radius_neighbors",
     "radius_outlier_mask",
     "random_sample_index",

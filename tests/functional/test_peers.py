@@ -1,4 +1,4 @@
-"""docs/operations.md: what each operation on clouds gives, and what neighboring libraries call it; made from here.
+"""docs/operations.md: what each operation gives, and what neighboring libraries call it; made from here.
 
 ``python -m tests.functional.test_peers > docs/operations.md`` writes the page anew.
 """
@@ -12,6 +12,7 @@ import pytest
 
 import pcdata.functional
 from pcdata.contracts.dispatch import OPERATIONS, why_unavailable
+from pcdata.contracts.tensors import parse_spec
 
 ROOT = Path(__file__).parents[2]
 # Operation -> the test that holds it to an oracle, and what others call it.
@@ -21,6 +22,17 @@ PEERS = {
     "chamfer_distance": ("functional/test_metrics.py", "PyTorch3D `loss.chamfer_distance`"),
     "core_point_mask": ("functional/test_clusters.py", "scikit-learn `DBSCAN.core_sample_indices_`"),
     "dbscan": ("functional/test_clusters.py", "Open3D `cluster_dbscan`; scikit-learn `DBSCAN`"),
+    "decimate_depth": ("functional/depth/test_resampling.py", "librealsense `decimation_filter`"),
+    "deproject_depth": (
+        "functional/depth/test_deproject.py",
+        "Open3D `create_from_depth_image`; kornia `depth_to_3d`; OpenCV `rgbd.depthTo3d`; "
+        "librealsense `rs2_deproject_pixel_to_point`",
+    ),
+    "deproject_ranges": ("functional/test_rendering.py", "PCL `RangeImageSpherical`"),
+    "depth_normals": (
+        "functional/test_rendering.py",
+        "kornia `depth_to_normals`; OpenCV `RgbdNormals`; PCL `IntegralImageNormalEstimation`",
+    ),
     "duplicate_mask": ("functional/test_selection.py", "Open3D `remove_duplicated_points`"),
     "estimate_normals": (
         "functional/test_normals.py",
@@ -32,6 +44,14 @@ PEERS = {
         "functional/test_sampling.py",
         "torch-cluster `fps`; PyTorch3D `sample_farthest_points`; Open3D `farthest_point_down_sample`",
     ),
+    "fill_holes": ("functional/depth/test_holes.py", "librealsense `hole_filling_filter`"),
+    "find_voxel_size": ("functional/test_voxels.py", ""),
+    "fit_paired_points": (
+        "functional/test_paired_points.py",
+        "PyTorch3D `corresponding_points_alignment`; SciPy `Rotation.align_vectors`; "
+        "PCL `TransformationEstimationSVD`; OpenCV `estimateAffine3D`",
+    ),
+    "flying_pixel_mask": ("functional/depth/test_flying_pixels.py", "PCL `ShadowPoints`"),
     "hausdorff_distance": ("functional/test_metrics.py", "SciPy `directed_hausdorff`"),
     "knn": ("functional/test_neighbors.py", "torch-cluster `knn`; PyTorch3D `knn_points`; Open3D `knn_search`"),
     "neighborhood_covariance": (
@@ -42,37 +62,80 @@ PEERS = {
         "functional/test_selection.py",
         "Open3D `SelectionPolygonVolume`; PCL `ExtractPolygonalPrismData`",
     ),
+    "project_points": (
+        "functional/depth/test_deproject.py",
+        "OpenCV `projectPoints`; kornia `project_points`; librealsense `rs2_project_point_to_pixel`",
+    ),
     "radius_neighbors": ("functional/test_neighbors.py", "torch-cluster `radius`; Open3D `fixed_radius_search`"),
     "radius_outlier_mask": ("functional/test_outliers.py", "Open3D `remove_radius_outlier`"),
     "ransac_plane": ("functional/test_planes.py", "Open3D `segment_plane`"),
+    "register_depth": (
+        "functional/depth/test_depth_to_color.py",
+        "librealsense `align`; OpenCV `rgbd.registerDepth`",
+    ),
+    "render_points": (
+        "functional/test_rendering.py",
+        "PyTorch3D `PointsRasterizer`; Open3D `project_to_depth_image`",
+    ),
+    "render_ranges": ("functional/test_rendering.py", "PCL `RangeImageSpherical`"),
+    "render_triangles": ("functional/test_rendering.py", "PyTorch3D `MeshRasterizer`; Open3D `RaycastingScene`"),
+    "resize_depth": ("functional/depth/test_resampling.py", "OpenCV `resize`"),
+    "spatial_filter": ("functional/depth/test_disparity.py", "librealsense `spatial_filter`"),
     "statistical_outlier_mask": ("functional/test_outliers.py", "Open3D `remove_statistical_outlier`"),
+    "undistort_depth": ("functional/depth/test_undistortion.py", "OpenCV `remap`, nearest"),
+    "undistort_image": (
+        "functional/depth/test_undistortion.py",
+        "OpenCV `undistort`, `fisheye.undistortImage`; kornia `undistort_image`",
+    ),
     "voxel_downsample": ("functional/test_voxels.py", "Open3D `voxel_down_sample`; PyG `GridSampling`"),
 }
+
+
+def batches(name: str) -> str:
+    """How an operation takes many at once, by its contract."""
+    contract = OPERATIONS[name].contract
+    assert contract is not None
+    specs = [parse_spec(text) for text in contract.tensors.values()]
+    if any(spec.is_ptr for spec in specs):
+        return "ragged"
+    return "images of one size" if any(spec.dims[0] == "V" for spec in specs) else "rows"
 
 
 def page() -> str:
     why_unavailable("cpu")  # loads the kernels
     lines = [
-        "# Operations on clouds, and what others call them",
+        "# Operations, and what others call them",
         "",
         "Made by `tests/functional/test_peers.py` from the registered operations; all are called as "
-        "`pcdata.functional.NAME` and take ragged batches (`polygon_mask`: each point by itself). Compiled "
-        "bodies know three coordinates and Open3D's voxel grid; all else runs in torch.",
+        '`pcdata.functional.NAME`. Many at once: "ragged" takes clouds of any sizes, one after another, cut by `ptr`, '
+        'without a loop over them; "rows" knows no clouds. Compiled bodies know three coordinates and Open3D\'s voxel '
+        "grid; all else runs in torch, on any device. [Calls of other libraries beside ours](coming_from.md).",
         "",
-        "| operation | gradients | compiled | held to an oracle in | others call it |",
-        "|---|---|---|---|---|",
+        "| operation | gradients | many at once | compiled | held to an oracle in | others call it |",
+        "|---|---|---|---|---|---|",
     ]
     for name, (test, peers) in sorted(PEERS.items()):
         operation = OPERATIONS[name]
         gradient = "yes" if operation.gradient else "no"
         compiled = "yes" if operation.serves("cpu") else "no"
-        lines.append(f"| `{name}` | {gradient} | {compiled} | `tests/{test}` | {peers} |")
+        lines.append(f"| `{name}` | {gradient} | {batches(name)} | {compiled} | `tests/{test}` | {peers} |")
+    lines += [
+        "",
+        "Alignment of clouds without partners is `pcdata.alignment.align_clouds` "
+        "([alignment.md](alignment.md)), fusion "
+        "`pcdata.TSDFVolume` ([fusion.md](fusion.md)), rendering of structures `pcdata.render` "
+        "([rendering.md](rendering.md)), lenses [lenses.md](lenses.md).",
+    ]
     return "\n".join(lines) + "\n"
 
 
 @pytest.mark.skipif(why_unavailable("cpu") is not None, reason="the page tells what the compiled core serves")
 def test_the_page_is_made_from_the_operations():
     assert (ROOT / "docs" / "operations.md").read_text(encoding="utf-8") == page()
+
+
+def test_every_public_operation_is_on_the_page():
+    assert PEERS.keys() == OPERATIONS.keys() & set(pcdata.functional.__all__)
 
 
 def test_every_operation_of_the_page_exists_and_its_oracle_calls_it():

@@ -109,7 +109,9 @@ EXAMPLES: dict[str, list[Example]] = {
         T.DescribeShape(features=("linearity", "planarity"), radius=None, max_neighbors=9),
     ),
     "DropNonFinite": _of(T.DropNonFinite(fields=("points", "weight")), make=cloud_with_flaws),
-    "EstimateNormals": _of(T.EstimateNormals(radius=0.05), T.EstimateNormals(radius=None, max_neighbors=8, orient="none")),
+    "EstimateNormals": _of(
+        T.EstimateNormals(radius=0.05), T.EstimateNormals(radius=None, max_neighbors=8, orient="none")
+    ),
     "FarthestPointSample": _of(
         T.FarthestPointSample(num_points=32),
         *(T.FarthestPointSample(num_points=100, if_short=how) for how in ("repeat", "tile", "zeros", "keep")),
