@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
 from pcdata.errors import DTypeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import (
@@ -23,6 +23,7 @@ from pcdata.functional.rows import (
     group_count,
     group_first,
     group_sum,
+    ptr_after_mask,
     ptr_from_counts,
     segment_max,
     segment_min,
@@ -37,7 +38,54 @@ _MAX_VOXELS_PER_AXIS = 2.0**53
 SIZE_TOLERANCE = 1e-6
 
 
-@op(points="N 3", ptr="ptr N B", voxel_size=checked_edges, origin=checked_places, min_points=checked_count)
+@inner
+def voxel_means(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor,  # (B+1,)
+    edges: Tensor,  # (B, 1) or (B, 3) float64
+    origin: Tensor | None,  # (B, 3) float64
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # means (M, 3) float32, ptr (B+1,), inverse (N,) int64, members (M,) int64
+    """Return the mean of the points of each voxel, whose voxel each point is, and how many points each voxel has."""
+    points = points.detach()
+    cloud, start, scaled = _scale_to_grid(points, ptr, edges, origin)
+    voxel = scaled.floor()
+    above = voxel - voxel.amin(0) if origin is not None and len(voxel) else voxel
+    inverse, first = _group_in_row_order(_voxel_keys(cloud, above, len(ptr) - 1))
+    offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
+    members = group_count(inverse, len(first))
+    mean_offset = group_sum(offset, inverse, len(first)).double() / members[:, None] / _FIXED_POINT
+    owner = cloud[first]
+    means = (start[owner] + (voxel[first] + mean_offset) * edges[owner]).float()
+    return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse, members
+
+
+class _OfMembers(torch.autograd.Function):
+    """Means that are known already, with the gradient of a mean: every member takes its share."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, means: Tensor, inverse: Tensor, members: Tensor) -> Tensor:
+        ctx.save_for_backward(inverse, members)
+        return means
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        inverse, members = ctx.saved_tensors
+        shares = (gradients[0].double() / members[:, None]).to(gradients[0].dtype)
+        if not len(shares):
+            return shares.new_zeros(len(inverse), 3), None, None, None
+        return torch.where((inverse >= 0)[:, None], shares[inverse.clamp(min=0)], 0.0), None, None, None
+
+
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    voxel_size=checked_edges,
+    origin=checked_places,
+    min_points=checked_count,
+    steps=(voxel_means,),
+)
 def voxel_downsample(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,)
@@ -68,26 +116,15 @@ def voxel_downsample(
     """
     assert ptr is not None  # @op fills it
     assert isinstance(voxel_size, Tensor)  # and makes it one size per cloud, (B,) or (B, 3)
-    with torch.no_grad():
-        edges = voxel_size if voxel_size.ndim == 2 else voxel_size[:, None]
-        cloud, start, scaled = _scale_to_grid(points, ptr, edges, origin)
-        voxel = scaled.floor()
-        above = voxel - voxel.amin(0) if origin is not None and len(voxel) else voxel
-        inverse, first = _group_in_row_order(_voxel_keys(cloud, above, len(ptr) - 1))
-        offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
-        count = group_count(inverse, len(first))
-        mean_offset = group_sum(offset, inverse, len(first)).double() / count[:, None] / _FIXED_POINT
-        owner = cloud[first]
-        means = (start[owner] + (voxel[first] + mean_offset) * edges[owner]).float()
-        if min_points > 1:
-            full = count >= min_points
-            inverse = torch.where(full, full.cumsum(0) - 1, -1)[inverse]
-            means, owner = means[full], owner[full]
+    edges = voxel_size if voxel_size.ndim == 2 else voxel_size[:, None]
+    means, means_ptr, inverse, members = voxel_means(points.detach(), ptr, edges, origin, backend=backend)
+    if min_points > 1:
+        full = members >= min_points
+        inverse = torch.where(full, full.cumsum(0) - 1, -1)[inverse]
+        means_ptr, means, members = ptr_after_mask(full, means_ptr), means[full], members[full]
     if torch.is_grad_enabled() and points.requires_grad:
-        kept = inverse >= 0
-        plain = voxel_mean(points[kept], inverse[kept], len(means))
-        means = means + (plain - plain.detach())  # the value keeps every bit
-    return means, ptr_from_counts(group_count(owner, len(ptr) - 1)), inverse
+        means = _OfMembers.apply(points, means, inverse, members)  # type: ignore[no-untyped-call]
+    return means, means_ptr, inverse
 
 
 @op(points="N 3", ptr="ptr N B", num_points=checked_count, gradient=False)

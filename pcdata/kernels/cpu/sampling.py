@@ -30,24 +30,28 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     return picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
 
 
-@kernel("voxel_downsample", "cpu")
-def voxel_downsample(
-    points: Tensor, ptr: Tensor, *, voxel_size: Tensor, origin: Tensor | None, min_points: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Number voxels in a hash table; sums are integers, so threads change nothing. The core knows Open3D's grid."""
-    given = {"voxel_size": voxel_size, "origin": origin, "min_points": min_points}
-    if _too_long(ptr) or origin is not None or voxel_size.ndim == 2 or min_points > 1:
-        return _reference("voxel_downsample", points, ptr, **given)
+@kernel("voxel_means", "cpu")
+def voxel_means(
+    points: Tensor, ptr: Tensor, edges: Tensor, origin: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Number voxels in a hash table; sums are integers, so threads change nothing."""
+    if _too_long(ptr):
+        return _reference("voxel_means", points, ptr, edges, origin)
     # As many rows as there could be: those not written never become memory.
-    means, inverse = room(points.shape, points.dtype), room(len(points), torch.int64)
+    points, ptr = points.contiguous(), ptr.contiguous()
+    means, inverse, members = room(points.shape, points.dtype), *(room(len(points), torch.int64) for _ in range(2))
     counts, spans_too_many = room(len(ptr) - 1, torch.int64), room(1, torch.int64)
-    arrays = points, ptr, len(ptr) - 1, voxel_size, means, inverse, counts, spans_too_many
+    sizes = edges.expand(-1, 3).contiguous()
+    corners = None if origin is None else origin.contiguous()
+    arrays = points, ptr, len(ptr) - 1, sizes, corners, means, inverse, members, counts, spans_too_many
     call("pc_voxel_downsample", *arrays)
     if spans_too_many:
-        return _reference("voxel_downsample", points, ptr, **given)  # knows what to say
+        return _reference("voxel_means", points, ptr, edges, origin)  # knows what to say
     means_ptr = ptr_from_counts(counts)
+    number = int(means_ptr[-1])
     # Not clone(): see pcdata.contracts.tensors on torch's threads.
-    return torch.from_numpy(means[: int(means_ptr[-1])].numpy().copy()), means_ptr, inverse
+    means, members = (torch.from_numpy(values[:number].numpy().copy()) for values in (means, members))
+    return means, means_ptr, inverse, members
 
 
 @kernel("find_voxel_size", "cpu")
@@ -104,5 +108,5 @@ def _too_long(ptr: Tensor) -> bool:
     return int(counts_from_ptr(ptr).max()) > _MAX_ROWS
 
 
-def _reference(operation: str, *args: Any, **kwargs: Any) -> Any:
-    return OPERATIONS[operation].reference(*args, **kwargs)
+def _reference(name: str, *args: Any, **kwargs: Any) -> Any:
+    return (OPERATIONS if name in OPERATIONS else INNER)[name].reference(*args, **kwargs)

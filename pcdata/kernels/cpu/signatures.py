@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xEC466C6D12946DC
+INTERFACE_NUMBER = 0x3AA4376FC279FDE
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -32,8 +32,17 @@ pc_move_points: float* points, int64* ptr, int64 num_clouds, int64 num_steps, in
     seeds, double* sigma, double* clip, uint8* kept, int64* kept_ptr, float* moved
 pc_random_rows: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, uint8* mask
 pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
+pc_box_mask: float* points, int64* ptr, int64 num_clouds, float* lower, float* upper, uint8* inside
+pc_polygon_mask: float* points, int64 rows, double* corners, int64 num_corners, uint8* inside
+pc_duplicate_mask: float* points, int64* ptr, int64 num_clouds, uint8* repeats
+pc_project_points: double* points, int64* ptr, int64 views, double* intrinsics, double* lenses, double* pixels
+pc_render_points: float* points, int64* ptr, int64 views, double* intrinsics, double* lenses, int64 height, int64 width,
+    double point_size, float* depth, int64* index
+pc_least_at_pixels: float* value, int64* pixel, int64 rows, int64 pixels, float* least, int64* index
 pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
     int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
+pc_wide_neighbors: float* points, int64* ptr, int64 num_clouds, int64 width, float* queries, int64* queries_ptr, int64
+    k, double limit, int64* index, float* distance
 pc_nearest_squared: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, float* squared
 pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
     double* camera, float* normals
@@ -43,8 +52,9 @@ pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, 
     width, uint8* outlier, double* largest
 pc_dbscan: float* points, int64* ptr, int64 clouds, double eps, int64 min_points, int64* labels, double* largest
 pc_farthest_points: float* points, int64* ptr, int64 num_clouds, int64* wanted, int64* picks
-pc_voxel_downsample: float* points, int64* ptr, int64 num_clouds, double* sizes, float* means, int64* inverse, int64*
-    counts, int64* spans_too_many
+pc_wide_farthest_points: float* points, int64* ptr, int64 num_clouds, int64 width, int64* wanted, int64* picks
+pc_voxel_downsample: float* points, int64* ptr, int64 num_clouds, double* sizes, double* origins, float* means, int64*
+    inverse, int64* members, int64* counts, int64* spans_too_many
 pc_find_voxel_sizes: float* points, int64* ptr, int64 num_clouds, int64 num_points, double tolerance, double* sizes,
     int64* possible
 pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triples, int64 count, int64* which, double

@@ -64,7 +64,7 @@ PC_EXPORT int32_t pc_mask_depth(const pc_context* context, const float* depth, i
 
 // Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of
 // that shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels.
-// Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (13,), which may be null.
+// Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (14,), which may be null.
 // *possible becomes 0, and nothing else is certain, if a reading has no ray or projects beyond what floats can be
 // computed with.
 PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
@@ -127,6 +127,37 @@ PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, 
 PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, int64_t rows, const float* lower,
                                 const float* upper, uint8_t* inside, int64_t* finite);
 
+// inside (N,) becomes 1 where lower <= point <= upper on every axis, the corners (num_clouds, 3) of its cloud's box.
+PC_EXPORT int32_t pc_box_mask(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                              const float* lower, const float* upper, uint8_t* inside);
+
+// inside (rows,) becomes 1 where a ray from the point (rows, 2) toward larger x crosses an odd number of the edges
+// between the corners (num_corners, 2), the last and the first among them.
+PC_EXPORT int32_t pc_polygon_mask(const pc_context* context, const float* points, int64_t rows, const double* corners,
+                                  int64_t num_corners, uint8_t* inside);
+
+// repeats (N,) becomes 1 where an earlier point of the cloud has the same coordinates, 0 elsewhere.
+PC_EXPORT int32_t pc_duplicate_mask(const pc_context* context, const float* points, const int64_t* ptr,
+                                    int64_t num_clouds, uint8_t* repeats);
+
+// -- rendering --------------------------------------------------------------------------------------------------------
+
+// points (N, 3) float64 in the frames of their cameras, intrinsics (views, 3, 3), lenses (views, 14) or null: twelve
+// coefficients, not 0 for inverse Brown-Conrady, the radius where the model folds -> pixels (N, 2), NaN where none.
+PC_EXPORT int32_t pc_project_points(const pc_context* context, const double* points, const int64_t* ptr, int64_t views,
+                                    const double* intrinsics, const double* lenses, double* pixels);
+
+// The nearest point at every pixel: depth (views, height, width), 0 where there is none, and index, its row, N where
+// there is none. Cameras are those of pc_project_points; points are point_size wide. There are less than 2^32 points.
+PC_EXPORT int32_t pc_render_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t views,
+                                   const double* intrinsics, const double* lenses, int64_t height, int64_t width,
+                                   double point_size, float* depth, int64_t* index);
+
+// The row with the least positive value at every pixel, the first of equals: least (pixels,), 0 where there is none,
+// and index, N where there is none. pixel (rows,) is -1 for rows that are nowhere; less than 2^32 rows.
+PC_EXPORT int32_t pc_least_at_pixels(const pc_context* context, const float* value, const int64_t* pixel, int64_t rows,
+                                     int64_t pixels, float* least, int64_t* index);
+
 // -- neighbors --------------------------------------------------------------------------------------------------------
 
 // queries null: the points; pixel null: no grid; neighbors have d2 <= limit; count may be null.
@@ -134,6 +165,11 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
                                const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
                                float* distance, int64_t* count);
+
+// The same for points (N, width) and queries (Q, width), without a grid; rows are less than 2^32 - 1.
+PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* points, const int64_t* ptr,
+                                    int64_t num_clouds, int64_t width, const float* queries, const int64_t* queries_ptr,
+                                    int64_t k, double limit, int64_t* index, float* distance);
 
 // squared (Q,) float: from every query to the nearest point of its cloud.
 PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,
@@ -171,12 +207,17 @@ PC_EXPORT int32_t pc_dbscan(const pc_context* context, const float* points, cons
 PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
                                      int64_t num_clouds, const int64_t* wanted, int64_t* picks);
 
-// points (N, 3); ptr (num_clouds+1,); sizes (num_clouds,) -> means (M, 3) in the first rows of (N, 3); inverse (N,);
-// counts (num_clouds,): the voxels of each cloud. Clouds hold less than 2^31 points. *spans_too_many becomes 1, and
-// nothing else is written, if a cloud spans 2^53 voxels or more.
+// The same for points (N, width).
+PC_EXPORT int32_t pc_wide_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                          int64_t num_clouds, int64_t width, const int64_t* wanted, int64_t* picks);
+
+// points (N, 3); ptr (num_clouds+1,); sizes (num_clouds, 3); origins (num_clouds, 3), null: half a voxel below each
+// cloud's lowest corner -> means (M, 3) in the first rows of (N, 3); inverse (N,); members (M,) in the first of (N,):
+// how many points each voxel has; counts (num_clouds,): the voxels of each cloud. Clouds hold less than 2^31 points.
+// *spans_too_many becomes 1, and nothing else is written, if a cloud spans 2^53 voxels or more.
 PC_EXPORT int32_t pc_voxel_downsample(const pc_context* context, const float* points, const int64_t* ptr,
-                                      int64_t num_clouds, const double* sizes, float* means, int64_t* inverse,
-                                      int64_t* counts, int64_t* spans_too_many);
+                                      int64_t num_clouds, const double* sizes, const double* origins, float* means,
+                                      int64_t* inverse, int64_t* members, int64_t* counts, int64_t* spans_too_many);
 
 // sizes (num_clouds,): the voxel size that leaves num_points of each cloud, or as few more as possible, found to the
 // relative tolerance. *possible becomes 0, and nothing is certain, if a cloud has fewer distinct points or spans 2^53

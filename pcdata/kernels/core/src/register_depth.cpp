@@ -224,7 +224,7 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
     std::atomic<bool> all_possible{true};
     for (int64_t number = 0; number < views && all_possible; ++number) {
       math::Lens lens{};
-      if (lenses != nullptr) std::memcpy(&lens, lenses + 13 * number, sizeof(lens));
+      if (lenses != nullptr) std::memcpy(&lens, lenses + 14 * number, sizeof(lens));
       DepthView view{depth + number * pixels, height, width};
       if (rays != nullptr) {
         view.rays = rays + 2 * number * pixels;

@@ -6,7 +6,7 @@ namespace {
 
 template <class Voxel>
 void downsample(const pc_context& context, ScratchFrame& scratch, const SizedClouds& clouds, Pieces& pieces,
-                const VoxelGrid* grids, float* means, int64_t* inverse, int64_t* counts) {
+                const VoxelGrid* grids, float* means, int64_t* inverse, int64_t* members, int64_t* counts) {
   const Found<Voxel> found = room_for<Voxel>(scratch, clouds.ptr[clouds.num_clouds], true);
   auto tables = tables_for<Voxel>(context, scratch, pieces);
   parallel_for(context, pieces.size(), 1, [&](int64_t p, int64_t, int64_t thread) {
@@ -27,9 +27,11 @@ void downsample(const pc_context& context, ScratchFrame& scratch, const SizedClo
     const Piece& piece = pieces[p];
     const int64_t base = clouds.ptr[piece.cloud];
     const int64_t end = std::min(piece.end, base + counts[piece.cloud]);
-    float* own = means + 3 * starts[static_cast<size_t>(piece.cloud)];
-    for (int64_t i = piece.begin; i < end; ++i)
-      mean_of(found.voxels[i], found.sums[i], grids[piece.cloud], own + 3 * (i - base));
+    const int64_t start = starts[static_cast<size_t>(piece.cloud)];
+    for (int64_t i = piece.begin; i < end; ++i) {
+      mean_of(found.voxels[i], found.sums[i], grids[piece.cloud], means + 3 * (start + i - base));
+      members[start + i - base] = found.sums[i].count;
+    }
   });
 }
 
@@ -37,16 +39,16 @@ void downsample(const pc_context& context, ScratchFrame& scratch, const SizedClo
 }  // namespace pc::voxels
 
 PC_EXPORT int32_t pc_voxel_downsample(const pc_context* context, const float* points, const int64_t* ptr,
-                                      int64_t num_clouds, const double* sizes, float* means, int64_t* inverse,
-                                      int64_t* counts, int64_t* spans_too_many) {
+                                      int64_t num_clouds, const double* sizes, const double* origins, float* means,
+                                      int64_t* inverse, int64_t* members, int64_t* counts, int64_t* spans_too_many) {
   using namespace pc;
   using namespace pc::voxels;
   return guarded([&] {
     ScratchFrame scratch;
     Pieces pieces(ptr, num_clouds);
-    const SizedClouds clouds{points, ptr, num_clouds, sizes};
+    const SizedClouds clouds{points, ptr, num_clouds, sizes, origins};
     *spans_too_many = !with_grids(*context, scratch, clouds, pieces, [&](auto voxel, const VoxelGrid* grids) {
-      downsample<decltype(voxel)>(*context, scratch, clouds, pieces, grids, means, inverse, counts);
+      downsample<decltype(voxel)>(*context, scratch, clouds, pieces, grids, means, inverse, members, counts);
     });
   });
 }

@@ -94,7 +94,8 @@ bool find_size_alone(const float* points, int64_t rows, int64_t num_points, doub
       bounds, num_points, tolerance,
       [&](double at, int64_t& voxels) {
         VoxelGrid grid{};
-        if (!measure(bounds, at, grid)) return false;
+        const double size[3] = {at, at, at};
+        if (!measure(bounds, size, nullptr, grid)) return false;
         if (!grid.packs() && !wide) wide.emplace(scratch, rows);
         voxels = grid.packs() ? packed.of(points, rows, grid) : wide->of(points, rows, grid);
         return true;
@@ -112,7 +113,8 @@ bool find_size_together(const pc_context& context, const float* points, int64_t 
       bounds_of(points, 0, rows), num_points, tolerance,
       [&](double at, int64_t& voxels) {
         ScratchFrame scratch;
-        const SizedClouds cloud{points, ptr, 1, &at};
+        const double size[3] = {at, at, at};
+        const SizedClouds cloud{points, ptr, 1, size, nullptr};
         return with_grids(context, scratch, cloud, pieces, [&](auto voxel, const VoxelGrid* grids) {
           count<decltype(voxel)>(context, scratch, cloud, pieces, grids, &voxels);
         });

@@ -27,11 +27,12 @@ struct WideVoxel {
   }
 };
 
-// The grid of one cloud: Open3D's, half a voxel below the lowest corner.
+// The grid of one cloud. Coordinates of voxels are counted from the lowest that the cloud touches.
 struct VoxelGrid {
   double origin[3];
-  double size;
-  int bits[3];  // enough for the coordinates of this cloud; 0 where all are 0
+  double size[3];
+  double first[3];  // the lowest voxel, counted from the origin
+  int bits[3];      // enough for the coordinates of this cloud; 0 where all are 0
 
   PC_HD bool packs() const { return bits[0] + bits[1] + bits[2] <= 63; }
 
@@ -79,7 +80,8 @@ PC_HD void mean_of(const Voxel& voxel, const VoxelSum& sum, const VoxelGrid& gri
   const int64_t coordinate[3] = {corner.x, corner.y, corner.z}, total[3] = {sum.x, sum.y, sum.z};
   for (int axis = 0; axis < 3; ++axis) {
     const double offset = static_cast<double>(total[axis]) / static_cast<double>(sum.count) / kFixedPoint;
-    mean[axis] = static_cast<float>(grid.origin[axis] + (static_cast<double>(coordinate[axis]) + offset) * grid.size);
+    const double voxel = static_cast<double>(coordinate[axis]) + grid.first[axis];
+    mean[axis] = static_cast<float>(grid.origin[axis] + (voxel + offset) * grid.size[axis]);
   }
 }
 

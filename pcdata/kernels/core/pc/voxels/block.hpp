@@ -20,13 +20,14 @@ class VoxelBlock {
 
   void place(const float* points, int count, const VoxelGrid& grid) {
     for (int axis = 0; axis < 3; ++axis) {
-      const double origin = grid.origin[axis], size = grid.size;
+      const double origin = grid.origin[axis], size = grid.size[axis], first = grid.first[axis];
       double* whole = voxel_[axis];
       int64_t* offset = offset_[axis];
       for (int i = 0; i < count; ++i) {
         const double scaled = (static_cast<double>(points[3 * i + axis]) - origin) / size;
-        whole[i] = std::floor(scaled);
-        offset[i] = rounded((scaled - whole[i]) * kFixedPoint);
+        const double voxel = std::floor(scaled);
+        whole[i] = voxel - first;
+        offset[i] = rounded((scaled - voxel) * kFixedPoint);
       }
     }
   }

@@ -43,32 +43,46 @@ struct Pieces {
   int64_t first(int64_t cloud) const { return first_of[static_cast<size_t>(cloud)]; }
 };
 
-// False if the cloud spans 2^53 voxels or more.
-inline bool measure(const math::Bounds& bounds, double size, VoxelGrid& grid) {
-  grid.size = size;
+// The grid of a cloud: with voxels of `size` (3,) from `origin` (3,) on, which may be null: Open3D's, half a voxel
+// below the lowest corner. False if the cloud spans 2^53 voxels or more, or lies as far from the origin.
+inline bool measure(const math::Bounds& bounds, const double* size, const double* origin, VoxelGrid& grid) {
   for (int axis = 0; axis < 3; ++axis) {
-    grid.origin[axis] = static_cast<double>(bounds.low[axis]) - size / 2;
-    const double last = std::floor((static_cast<double>(bounds.high[axis]) - grid.origin[axis]) / size);
-    if (!(last < kMaxVoxelsPerAxis)) return false;
+    grid.size[axis] = size[axis];
+    grid.origin[axis] = origin != nullptr ? origin[axis] : static_cast<double>(bounds.low[axis]) - size[axis] / 2;
+    grid.first[axis] = std::floor((static_cast<double>(bounds.low[axis]) - grid.origin[axis]) / size[axis]);
+    const double last = std::floor((static_cast<double>(bounds.high[axis]) - grid.origin[axis]) / size[axis]);
+    if (!(std::fabs(last) < kMaxVoxelsPerAxis && std::fabs(grid.first[axis]) < kMaxVoxelsPerAxis)) return false;
+    const double width = last - grid.first[axis];
     grid.bits[axis] = 0;
-    while (std::ldexp(1.0, grid.bits[axis]) <= last) ++grid.bits[axis];
+    while (std::ldexp(1.0, grid.bits[axis]) <= width) ++grid.bits[axis];
     if (grid.bits[axis] > kMaxPackedBits) grid.bits[axis] = 64;
   }
   return true;
 }
 
+// Clouds, the size of each one's voxels, and where its grid starts.
+struct SizedClouds {
+  const float* points;  // (rows, 3)
+  const int64_t* ptr;
+  int64_t num_clouds;
+  const double* sizes;    // (num_clouds, 3)
+  const double* origins;  // (num_clouds, 3) or null
+};
+
 // The grid of every cloud; false if one spans too many voxels.
-inline bool measure_all(const pc_context& context, ScratchFrame& scratch, const float* points, Pieces& pieces,
-                        const double* sizes, int64_t num_clouds, VoxelGrid* grids) {
+inline bool measure_all(const pc_context& context, ScratchFrame& scratch, const SizedClouds& clouds, Pieces& pieces,
+                        VoxelGrid* grids) {
   math::Bounds* bounds = scratch.take<math::Bounds>(pieces.size());
-  parallel_for(context, pieces.size(), 1,
-               [&](int64_t p, int64_t, int64_t) { bounds[p] = bounds_of(points, pieces[p].begin, pieces[p].end); });
-  for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
+  parallel_for(context, pieces.size(), 1, [&](int64_t p, int64_t, int64_t) {
+    bounds[p] = bounds_of(clouds.points, pieces[p].begin, pieces[p].end);
+  });
+  for (int64_t cloud = 0; cloud < clouds.num_clouds; ++cloud) {
     const int64_t first = pieces.first(cloud), last = pieces.first(cloud + 1);
     if (first == last) continue;
     math::Bounds all = bounds[first];
     for (int64_t p = first + 1; p < last; ++p) all.include(bounds[p]);
-    if (!measure(all, sizes[cloud], grids[cloud])) return false;
+    const double* origin = clouds.origins == nullptr ? nullptr : clouds.origins + 3 * cloud;
+    if (!measure(all, clouds.sizes + 3 * cloud, origin, grids[cloud])) return false;
   }
   return true;
 }
@@ -193,22 +207,13 @@ std::vector<VoxelTable<Voxel>> tables_for(const pc_context& context, ScratchFram
   return tables;
 }
 
-// Clouds and the voxel size of each.
-struct SizedClouds {
-  const float* points;  // (rows, 3)
-  const int64_t* ptr;
-  int64_t num_clouds;
-  const double* sizes;
-};
-
 // Call body(a voxel of the type that the clouds need); false if one spans too many voxels.
 template <class Body>
 bool with_grids(const pc_context& context, ScratchFrame& scratch, const SizedClouds& clouds, Pieces& pieces,
                 Body&& body) {
   std::vector<VoxelGrid> grids(static_cast<size_t>(clouds.num_clouds));
   for (VoxelGrid& grid : grids) grid = {};
-  if (!measure_all(context, scratch, clouds.points, pieces, clouds.sizes, clouds.num_clouds, grids.data()))
-    return false;
+  if (!measure_all(context, scratch, clouds, pieces, grids.data())) return false;
   if (std::all_of(grids.begin(), grids.end(), [](const VoxelGrid& grid) { return grid.packs(); }))
     body(PackedVoxel{}, grids.data());
   else
