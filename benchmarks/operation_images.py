@@ -22,9 +22,7 @@ SIZE = (720, 1280)
 K = torch.tensor([[[640.0, 0.0, 640.0], [0.0, 640.0, 360.0], [0.0, 0.0, 1.0]]])
 # A D455's color, a wide fisheye, and a rational lens with thin prism and tilt.
 LENSES = {
-    "D455's inverse Brown-Conrady": lens_row(
-        "", "inverse_brown_conrady", [-0.0563, 0.0667, -0.0008, 0.0002, -0.0215]
-    ),
+    "D455's inverse Brown-Conrady": lens_row("", "inverse_brown_conrady", [-0.0563, 0.0667, -0.0008, 0.0002, -0.0215]),
     "fisheye": lens_row("", "fisheye", [-0.02, 0.006, -0.004, 0.0007]),
     "14 coefficients": [0.3, -0.1, 1e-4, -2e-4, 0.01, 0.6, -0.05, 0.02, 1e-4, -5e-5, 2e-4, 3e-5, 0.01, -0.02],
 }

@@ -57,30 +57,38 @@ def calls() -> Iterator[tuple[str, Call]]:
     yield "voxels", lambda p, ptr: F.voxel_downsample(p, ptr, voxel_size=0.1)
     yield "voxels, stated origin", lambda p, ptr: F.voxel_downsample(p, ptr, voxel_size=0.1, origin=(0, 0, 0))
     yield "farthest points, ratio 1/10", lambda p, ptr: F.farthest_point_sample(p, ptr, ratio=0.02)
-    yield "farthest points, start drawn", lambda p, ptr: F.farthest_point_sample(
-        p, ptr, ratio=0.02, seeds=torch.arange(len(ptr) - 1)
+    yield (
+        "farthest points, start drawn",
+        lambda p, ptr: F.farthest_point_sample(p, ptr, ratio=0.02, seeds=torch.arange(len(ptr) - 1)),
     )
-    yield "farthest points, balanced labels", lambda p, ptr: F.farthest_point_sample(
-        p, ptr, ratio=0.02, labels=labels(p)
+    yield (
+        "farthest points, balanced labels",
+        lambda p, ptr: F.farthest_point_sample(p, ptr, ratio=0.02, labels=labels(p)),
     )
     yield "farthest points and nearest sample", lambda p, ptr: F.farthest_point_groups(p, ptr, ratio=0.02)
     yield "kNN 8, 3 columns", lambda p, ptr: F.knn(p, ptr, k=8)
     yield "all neighbors within 2 cm", lambda p, ptr: F.radius_neighbors(p, ptr, radius=0.02)
-    yield "32 nearest, a radius per query", lambda p, ptr: F.ball_query(
-        p, ptr, radius=0.01 + 0.02 * p[:, 0], max_neighbors=32
+    yield (
+        "32 nearest, a radius per query",
+        lambda p, ptr: F.ball_query(p, ptr, radius=0.01 + 0.02 * p[:, 0], max_neighbors=32),
     )
     yield "covariance of 16 neighbors", lambda p, ptr: F.neighborhood_covariance(p, ptr, **shape)
     yield "Chamfer, both sides", lambda p, ptr: F.chamfer_distance(p, ptr, p.flip(0).contiguous(), ptr)
-    yield "Chamfer, L1", lambda p, ptr: F.chamfer_distance(
-        p, ptr, p.flip(0).contiguous(), ptr, norm="l1", squared=False
+    yield (
+        "Chamfer, L1",
+        lambda p, ptr: F.chamfer_distance(p, ptr, p.flip(0).contiguous(), ptr, norm="l1", squared=False),
     )
     yield "F-score", lambda p, ptr: F.f_score(p, ptr, p.flip(0).contiguous(), ptr, threshold=0.05)
     yield "Hausdorff distance", lambda p, ptr: F.hausdorff_distance(p, ptr, p.flip(0).contiguous(), ptr)
-    yield "cloud to depth, 64x48", lambda p, ptr: F.render_points(
-        p + 1, ptr, intrinsics=(k / torch.tensor([[10.0], [10.0], [1.0]])).expand(len(ptr) - 1, 3, 3), size=(48, 64)
+    yield (
+        "cloud to depth, 64x48",
+        lambda p, ptr: F.render_points(
+            p + 1, ptr, intrinsics=(k / torch.tensor([[10.0], [10.0], [1.0]])).expand(len(ptr) - 1, 3, 3), size=(48, 64)
+        ),
     )
     yield "lidar to range image, 8x64", lambda p, ptr: F.render_ranges(p, ptr, size=(8, 64))
-    yield "box mask", lambda p, ptr: F.box_mask(
-        p, ptr, lower=torch.zeros(len(ptr) - 1, 3), upper=torch.full((len(ptr) - 1, 3), 0.5)
+    yield (
+        "box mask",
+        lambda p, ptr: F.box_mask(p, ptr, lower=torch.zeros(len(ptr) - 1, 3), upper=torch.full((len(ptr) - 1, 3), 0.5)),
     )
     yield "repeated points", lambda p, ptr: F.duplicate_mask(p, ptr)

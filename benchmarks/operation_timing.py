@@ -122,7 +122,8 @@ def facts(peers: Iterable[str]) -> dict[str, Any]:
             "load_before": os.getloadavg()[0],
         },
         "backends": [backend for backend in dispatch.backends() if dispatch.why_unavailable(backend) is None],
-        "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__} | {peer: _version(peer) for peer in there},
+        "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__}
+        | {peer: _version(peer) for peer in there},
         "left_out": [peer for peer in peers if peer not in there],
     }
 

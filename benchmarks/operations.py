@@ -107,7 +107,12 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 def page(result: dict[str, Any]) -> str:
     """The tables of the docs: the options, then the small clouds."""
-    lines = [markdown(result["rows"]), "", "| operation | 10,000 clouds of 50 | one cloud of 500,000 |", "|---|---|---|"]
+    lines = [
+        markdown(result["rows"]),
+        "",
+        "| operation | 10,000 clouds of 50 | one cloud of 500,000 |",
+        "|---|---|---|",
+    ]
     lines += [f"| {row['operation']} | {row['many_ms']:.1f} ms | {row['one_ms']:.1f} ms |" for row in result["ragged"]]
     return "\n".join(lines)
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_image_size, checked_positive
 from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import pixel_rays, project_points
@@ -204,10 +204,28 @@ class _Boxes(NamedTuple):
                 yield left, self.first[left] + (row * self.width + column)
 
 
+@inner
+def least_at_pixels(
+    value: Tensor,  # (N,) float32
+    pixel: Tensor,  # (N,) int64, -1 = nowhere
+    num_pixels: int,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:  # least (P,) float32, index (P,) int64
+    """Return the row with the least positive value at every pixel, the first of equals; value 0 and N where none is."""
+    image = torch.full((num_pixels,), _EMPTY, dtype=torch.int64, device=value.device)
+    somewhere = pixel >= 0
+    image.scatter_reduce_(0, pixel[somewhere], _keys(value)[somewhere], "amin")
+    found = image != _EMPTY
+    least = torch.where(found, (image >> _INDEX_BITS).int().view(torch.float32), 0.0)
+    return least, torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(value))
+
+
 @op(
     points="N 3",
     ptr="ptr N V",
     size=checked_image_size,
+    steps=(least_at_pixels,),
     gradient=False,
 )
 def render_ranges(
@@ -249,11 +267,8 @@ def render_ranges(
     distance = ranges.float()
     inside = (row >= 0) & (row < beams) & (distance > 0)
     target = (cloud_of_rows(ptr) * beams + torch.where(inside, row, 0.0).long()) * columns + column.long()
-    image = torch.full(((len(ptr) - 1) * beams * columns,), _EMPTY, dtype=torch.int64, device=points.device)
-    image.scatter_reduce_(0, target[inside], _keys(distance)[inside], "amin")
-    found = image != _EMPTY
-    seen = torch.where(found, (image >> _INDEX_BITS).int().view(torch.float32), 0.0)
-    index = torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(points))
+    pixels = (len(ptr) - 1) * beams * columns
+    seen, index = least_at_pixels(distance, torch.where(inside, target, -1), pixels, backend=backend)
     shape = (len(ptr) - 1, beams, columns)
     return RenderedPoints(seen.reshape(shape), index.reshape(shape))
 

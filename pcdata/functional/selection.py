@@ -41,12 +41,17 @@ def box_mask(
     assert ptr is not None  # @op fills it
     assert isinstance(lower, Tensor)  # and makes both (B, 3)
     assert isinstance(upper, Tensor)
+    require_box(lower, upper)
+    cloud = cloud_of_rows(ptr)
+    return ((points >= lower.float()[cloud]) & (points <= upper.float()[cloud])).all(1)
+
+
+def require_box(lower: Tensor, upper: Tensor) -> None:
+    """Require corners (B, 3) of which the lower is below the upper on every axis."""
     for b in (lower >= upper).any(1).nonzero().squeeze(1).tolist():
         raise ConfigError(
             f"box_mask: lower must be below upper on every axis, cloud {b} has {lower[b].tolist()}, {upper[b].tolist()}"
         )
-    cloud = cloud_of_rows(ptr)
-    return ((points >= lower.float()[cloud]) & (points <= upper.float()[cloud])).all(1)
 
 
 def checked_polygon(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:

@@ -182,6 +182,22 @@ def _with_gradient(solved: Tensor, target: Tensor, coefficients: _Coefficients) 
     return solved - (step - step.detach())  # the value keeps every bit
 
 
+def plain_lenses(distortion: Tensor) -> Tensor | None:  # (V, 14) float64
+    """Return lenses (V, D) as compiled bodies know them; None where one is no polynomial, or tilted.
+
+    Twelve coefficients, not 0 for inverse Brown-Conrady, and the radius where the model folds back.
+    """
+    rows = []
+    for row in distortion.detach():
+        _, polynomial = _model_of(row.double())
+        if polynomial is None or polynomial.tilt is not None:
+            return None
+        rows.append(torch.cat([polynomial.twelve, polynomial.twelve.new_tensor([float(polynomial.after)])]))
+    if not rows:
+        return None
+    return torch.cat([torch.stack(rows), fold_radius(distortion)[:, None]], dim=1)
+
+
 def fold_radius(distortion: Tensor) -> Tensor:
     """Return (V,) float64: the normalized radius at which each view's radial model stops growing, or infinity.
 

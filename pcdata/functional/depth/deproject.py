@@ -146,7 +146,7 @@ def pixel_rays(
     Raises:
         CaptureError: impossible intrinsics or distortion.
     """
-    _check_camera("pixel_rays", intrinsics, distortion)
+    check_camera("pixel_rays", intrinsics, distortion)
     height, width = size
     fx, skew, cx, fy, cy = _pinhole(intrinsics[:, :, :, None, None])
     u = torch.arange(width, dtype=torch.float64, device=intrinsics.device)
@@ -175,14 +175,14 @@ def project_points(
         CaptureError: impossible intrinsics or distortion.
     """
     assert ptr is not None
-    _check_camera("project_points", intrinsics, distortion)
+    check_camera("project_points", intrinsics, distortion)
     view = cloud_of_rows(ptr)
     x, y, z = points.double().unbind(-1)
     visible = z > 0
     # What is not visible is not computed with: a NaN on the way would be in every gradient.
     xy = torch.stack([x, y], dim=-1) / torch.where(visible, z, 1.0)[:, None]
     if distortion is not None:
-        visible = visible & (xy.norm(dim=-1) < fold_radius(distortion)[view])
+        visible = visible & (xy.square().sum(-1) < fold_radius(distortion).square()[view])
         xy = _distort_rows(torch.where(visible[:, None], xy, 0.0), ptr, distortion)
     fx, skew, cx, fy, cy = (value[view] for value in _pinhole(intrinsics))
     u = fx * xy[:, 0] + skew * xy[:, 1] + cx
@@ -201,7 +201,7 @@ def range_to_depth(
         CaptureError: as :func:`deproject_depth`.
     """
     check_tensors("range_to_depth", {"ray_length": ray_length}, {"ray_length": "V H W : depth"})
-    _check_camera("range_to_depth", intrinsics, distortion, views=len(ray_length))
+    check_camera("range_to_depth", intrinsics, distortion, views=len(ray_length))
     height, width = ray_length.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion)
     check_rays("range_to_depth", rays, ray_length > 0)
@@ -245,7 +245,12 @@ def check_rays(where: str, rays: Tensor, needed: Tensor) -> None:
         )
 
 
-def _check_camera(where: str, intrinsics: Tensor, distortion: Tensor | None, views: int | None = None) -> None:
+def check_camera(where: str, intrinsics: Tensor, distortion: Tensor | None, views: int | None = None) -> None:
+    """Require intrinsics (V, 3, 3), of so many views where that is said, and lenses (V, D) that can be.
+
+    Raises:
+        ShapeError, DTypeError, NonFiniteError, CaptureError: they are not such.
+    """
     specs = {"intrinsics": f"{'V' if views is None else views} 3 3 : float", "distortion": "V D : float"}
     if views is not None:
         specs["distortion"] = f"{views} D : float"

@@ -7,8 +7,10 @@ from pcdata.kernels.cpu import fusion as cpu_fusion
 from pcdata.kernels.cpu import images as cpu_images
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
 from pcdata.kernels.cpu import noise as cpu_noise
+from pcdata.kernels.cpu import rendering as cpu_rendering
 from pcdata.kernels.cpu import rows as cpu_rows
 from pcdata.kernels.cpu import sampling as cpu_sampling
+from pcdata.kernels.cpu import selection as cpu_selection
 from pcdata.kernels.cpu.native import unavailable
 
 __all__ = [
@@ -17,7 +19,9 @@ __all__ = [
     "cpu_neighbors",
     "cpu_noise",
     "cpu_registration",
+    "cpu_rendering",
     "cpu_rows",
     "cpu_sampling",
+    "cpu_selection",
     "unavailable",
 ]

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_cameras, half_pixels
-from pcdata.geometry.lens import fold_radius
-from pcdata.geometry.lens_models import is_plain
+from pcdata.geometry.lens import plain_lenses
 from pcdata.kernels.cpu.images import rays_of_cameras
 from pcdata.kernels.cpu.native import call, room, room_for
 
@@ -32,7 +31,8 @@ def register_depth(
     check_cameras(depth, intrinsics, distortion, color_intrinsics, color_distortion, color_from_depth)
     views, height, width = depth.shape
     color_shape = (views, *color_size)
-    if is_plain(color_distortion) and 0 < height * width <= _MOST_PIXELS and views > 0:
+    lenses = None if color_distortion is None else plain_lenses(color_distortion)
+    if (color_distortion is None or lenses is not None) and 0 < height * width <= _MOST_PIXELS and views > 0:
         rays = rays_of_cameras(intrinsics, (height, width), distortion)
         results = room_for(
             (color_shape, torch.float32),
@@ -46,7 +46,7 @@ def register_depth(
             *(depth.contiguous(), views, height, width, *rays),
             *(color_from_depth.contiguous(), color_intrinsics.double().contiguous()),
             half_pixels(intrinsics, color_intrinsics, color_from_depth).contiguous(),
-            None if color_distortion is None else _lenses(color_distortion),
+            lenses,
             *(*color_size, float(max_jump), *results, possible),
         )
         if possible:
@@ -62,9 +62,3 @@ def register_depth(
         max_jump=max_jump,
     )
     return reference
-
-
-def _lenses(distortion: Tensor) -> Tensor:
-    """Return (V, 13) float64: twelve coefficients, those not given 0, and the radius where the model folds back."""
-    coefficients = torch.nn.functional.pad(distortion.double(), (0, 12 - distortion.shape[1]))
-    return torch.cat([coefficients, fold_radius(distortion)[:, None]], dim=1)

@@ -1,7 +1,7 @@
 """Neighbor kernels: kNN, ball query, chamfer distance, outliers, normals, DBSCAN.
 
 Radius outliers and DBSCAN count in cells. All others search one box tree over Morton order, sixteen queries at a time;
-clouds with an image grid search pixel windows first. Results are those of the references: the same neighbors in the
+clouds with an image grid search pixel windows first. Points of other than three columns have trees of their own. Results are those of the references: the same neighbors in the
 same order, the same masks.
 """
 
@@ -34,7 +34,9 @@ def nearest_rows(
     radius: float | None = None,
     grid: ImageGrid | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Run the reference's contract in the core; it knows three coordinates."""
+    """Run the reference's contract in the core."""
+    if points.shape[1] not in (0, 3) and max(k, len(points)) <= _MAX_ROWS:
+        return _wide_neighbors(points, ptr, k, radius, queries, queries_ptr)
     if k > _MAX_ROWS or points.shape[1] != 3:
         others = {"queries": queries, "queries_ptr": queries_ptr, "radius": radius, "grid": grid}
         found: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
@@ -128,6 +130,22 @@ def _neighbors(
         *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, _limit(radius)),
         *(*_grid_arguments(grid), index, distance, None),
     )
+    return index, distance
+
+
+def _wide_neighbors(
+    points: Tensor, ptr: Tensor, k: int, radius: float | None, queries: Tensor | None, queries_ptr: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Search in trees of boxes of any number of columns."""
+    points, ptr = _rows(points, ptr)
+    num_queries = len(points)
+    if queries is not None:
+        assert queries_ptr is not None
+        queries, queries_ptr = _rows(queries, queries_ptr)
+        num_queries = len(queries)
+    index, distance = room((num_queries, k), torch.int64), room((num_queries, k), torch.float32)
+    arrays = points, ptr, len(ptr) - 1, points.shape[1], queries, queries_ptr
+    call("pc_wide_neighbors", *arrays, k, _limit(radius), index, distance)
     return index, distance
 
 

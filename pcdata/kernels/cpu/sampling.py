@@ -21,12 +21,17 @@ _MAX_ROWS = 2**31 - 1
 
 @kernel("farthest_rows", "cpu")
 def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
-    """Visit only the points that a pick can change; the core knows three coordinates."""
-    if points.shape[1] != 3 or _too_long(ptr):
+    """Visit only the points that a pick can change."""
+    width = points.shape[1]
+    if not width or _too_long(ptr):
         rows: Tensor = INNER["farthest_rows"].reference(points, ptr, counts)
         return rows
     picks, wanted = room(sum(counts), torch.int64), numbers(counts)
-    call("pc_farthest_points", points.contiguous(), ptr.contiguous(), len(counts), wanted, picks)
+    arrays = points.contiguous(), ptr.contiguous(), len(counts)
+    if width == 3:
+        call("pc_farthest_points", *arrays, wanted, picks)
+    else:
+        call("pc_wide_farthest_points", *arrays, width, wanted, picks)
     return picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
 
 

@@ -1,0 +1,69 @@
+"""Points and triangles projected, and who is in front at every pixel."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
+from pcdata.functional.depth.deproject import check_camera
+from pcdata.functional.rendering import RenderedPoints
+from pcdata.geometry.lens import plain_lenses
+from pcdata.kernels.cpu.native import call, room, room_for
+
+# The core keeps rows in 32 bits.
+_MAX_ROWS = 2**32 - 2
+
+
+@kernel("project_points", "cpu")
+def project_points(
+    *, points: Tensor, ptr: Tensor, intrinsics: Tensor, distortion: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Project in one pass where the lenses are polynomials without tilt."""
+    check_camera("project_points", intrinsics, distortion)
+    lenses = None if distortion is None else plain_lenses(distortion)
+    if distortion is not None and lenses is None:
+        found: tuple[Tensor, Tensor] = OPERATIONS["project_points"].reference(
+            points, ptr, intrinsics=intrinsics, distortion=distortion
+        )
+        return found
+    pixels = room((len(points), 2), torch.float64)
+    cameras = intrinsics.double().contiguous(), lenses
+    call("pc_project_points", points.double().contiguous(), ptr, len(ptr) - 1, *cameras, pixels)
+    return pixels, points[:, 2]
+
+
+@kernel("render_points", "cpu")
+def render_points(
+    *,
+    points: Tensor,
+    ptr: Tensor,
+    intrinsics: Tensor,
+    size: tuple[int, int],
+    distortion: Tensor | None,
+    point_size: float,
+) -> RenderedPoints:
+    """Project and draw in one pass; whichever thread comes first, the nearest point stays."""
+    check_camera("project_points", intrinsics, distortion)
+    lenses = None if distortion is None else plain_lenses(distortion)
+    if (distortion is not None and lenses is None) or len(points) > _MAX_ROWS:
+        found: RenderedPoints = OPERATIONS["render_points"].reference(
+            points, ptr, intrinsics=intrinsics, size=size, distortion=distortion, point_size=point_size
+        )
+        return found
+    shape = (len(intrinsics), *size)
+    depth, index = room_for((shape, torch.float32), (shape, torch.int64))
+    cameras = intrinsics.double().contiguous(), lenses
+    call("pc_render_points", points, ptr, len(ptr) - 1, *cameras, *size, point_size, depth, index)
+    return RenderedPoints(depth, index)
+
+
+@kernel("least_at_pixels", "cpu")
+def least_at_pixels(value: Tensor, pixel: Tensor, num_pixels: int) -> tuple[Tensor, Tensor]:
+    """Keep the least key of every pixel, whichever thread brings it."""
+    if len(value) > _MAX_ROWS:
+        found: tuple[Tensor, Tensor] = INNER["least_at_pixels"].reference(value, pixel, num_pixels)
+        return found
+    least, index = room_for(((num_pixels,), torch.float32), ((num_pixels,), torch.int64))
+    call("pc_least_at_pixels", value.contiguous(), pixel.contiguous(), len(value), num_pixels, least, index)
+    return least, index
