@@ -58,10 +58,14 @@ def cloud_cases(cloud: pcdata.PointCloud) -> Iterator[Case]:
     theirs = o3d.t.geometry.PointCloud(o3d.core.Tensor(points.numpy()))
     theirs.point.colors = o3d.core.Tensor(colors.float().numpy())
     k = o3d.core.Tensor(K[0].double().numpy())
+
+    def their_depth() -> np.ndarray:
+        image = theirs.project_to_depth_image(SIZE[1], SIZE[0], k, depth_scale=1.0, depth_max=100.0)
+        return image.as_tensor().numpy()
+
     yield Case(
         "cloud to depth", len(points), lambda: F.render_points(points, intrinsics=K, size=SIZE).depth, "Open3D tensor",
-        lambda: theirs.project_to_depth_image(SIZE[1], SIZE[0], k, depth_scale=1.0, depth_max=100.0).as_tensor().numpy(),
-        covered,
+        their_depth, covered,
     )  # fmt: skip
     yield Case(
         "cloud to depth and color", len(points), lambda: render(plain, camera).frame, "Open3D tensor",
@@ -71,8 +75,7 @@ def cloud_cases(cloud: pcdata.PointCloud) -> Iterator[Case]:
     yield Case(
         "cloud to depth, points 5 mm wide", len(points),
         lambda: F.render_points(points, intrinsics=K, size=SIZE, point_size=0.005).depth, "Open3D tensor, one pixel",
-        lambda: theirs.project_to_depth_image(SIZE[1], SIZE[0], k, depth_scale=1.0, depth_max=100.0).as_tensor().numpy(),
-        covered,
+        their_depth, covered,
     )  # fmt: skip
 
 

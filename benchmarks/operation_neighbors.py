@@ -80,7 +80,8 @@ def radius_cases(points: torch.Tensor) -> Iterator[Case]:
         from scipy.spatial import cKDTree
 
         yield Case(
-            "all neighbors, a radius per query", count, lambda: F.radius_neighbors(points, radius=each), "SciPy cKDTree",
+            "all neighbors, a radius per query", count, lambda: F.radius_neighbors(points, radius=each),
+            "SciPy cKDTree, counts alone",
             lambda: cKDTree(array).query_ball_point(array, each.numpy(), workers=-1, return_length=True),
             lambda a, b: same(a[2].diff().numpy(), b),
         )  # fmt: skip
@@ -165,7 +166,8 @@ def metric_cases(points: torch.Tensor) -> Iterator[Case]:
             lambda: np.square(to_nearest(x, y)[0]).mean(), within,
         )  # fmt: skip
         yield Case(
-            "Chamfer, L1", count, lambda: F.chamfer_distance(a, None, b, None, norm="l1", squared=False, sides="a_to_b"),
+            "Chamfer, L1", count,
+            lambda: F.chamfer_distance(a, None, b, None, norm="l1", squared=False, sides="a_to_b"),
             "SciPy cKDTree", lambda: np.abs(x - y[to_nearest(x, y)[1]]).sum(1).mean(), within,
         )  # fmt: skip
 

@@ -85,7 +85,6 @@ def voxel_cases(points: torch.Tensor, colors: torch.Tensor) -> Iterator[Case]:
         lambda: numpy(SIZE, least=4), counted,
     )  # fmt: skip
     cloud = pcdata.PointCloud(points=points, ptr=torch.tensor([0, count]), unit="m", frame_id="camera", colors=colors)
-    inverse, counts = numpy_voxels(array, SIZE, origin)
 
     def first() -> Any:
         return np.unique(numpy_voxels(array, SIZE, origin)[0], return_index=True)[1]
@@ -222,7 +221,7 @@ def mask_cases(points: torch.Tensor) -> Iterator[Case]:
         volume.axis_min, volume.axis_max = -100, 100
         corners = torch.cat([polygon, torch.zeros(len(polygon), 1, dtype=torch.float64)], 1)
         volume.bounding_polygon = o3d.utility.Vector3dVector(corners.numpy())
-        whole, repeated = legacy(points), legacy(twice)
+        whole = legacy(points)
         box = o3d.geometry.AxisAlignedBoundingBox(np.array(lower), np.array(upper))
         yield Case(
             "box mask", count, lambda: F.box_mask(points, lower=lower, upper=upper), "Open3D",

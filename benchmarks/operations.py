@@ -1,6 +1,6 @@
 """Time operations against their peers in one run, check that the results are equal, and try 10,000 small clouds.
 
-    OMP_NUM_THREADS=2 python benchmarks/operations.py           # options of the operations; writes results/operations.json
+    OMP_NUM_THREADS=2 python benchmarks/operations.py       # the options of operations; writes results/operations.json
     PCDATA_TEST_DATA=... python benchmarks/operations.py --frame    # the README's; writes results/operations_*.json
     python benchmarks/operations.py --kept                      # prints the kept results of --frame as in the README
     python benchmarks/operations.py --page                      # prints those of the options as in the docs

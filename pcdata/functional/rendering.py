@@ -16,7 +16,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_image_size, checked_positive
 from pcdata.errors import ConfigError
-from pcdata.functional.depth.deproject import pixel_rays, project_points
+from pcdata.functional.depth.deproject import pixel_rays, projected
 from pcdata.functional.rows import cloud_of_rows
 
 _INDEX_BITS = 32  # of a key; the bits of its depth lie above them
@@ -75,7 +75,7 @@ def render_points(
         ConfigError: a size below one pixel, or a point size that is negative or not finite.
     """
     assert ptr is not None
-    pixels, _ = project_points(points, ptr, intrinsics=intrinsics, distortion=distortion)
+    pixels, _ = projected(points, ptr, intrinsics, distortion)
     view = cloud_of_rows(ptr)
     z = points[:, 2]
     visible = ~pixels[:, 0].isnan()
@@ -123,7 +123,7 @@ def render_triangles(
     """
     assert ptr is not None
     corners = triangles.double()
-    pixels, _ = project_points(corners.flatten(0, 1), 3 * ptr, intrinsics=intrinsics, distortion=distortion)
+    pixels, _ = projected(corners.flatten(0, 1), 3 * ptr, intrinsics, distortion)
     pixels = pixels.reshape(-1, 3, 2)
     visible = ~pixels.isnan().flatten(1).any(1)
     at = torch.where(visible[:, None, None], pixels, 0.0)

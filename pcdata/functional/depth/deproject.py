@@ -174,7 +174,12 @@ def project_points(
     Raises:
         CaptureError: impossible intrinsics or distortion.
     """
-    assert ptr is not None
+    assert ptr is not None  # @op fills it
+    return projected(points, ptr, intrinsics, distortion)
+
+
+def projected(points: Tensor, ptr: Tensor, intrinsics: Tensor, distortion: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Run the body of :func:`project_points`, in torch."""
     check_camera("project_points", intrinsics, distortion)
     view = cloud_of_rows(ptr)
     x, y, z = points.double().unbind(-1)

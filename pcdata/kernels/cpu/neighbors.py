@@ -1,8 +1,8 @@
 """Neighbor kernels: kNN, ball query, chamfer distance, outliers, normals, DBSCAN.
 
 Radius outliers and DBSCAN count in cells. All others search one box tree over Morton order, sixteen queries at a time;
-clouds with an image grid search pixel windows first. Points of other than three columns have trees of their own. Results are those of the references: the same neighbors in the
-same order, the same masks.
+clouds with an image grid search pixel windows first. Points of other than three columns have trees of their own.
+Results are those of the references: the same neighbors in the same order, the same masks.
 """
 
 from __future__ import annotations
