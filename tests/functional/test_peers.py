@@ -108,8 +108,8 @@ def page() -> str:
         "",
         "Made by `tests/functional/test_peers.py` from the registered operations; all are called as "
         '`pcdata.functional.NAME`. Many at once: "ragged" takes clouds of any sizes, one after another, cut by `ptr`, '
-        'without a loop over them; "rows" knows no clouds. Compiled bodies know three coordinates and Open3D\'s voxel '
-        "grid; all else runs in torch, on any device. [Calls of other libraries beside ours](coming_from.md).",
+        'without a loop over them; "rows" knows no clouds. Compiled bodies run on the CPU and give what the references '
+        "give; all else runs in torch, on any device. [Calls of other libraries beside ours](coming_from.md).",
         "",
         "| operation | gradients | many at once | compiled | held to an oracle in | others call it |",
         "|---|---|---|---|---|---|",
