@@ -17,6 +17,7 @@ from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
+from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import chamfer_distance, f_score, hausdorff_distance
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
@@ -24,6 +25,7 @@ from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.paired_points import PairedMotion, fit_paired_points
+from pcdata.functional.plane_segments import segment_planes, supporting_plane
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.rendering import (
     RenderedPoints,
@@ -37,6 +39,7 @@ from pcdata.functional.rendering import (
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
 from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, polygon_mask
+from pcdata.functional.table_surface import TableSurface, table_surface
 from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_downsample,
@@ -57,6 +60,7 @@ __all__ = [
     "RegisteredDepth",
     "RenderedPoints",
     "RenderedTriangles",
+    "TableSurface",
     "TemporalState",
     "average_depth",
     "ball_query",
@@ -84,6 +88,7 @@ __all__ = [
     "fit_paired_points",
     "flying_pixel_mask",
     "hausdorff_distance",
+    "image_clusters",
     "knn",
     "neighborhood_covariance",
     "orient_normals",
@@ -101,9 +106,12 @@ __all__ = [
     "render_ranges",
     "render_triangles",
     "resize_depth",
+    "segment_planes",
     "shape_features",
     "spatial_filter",
     "statistical_outlier_mask",
+    "supporting_plane",
+    "table_surface",
     "temporal_filter",
     "undistort_depth",
     "undistort_image",

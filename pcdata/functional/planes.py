@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
-from pcdata.contracts.numbers import checked_count, checked_length
+from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
@@ -22,11 +22,13 @@ from pcdata.rng import seeded
 _MAX_REFINEMENTS = 20
 # Hypotheses x points scored at once: 1 MB of distances stays in a CPU core's cache; a GPU wants fewer launches.
 _BLOCK = {"cpu": (64, 4096), "cuda": (64, 262144)}
+# Hypotheses of the first look where few may do; as many again as there were after each.
+_FIRST_TRIES = 32
 # Planes drawn at a time, over all clouds: 32 MB.
 _MOST_HYPOTHESES = 1 << 20
 
 
-def _checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
+def checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
     """Require one seed for every cloud, or one per cloud (B,); bodies get a list of B."""
     seed, num_clouds = arguments[name], len(arguments["ptr"]) - 1
     given = seed.tolist() if isinstance(seed, Tensor) else seed
@@ -38,7 +40,7 @@ def _checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[
     return seeds
 
 
-def _checked_up(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+def checked_up(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one direction for every cloud, or one per cloud; bodies get (B, 3) float64 unit vectors on the CPU."""
     num_clouds = len(arguments["ptr"]) - 1
     directions = torch.as_tensor(arguments[name], dtype=torch.float64, device="cpu").detach()
@@ -52,7 +54,7 @@ def _checked_up(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     return directions / lengths[:, None]
 
 
-def _checked_tilt(where: str, name: str, arguments: Mapping[str, Any]) -> float:
+def checked_tilt(where: str, name: str, arguments: Mapping[str, Any]) -> float:
     """Require an angle from up."""
     tilt: float = arguments[name]
     if arguments["up"] is None:
@@ -60,6 +62,14 @@ def _checked_tilt(where: str, name: str, arguments: Mapping[str, Any]) -> float:
     if not 0 <= tilt <= math.pi:
         raise ConfigError(f"{where}: max_tilt is in radians, between 0 and pi, got {tilt}")
     return tilt
+
+
+def checked_probability(where: str, name: str, arguments: Mapping[str, Any]) -> float:
+    """Require a number between 0 and 1."""
+    value = checked_fraction(where, name, arguments)
+    if value == 1:
+        raise ConfigError(f"{where}: probability must be less than 1, which no number of tries gives; leave it out")
+    return value
 
 
 # The steps of the search that touch every point, for all clouds at once.
@@ -109,9 +119,10 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "a
     ptr="ptr N B >= 3",
     distance=checked_length,
     num_hypotheses=checked_count,
-    seed=_checked_seeds,
-    up=_checked_up,
-    max_tilt=_checked_tilt,
+    seed=checked_seeds,
+    up=checked_up,
+    max_tilt=checked_tilt,
+    probability=checked_probability,
     steps=(draw_planes, count_near_planes, near_planes, fit_planes),
     gradient=False,
 )
@@ -124,12 +135,13 @@ def ransac_plane(
     seed: int | Sequence[int] | Tensor = 0,
     up: Tensor | Sequence[float] | None = None,
     max_tilt: float | None = None,
+    probability: float | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Find each cloud's plane with the most points nearer than ``distance`` (strictly, as Open3D).
 
-    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored on all points (no early
-    stop); ties go to the earliest. The winner is then refitted to its inliers by least squares until the inliers no
+    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored on all points; ties go to
+    the earliest. The winner is then refitted to its inliers by least squares until the inliers no
     longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
@@ -145,6 +157,9 @@ def ransac_plane(
         up: (3,) or one per cloud (B, 3); any length.
         max_tilt: radians; only planes whose normal is within this angle of up or -up compete. A refinement that would
             leave this cone is not taken.
+        probability: stop at the first hypothesis by which, if the best so far holds the share w of the points, three
+            points within that plane have been drawn with this probability: after log(1 - probability) /
+            log(1 - w^3) tries. Hypotheses count in the order drawn, so every backend stops at the same. None = try all.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
@@ -167,10 +182,39 @@ def ransac_plane(
         triples, which = _draw_triples(counts[some], num_hypotheses, seed[some])
         hypotheses = draw_planes(own, own_ptr, triples, which, backend=backend)
         allowed = _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
-        near = count_near_planes(own, own_ptr, hypotheses, distance, backend=backend)
+        if probability is None:
+            near = count_near_planes(own, own_ptr, hypotheses, distance, backend=backend)
+        else:
+            near, allowed = _count_until_probable(own, own_ptr, hypotheses, allowed, distance, probability, backend)
         winners.append(_best_planes(hypotheses, allowed, near, distance, first))
-    planes, inliers = _refine(points, ptr, torch.cat(winners), distance, up, max_tilt, backend)
+    planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend)
     return _face(planes, up, distance).to(points.device), inliers
+
+
+def _count_until_probable(
+    points: Tensor,
+    ptr: Tensor,
+    hypotheses: Tensor,  # (B, P, 4)
+    allowed: Tensor,  # (B, P)
+    distance: float,
+    probability: float,
+    backend: str,
+) -> tuple[Tensor, Tensor]:  # counts (B, P) and allowed (B, P), nothing behind each cloud's last try
+    """Score hypotheses in blocks until the last cloud has been tried often enough."""
+    sizes = counts_from_ptr(ptr).cpu()[:, None].double()
+    counts = torch.zeros(allowed.shape, dtype=torch.int64, device="cpu")
+    competes, tries = allowed & ~hypotheses[..., 0].isnan(), hypotheses.shape[1]
+    last, first, block = torch.full_like(sizes, tries), 0, _FIRST_TRIES
+    while first < tries and bool((last > first).any()):
+        some = slice(first, min(first + block, tries))
+        counts[:, some] = count_near_planes(points, ptr, hypotheses[:, some].contiguous(), distance, backend=backend)
+        share = counts[:, : some.stop].masked_fill(~competes[:, : some.stop], 0).cummax(1).values / sizes
+        # log1p(-1) = -inf: one try finds a plane that holds all
+        needed = math.log1p(-probability) / torch.log1p(-share.pow(3))
+        done = torch.arange(1, some.stop + 1, dtype=torch.float64, device="cpu") >= needed
+        last = torch.where(done.any(1, keepdim=True), done.int().argmax(1, keepdim=True) + 1.0, float(tries))
+        first, block = some.stop, 2 * block
+    return counts, allowed & (torch.arange(tries, dtype=torch.int64, device="cpu") < last)
 
 
 def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
@@ -233,7 +277,7 @@ def _count_near(points: Tensor, planes: Tensor, distance: float) -> Tensor:
     return counts.long().cpu()
 
 
-def _refine(
+def refined_planes(
     points: Tensor,
     ptr: Tensor,
     planes: Tensor,  # (B, 4)
@@ -242,7 +286,10 @@ def _refine(
     max_tilt: float | None,
     backend: str,
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
-    """Refit to the inliers until they no longer change; return the last allowed planes and their inliers."""
+    """Refit to the inliers until they no longer change; return the last allowed planes and their inliers.
+
+    The planes given are changed.
+    """
     inliers = near_planes(points, ptr, planes, distance, backend=backend)
     unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
     rows, own, own_ptr, before = None, points, ptr, inliers

@@ -157,3 +157,35 @@ def convex_hull(
         farthest = around[beyond.argmax()]
         stack += [(farthest, b, around), (a, farthest, around)]
     return torch.stack(corners)
+
+
+def plane_axes(plane: Tensor) -> Tensor:
+    """Return two orthogonal directions (3, 2) float64 in a plane (4,): the first across its normal's least component.
+
+    With the normal as third they are right-handed, so counterclockwise is seen from the side that it points to.
+    """
+    normal = plane[:3].double()
+    axis = torch.eye(3, dtype=torch.float64, device=normal.device)[normal.abs().argmin()]
+    first = torch.linalg.cross(normal, axis)
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(normal, first)], dim=1)
+
+
+def over_hull(
+    points: Tensor,  # (n, 3)
+    base: Tensor,  # (m, 3)
+    plane: Tensor,  # (4,)
+    margin: float,
+) -> Tensor:  # (n,) bool
+    """Mark points over or under the convex hull of base in a plane, or within ``margin`` of the lines of its edges."""
+    axes = plane_axes(plane)
+    flat, flat_base = points.double() @ axes, base.double() @ axes
+    corners = flat_base[convex_hull(flat_base)]
+    if len(corners) < 3:
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    edge = corners.roll(-1, 0) - corners
+    outward = torch.stack([edge[:, 1], -edge[:, 0]], dim=1) / edge.norm(dim=1, keepdim=True)
+    beyond = torch.full_like(flat[:, 0], -torch.inf)
+    for corner, direction in zip(corners, outward):  # tens of them
+        beyond = torch.maximum(beyond, (flat - corner) @ direction)
+    return beyond <= margin

@@ -18,6 +18,7 @@ from pcdata.transforms.downsample import (
     VoxelDownsample,
 )
 from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTransform, SpatialTransform
+from pcdata.transforms.found_planes import plane_hulls_in_cloud, planes_in_cloud
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.keep_confidence import KeepConfidence
@@ -25,7 +26,7 @@ from pcdata.transforms.mixing import mix_scenes
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace, ShiftToOrigin
 from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
-from pcdata.transforms.planes import RemovePlane, planes_in_cloud
+from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning
 from pcdata.transforms.random_apply import RandomApply
 from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_jitter import RandomColorDrop, RandomColorJitter, RandomJitter, RandomPointDropout
@@ -98,6 +99,7 @@ __all__ = [
     "SpatialFilterDepth",
     "SpatialTransform",
     "SplitObjects",
+    "TiltedPlaneWarning",
     "ToFrame",
     "Transform",
     "TurnDepth",
@@ -105,5 +107,6 @@ __all__ = [
     "VoxelDownsample",
     "VoxelSample",
     "mix_scenes",
+    "plane_hulls_in_cloud",
     "planes_in_cloud",
 ]

@@ -1,9 +1,10 @@
-"""RemovePlane: find the dominant plane, usually the table, and remove it."""
+"""RemovePlane: find the table, or the dominant plane, and remove it."""
 
 from __future__ import annotations
 
-import itertools
 import math
+import warnings
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import annotated_types
@@ -12,49 +13,73 @@ from annotated_types import Ge, Interval
 from torch import Tensor
 
 from pcdata.contracts.host import negated
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, PcdataWarning
+from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import ransac_plane
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
-from pcdata.functional.selection import convex_hull
+from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_after_mask
+from pcdata.functional.selection import over_hull
+from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
 from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
-from pcdata.structures import METRE, PointCloud
+from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
+from pcdata.transforms.found_planes import plane_facts
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.
 _LEAST_RISE = math.radians(5)
+# From here on a plane is rather a wall than a table that a pose is wrong about.
+_WALL = math.radians(60)
+# Up, more or less, of a camera that is held upright, in its own axes (x right, y down, z forward): it looks level or
+# down. A wall that faces it scores low whatever the angle.
+_LIKELY_UP = (0.0, -1.0, -0.3)
+
+
+class TiltedPlaneWarning(PcdataWarning):
+    """A table that is not level: its pose, the stated up, or the choice of the plane is wrong."""
 
 
 class RemovePlane(RemoveTransform):
-    """Remove the plane with the most inliers, found by RANSAC and refined by least squares.
+    """Remove a plane: the one with the most inliers, found by RANSAC and refined by least squares, or the table.
 
-    The plane joins ``meta["planes"]`` of every cloud, in the source frame, so later steps cannot make it stale;
-    :func:`planes_in_cloud` gives it in the cloud's present coordinates. ``faces`` says what its normal was turned to:
-    ``up``, the ``origin`` of the frame it was found in, or ``neither side`` of a plane through that origin.
+    The plane joins ``meta["planes"]`` of every cloud with its inlier share, RMS, tilt and hull, in the source frame, so
+    later steps cannot make it stale; :func:`planes_in_cloud` and :func:`plane_hulls_in_cloud` give it in the cloud's
+    present coordinates. ``faces`` says what its normal was turned to: ``up``, the ``sensor``, the ``origin`` of the
+    frame it was found in, or ``neither side`` of a plane through that origin.
 
     Args:
         distance: inliers are closer to the plane than this.
         num_hypotheses: planes tried through three points each.
         seed: of the hypotheses: the same cloud always gives the same plane.
-        up: the normal's rough direction in `frame`; None = any, facing the origin of the frame.
+        probability: stop trying once a better plane is this unlikely to be missed; None = try all.
+        up: the normal's rough direction in `frame`; None = any, facing the sensor or the origin of the frame.
         frame: the frame that `up` is given in; given with it.
         max_tilt: radians between normal and up at most.
+        tilt_alarm: radians between normal and up from which a warning is given; None = never.
         max_height: metres above the plane that are kept at most, with above and over.
         margin: metres beyond the hull that still are over the plane.
 
     Raises:
         ConfigError: ``keep`` asks for one side where the plane passes the origin and no ``up`` is given, or holds it.
+
+    Warns:
+        TiltedPlaneWarning: the plane leans away from up by more than ``tilt_alarm``.
     """
 
     runs_statistics = True
-    version = 2
+    version = 3
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000
     seed: int = 0
+    probability: Annotated[float, Interval(gt=0, lt=1)] | None = None
+    # "supporting": by area, by what stands on it and by how level it is: see functional.supporting_plane.
+    which: Literal["largest", "supporting"] = "largest"
+    # "slab": all that is closer than `distance` goes. "measured": what the plane's own bend and noise explain goes, so
+    # the feet of objects stay and edges of the table do not: see functional.table_surface.
+    cut: Literal["slab", "measured"] = "slab"
     # "above": also drop what lies beyond the plane, seen along its normal; then the plane must have an upper side.
     # "over": also drop what is not over the convex hull of the plane's points: what stands on the table.
     keep: Literal["both", "above", "over"] = "both"
@@ -63,6 +88,7 @@ class RemovePlane(RemoveTransform):
     up: Vec3 | None = None
     frame: Name | None = None
     max_tilt: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = None
+    tilt_alarm: Annotated[float, Interval(gt=0, le=math.pi / 2)] | None = math.radians(5)
 
     def check_fields(self) -> None:
         """Require up and frame together, up for max_tilt, and a side for heights and margins."""
@@ -81,7 +107,67 @@ class RemovePlane(RemoveTransform):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Find the plane of every cloud and the rows that stay."""
-        planes, inlier = ransac_plane(
+        planes, own = self._found(data)
+        found: Params = {}
+        height = None
+        if self.cut == "measured":
+            surface = table_surface(
+                data.points,
+                data.ptr,
+                planes=planes,
+                distance=self.distance,
+                viewpoint=data.viewpoint_per_point(),
+                grid=data.image_grid(),
+            )
+            planes, own, height = surface.planes, surface.table, surface.height
+            found = {"noise": surface.noise, "inverse_noise": surface.inverse_noise}
+        keep = negated(own)
+        if self.keep != "both":
+            for b, plane in enumerate(planes.cpu()):
+                self._require_upper_side(data, b, plane)
+            if height is None:
+                plane = planes.double()[cloud_of_rows(data.ptr)]
+                height = (plane[:, :3] * data.points).sum(1) + plane[:, 3]
+            keep &= height > 0
+            if self.max_height is not None:
+                keep &= height <= self.max_height
+        if self.keep == "over":
+            parts = [slice(*pair) for pair in pairwise(data.ptr.tolist())]
+            keep &= torch.cat(
+                [
+                    over_hull(data.points[part], data.points[part][own[part]], plane, self.margin)
+                    for part, plane in zip(parts, planes)
+                ]
+            )
+        return {
+            "index": keep,
+            "ptr": ptr_after_mask(keep, data.ptr),
+            "planes": planes,
+            "num_inliers": count_per_cloud(own, data.ptr),
+            "per_point": own,
+            **found,
+        }
+
+    def _found(self, data: PointCloud) -> tuple[Tensor, Tensor]:
+        """Return each cloud's plane and its inliers."""
+        if self.which == "largest":
+            return ransac_plane(
+                data.points,
+                data.ptr,
+                distance=self.distance,
+                num_hypotheses=self.num_hypotheses,
+                seed=self.seed,
+                up=self.up,
+                max_tilt=self.max_tilt,
+                probability=self.probability,
+            )
+        likely_up = None
+        if self.up is None and data.source_frame == CAMERA_FRAME:
+            likely_up = torch.linalg.solve(
+                data.source_from_cloud[:, :3, :3].cpu(),
+                torch.tensor(_LIKELY_UP, dtype=torch.float64, device="cpu").expand(data.num_clouds, 3),
+            )
+        return supporting_plane(
             data.points,
             data.ptr,
             distance=self.distance,
@@ -89,101 +175,96 @@ class RemovePlane(RemoveTransform):
             seed=self.seed,
             up=self.up,
             max_tilt=self.max_tilt,
+            probability=self.probability,
+            likely_up=likely_up,
+            viewpoint=_viewpoints(data),
         )
-        keep = negated(inlier)
-        if self.keep != "both":
-            for b, plane in enumerate(planes.cpu()):
-                self._require_upper_side(data, b, plane)
-            plane = planes.double()[cloud_of_rows(data.ptr)]
-            height = (plane[:, :3] * data.points).sum(1) + plane[:, 3]
-            keep &= height > 0
-            if self.max_height is not None:
-                keep &= height <= self.max_height
-        if self.keep == "over":
-            bounds = data.ptr.tolist()
-            parts = [slice(*pair) for pair in itertools.pairwise(bounds)]
-            keep &= torch.cat(
-                [_over_hull(data.points[part], inlier[part], plane, self.margin) for part, plane in zip(parts, planes)]
-            )
-        return {
-            "index": keep,
-            "ptr": ptr_after_mask(keep, data.ptr),
-            "planes": planes,
-            "num_inliers": counts_from_ptr(ptr_after_mask(inlier, data.ptr)),
-        }
 
     def _require_upper_side(self, data: PointCloud, b: int, plane: Tensor) -> None:
         """Refuse a plane whose normal noise could turn round: it decides which half of the scene is dropped."""
         where = f"RemovePlane: keep={self.keep!r} of cloud {b}{sample_name(data, b)} is open: the plane"
-        if self.up is None and through_origin(plane, self.distance):
+        if self._faces(data, b, plane) == "neither side":
             raise ConfigError(
                 f"{where} passes the origin of {data.frame_id!r} at {1000 * abs(float(plane[3])):.3g} mm, nearer than "
                 f"distance={self.distance:g}, so the origin is on neither side; say which way is up: "
                 f"up=(x, y, z), frame={data.frame_id!r}"
             )
         if self.up is not None:
-            up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
-            rise = math.pi / 2 - float(rigid.angle_between(plane[:3], up))
+            rise = math.pi / 2 - self._tilt(plane)
             if abs(rise) < _LEAST_RISE:
                 raise ConfigError(
                     f"{where} contains up to within {math.degrees(abs(rise)):.2g} degrees, so neither side is above; "
                     "give max_tilt to look for a level plane, or the up of this one"
                 )
 
+    def _tilt(self, plane: Tensor) -> float:
+        up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
+        return float(rigid.angle_between(plane[:3].cpu(), up))
+
+    def _faces(self, data: PointCloud, b: int, plane: Tensor) -> str:
+        """Say what a normal was turned to."""
+        if self.up is not None:
+            return "up"
+        seen_from = _viewpoints(data) if self.which == "supporting" else None
+        if seen_from is None:
+            return "neither side" if through_origin(plane, self.distance) else "origin"
+        side = float(seen_from[b].double() @ plane[:3] + plane[3])
+        return "neither side" if abs(side) < self.distance else "sensor"
+
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
         entries: list[dict[str, Any]] = []
-        source_planes = _map_planes(params["planes"], torch.linalg.inv(data.source_from_cloud))
-        for b, plane in enumerate(source_planes.tolist()):
-            found: dict[str, Any] = {
-                "normal": plane[:3],
-                "offset": plane[3],
-                "frame": data.source_frame,
-                "num_inliers": int(params["num_inliers"][b]),
-            }
-            if self.up is None:
-                found["faces"] = "neither side" if through_origin(params["planes"][b], self.distance) else "origin"
+        for b, (start, stop) in enumerate(pairwise(data.ptr.tolist())):
+            plane = params["planes"][b]
+            own = data.points[start:stop][params["per_point"][start:stop]]
+            found = plane_facts(own, stop - start, plane, data, b)
+            found["faces"] = self._faces(data, b, plane)
+            for name in ("noise", "inverse_noise"):
+                if name in params and math.isfinite(value := float(params[name][b])):
+                    found[name] = value
             if self.up is not None:
-                found["faces"] = "up"
-                up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
-                found["tilt"] = float(rigid.angle_between(params["planes"][b, :3].cpu(), up))
+                found["tilt"] = self._tilt(plane)
+                self._warn_of_tilt(data, b, found["tilt"])
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
         return super().transform(data, params).with_meta(entries)
 
-
-def _over_hull(points: Tensor, inlier: Tensor, plane: Tensor, margin: float) -> Tensor:
-    """Mark the points (n, 3) that lie over the convex hull of the inliers, or within ``margin`` of its edges' lines."""
-    normal = plane[:3].double()
-    # Two directions in the plane: across the axis that the normal is least along.
-    aside = torch.linalg.cross(normal, torch.eye(3, dtype=torch.float64, device=normal.device)[normal.abs().argmin()])
-    aside = aside / aside.norm()
-    flat = points.double() @ torch.stack([aside, torch.linalg.cross(normal, aside)], dim=1)
-    corners = flat[inlier][convex_hull(flat[inlier])]
-    if len(corners) < 3:
-        return torch.zeros_like(inlier)
-    edge = corners.roll(-1, 0) - corners
-    outward = torch.stack([edge[:, 1], -edge[:, 0]], dim=1) / edge.norm(dim=1, keepdim=True)
-    beyond = torch.full_like(flat[:, 0], -torch.inf)
-    for corner, direction in zip(corners, outward):  # tens of them
-        beyond = torch.maximum(beyond, (flat - corner) @ direction)
-    return beyond <= margin
-
-
-def planes_in_cloud(cloud: PointCloud, b: int = 0) -> Tensor:
-    """Return (P, 4) float64 planes (unit normal, offset) found in cloud ``b``, in its present coordinates.
-
-    A point p is on the plane where ``normal @ p + offset == 0``.
-    """
-    stored = [[*plane["normal"], plane["offset"]] for plane in cloud.meta[b].get("planes", [])]
-    planes = torch.tensor(stored, dtype=torch.float64, device="cpu").reshape(-1, 4)
-    matrix = cloud.source_from_cloud[b].cpu()
-    return _map_planes(planes, matrix.expand(len(planes), 4, 4))
-
-
-def _map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
-    """Rewrite (P, 4) planes in new coordinates: a plane is a row vector, so it moves by the inverse matrix."""
-    moved = torch.einsum("pi,pij->pj", planes.double(), old_from_new)
-    return moved / moved[:, :3].norm(dim=1, keepdim=True)
+    def _warn_of_tilt(self, data: PointCloud, b: int, tilt: float) -> None:
+        """Say by how much a table leans, and what that mostly comes from."""
+        if self.tilt_alarm is None or tilt <= self.tilt_alarm:
+            return
+        turned = [step["step"] for step in data.history[b] if step["step"].startswith("Random")]
+        if tilt > _WALL:
+            cause = (
+                f"it is a wall or the side of a box, or up={self.up} is not up in frame {self.frame!r} (cameras have y "
+                "down); give max_tilt to look for a level plane, or correct up"
+            )
+        elif turned:
+            cause = f"{', '.join(turned)} before it turned the cloud; put RemovePlane before random steps"
+        elif data.frame_id == CAMERA_FRAME:
+            cause = (
+                f"the camera looks down at another angle than up={self.up} says; bring the cloud into a level frame "
+                "by ToFrame, or correct up"
+            )
+        else:
+            cause = (
+                f"the pose of the camera in {self.frame!r} is off by as much (check it: pcdata calib, pcdata "
+                "validate), or the table does lean; raise tilt_alarm if it does"
+            )
+        warnings.warn(
+            f"RemovePlane: cloud {b}{sample_name(data, b)}: the plane is tilted by {math.degrees(tilt):.1f} degrees "
+            f"from up; likely {cause}",
+            TiltedPlaneWarning,
+            stacklevel=2,
+        )
 
 
-__all__ = ["RemovePlane", "planes_in_cloud"]
+def _viewpoints(data: PointCloud) -> Tensor | None:
+    """Return one place (B, 3) for every cloud where its sensors stood, the mean of several, or None."""
+    if "viewpoint" not in data.extra:
+        return data.viewpoint
+    places = [part.mean(0) if len(part) else part.new_zeros(3) for part in data.extra["viewpoint"].split(_sizes(data))]
+    return torch.stack(places)
+
+
+def _sizes(data: PointCloud) -> list[int]:
+    return [int(count) for count in data.counts.tolist()]

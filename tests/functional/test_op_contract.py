@@ -97,6 +97,15 @@ def two_clouds_with_normals(count: int, seed: int) -> dict[str, Tensor]:
     return clouds
 
 
+def on_an_image(count: int, seed: int) -> dict[str, Tensor]:
+    pixels = torch.randperm(192, generator=seeded(seed))[:count].sort().values
+    return {"points": points(count, seed), "pixel_index": pixels}
+
+
+def with_a_plane(count: int, seed: int) -> dict[str, Tensor]:
+    return {"points": points(count, seed), "planes": torch.tensor([[0.0, 0.0, 2.0, -0.2]], dtype=torch.float64)}
+
+
 INTRINSICS = torch.tensor([[[30.0, 0.1, 8.2], [0.0, 31.0, 6.1], [0.0, 0.0, 1.0]]], dtype=torch.float64)
 LENS = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=torch.float64)
 
@@ -209,6 +218,7 @@ EXAMPLES = [
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
     Example("fit_paired_points", in_pairs, ("cloud",) * 3, {"with_scale": True}),
     Example("flying_pixel_mask", depth_alone, ("row",)),
+    Example("image_clusters", on_an_image, ("row",), {"size": (12, 16), "eps": 0.1, "reach": 2}),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("knn", in_six_dimensions, ("index", "row"), {"k": 4}),
@@ -226,8 +236,11 @@ EXAMPLES = [
     Example("render_ranges", one_cloud, ("row", "index"), {"size": (12, 16)}),
     Example("render_triangles", triangles_in_front_of_a_camera, ("row", "index", "row"), {"size": (12, 16)}),
     Example("resize_depth", depth_alone, ("row", "row"), {"size": (7, 30), "max_jump": 0.3}),
+    Example("segment_planes", one_cloud, ("row", "ptr", "row"), {"num_hypotheses": 50, "min_share": 0.1}),
     Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
+    Example("supporting_plane", one_cloud, ("cloud", "row"), {"num_hypotheses": 50, "distance": 0.005}),
+    Example("table_surface", with_a_plane, ("row", "row", *("cloud",) * 3), {"viewpoint": (0.1, 0.1, 1.0)}),
     Example("undistort_depth", lens_depth, ("row", "row"), {"rule": "surface", "max_jump": 0.3}),
     Example("undistort_image", lens_image, ("row", "row"), {"size": (7, 30)}),
     Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),

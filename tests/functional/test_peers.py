@@ -53,6 +53,7 @@ PEERS = {
     ),
     "flying_pixel_mask": ("functional/depth/test_flying_pixels.py", "PCL `ShadowPoints`"),
     "hausdorff_distance": ("functional/test_metrics.py", "SciPy `directed_hausdorff`"),
+    "image_clusters": ("functional/test_image_clusters.py", "PCL `OrganizedEuclideanClusterExtraction`"),
     "knn": ("functional/test_neighbors.py", "torch-cluster `knn`; PyTorch3D `knn_points`; Open3D `knn_search`"),
     "neighborhood_covariance": (
         "functional/test_neighborhoods.py",
@@ -80,8 +81,11 @@ PEERS = {
     "render_ranges": ("functional/test_rendering.py", "PCL `RangeImageSpherical`"),
     "render_triangles": ("functional/test_rendering.py", "PyTorch3D `MeshRasterizer`; Open3D `RaycastingScene`"),
     "resize_depth": ("functional/depth/test_resampling.py", "OpenCV `resize`"),
+    "segment_planes": ("functional/test_plane_segments.py", "Open3D `segment_plane`, repeated"),
     "spatial_filter": ("functional/depth/test_disparity.py", "librealsense `spatial_filter`"),
     "statistical_outlier_mask": ("functional/test_outliers.py", "Open3D `remove_statistical_outlier`"),
+    "supporting_plane": ("functional/test_plane_segments.py", ""),
+    "table_surface": ("functional/test_table_surface.py", ""),
     "undistort_depth": ("functional/depth/test_undistortion.py", "OpenCV `remap`, nearest"),
     "undistort_image": (
         "functional/depth/test_undistortion.py",

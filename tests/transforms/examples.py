@@ -221,8 +221,9 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),
-        T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, seed=4),
-        T.RemovePlane(up=(0.0, 0.0, 1.0), frame="base", keep="over", max_height=0.2, margin=0.01),
+        T.RemovePlane(up=(0.0, 0.1, 1.0), frame="base", max_tilt=0.2, keep="above", num_hypotheses=200, tilt_alarm=0.2),
+        T.RemovePlane(up=(0.0, 0.0, 1.0), frame="base", keep="over", max_height=0.2, margin=0.01, tilt_alarm=None),
+        T.RemovePlane(which="supporting", cut="measured", probability=0.999),
     ),
     "RemoveRadiusOutliers": _of(T.RemoveRadiusOutliers(min_neighbors=2, radius=0.03)),
     "RemoveStatisticalOutliers": _of(T.RemoveStatisticalOutliers(num_neighbors=8, std_ratio=1.5)),

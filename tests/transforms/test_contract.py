@@ -238,6 +238,34 @@ def test_the_way_back_leads_to_the_source(example):
     assert float(error.max()) <= example.displacement + 1e-6
 
 
+@each_spatial
+def test_a_plane_that_was_found_moves_along_and_comes_back(example):
+    data = example.make(COUNTS)
+    source = data.in_source_frame() if data.frame_id != data.source_frame else data
+    corners = [part.points[:3].double() for part in source.unbatch()]
+    stored = []
+    for a, b, c in corners:
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=0)
+        hull = torch.stack([a, b, c]).tolist()
+        stored.append({"planes": [{"normal": normal.tolist(), "offset": -float(normal @ a), "hull": hull}]})
+    before = data.with_meta(stored)
+    result = run(example, before)
+    for b, (was, now) in enumerate(zip(before.unbatch(), result.unbatch())):
+        old, new = T.planes_in_cloud(before, b)[0], T.planes_in_cloud(result, b)[0]
+        scale = float(now.points.abs().max()) + 1
+        off = now.points.double() @ new[:3] + new[3]
+        assert float(off[:3].abs().max()) < 1e-5 * scale
+        side = was.points.double() @ old[:3] + old[3]
+        clear = side.abs() > 1e-3 * float(was.points.abs().max())
+        assert torch.equal(off[clear] > 0, side[clear] > 0)
+        torch.testing.assert_close(
+            T.plane_hulls_in_cloud(result, b)[0], now.points[:3].double(), atol=1e-5 * scale, rtol=0
+        )
+        back = T.planes_in_cloud(result.in_source_frame(), b)[0]
+        expected = torch.tensor([*stored[b]["planes"][0]["normal"], stored[b]["planes"][0]["offset"]])
+        torch.testing.assert_close(back, expected.double(), atol=1e-6, rtol=0)
+
+
 def round_trips(transform: T.Transform) -> dict[str, T.Transform]:
     """The same transform through every way it can be written down."""
     chain = T.Compose([transform])
@@ -290,6 +318,8 @@ def changed_values(value: Any) -> list[Any]:
             "planarity",
             "inside",
             "outside",
+            "largest",
+            "slab",
             "warn",
             "y",
         ]

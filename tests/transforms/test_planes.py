@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pcdata.errors import ConfigError, FrameError, NoPlaneError
+from pcdata.errors import ConfigError, FrameError, NoPlaneError, TooFewPointsError
 from pcdata.geometry import rigid
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
@@ -19,10 +19,14 @@ from pcdata.transforms import (
     RandomRotation,
     RandomScale,
     RemovePlane,
+    TiltedPlaneWarning,
     ToFrame,
+    plane_hulls_in_cloud,
     planes_in_cloud,
 )
 from tests.factories import cloud_in_base
+from tests.tables import TABLE as TABLE_SIZE
+from tests.tables import WALL, box, rectangle
 
 TABLE = RemovePlane(distance=0.004, up=(0.0, 0.0, 1.0), frame="base", max_tilt=0.2)
 
@@ -177,4 +181,93 @@ def test_a_wall_has_no_upper_side(lean):
     cloud = PointCloud(points=torch.cat([wall, torch.rand(200, 3, generator=generator) * 0.3]), frame_id="base")
     with pytest.raises(ConfigError, match=r"contains up to within .* degrees, so neither side is above"):
         RemovePlane(keep="above", up=(0, 0, 1), frame="base")(cloud)
-    assert RemovePlane(up=(0, 0, 1), frame="base")(cloud).num_points > 0
+    with pytest.warns(TiltedPlaneWarning, match=r"tilted by (87|90)\.\d degrees from up; likely it is a wall"):
+        assert RemovePlane(up=(0, 0, 1), frame="base")(cloud).num_points > 0
+
+
+# -- the table of a scene ----------------------------------------------------------------------------------------------
+
+SUPPORTING = RemovePlane(which="supporting", cut="measured", probability=0.9999)
+
+
+def in_base(*parts: torch.Tensor) -> PointCloud:
+    """Parts by label, seen from above and aside."""
+    labels = torch.cat([torch.full((len(part),), number) for number, part in enumerate(parts)])
+    return PointCloud(
+        points=torch.cat(parts), labels=labels, frame_id="base", viewpoint=torch.tensor([[-1.0, 0.0, 1.0]])
+    )
+
+
+BLOCKS = [box((x, y, 0.0), (0.08, 0.06, 0.12), seed=9) for x, y in ((0.1, 0.1), (-0.2, 0.2), (0.25, -0.2))]
+
+
+def kept_share(cloud: PointCloud, left: PointCloud, *labels: int) -> list[float]:
+    return [float((left.labels == label).sum() / (cloud.labels == label).sum()) for label in labels]
+
+
+def test_the_table_goes_and_wall_and_things_stay_though_the_wall_is_larger():
+    cloud = in_base(rectangle(**WALL, seed=1), rectangle(**TABLE_SIZE), *BLOCKS)
+    left = SUPPORTING(cloud)
+    wall, table, *things = kept_share(cloud, left, 0, 1, 2, 3, 4)
+    assert wall > 0.98
+    assert table < 0.01
+    assert min(things) > 0.95
+    over = RemovePlane(which="supporting", cut="measured", keep="over")(cloud)
+    assert kept_share(cloud, over, 0) == [0.0]  # what is not over the table goes too
+    assert min(kept_share(cloud, over, 2, 3, 4)) > 0.95
+
+
+def test_of_two_tables_the_one_with_things_on_it_goes():
+    low = rectangle((-0.4, -0.4, 0.0), (0.8, 0.0, 0.0), (0.0, 0.8, 0.0), count=4000)
+    high = rectangle((0.5, -0.4, 0.2), (0.8, 0.0, 0.0), (0.0, 0.8, 0.0), count=4000)
+    cloud = in_base(low, high, *BLOCKS)
+    assert kept_share(cloud, SUPPORTING(cloud), 0, 1) == pytest.approx([0.0, 1.0], abs=0.01)
+
+
+def test_an_empty_table_leaves_a_cloud_of_nothing_which_is_told():
+    with pytest.raises(TooFewPointsError, match="nothing is left of cloud 0"):
+        SUPPORTING(in_base(rectangle(**TABLE_SIZE)))
+
+
+def test_a_cloud_without_a_table_is_told():
+    blob = torch.rand(3000, 3, generator=seeded(0)) * 2
+    with pytest.raises(NoPlaneError, match=r"no plane holds 0\.03 of its"):
+        RemovePlane(which="supporting", distance=0.002)(in_base(blob))
+
+
+@pytest.mark.parametrize(
+    ("frame", "steps", "cause"),
+    [
+        ("base", [], r"the pose of the camera in 'base' is off by as much .* or the table does lean"),
+        ("camera", [], "the camera looks down at another angle"),
+        ("base", [RandomRotation(axis=(1, 0, 0), degrees=0.001)], "RandomRotation before it turned the cloud"),
+    ],
+)
+def test_a_tilted_table_is_told_with_its_angle_and_the_likely_cause(frame, steps, cause):
+    tilted = rectangle((-0.5, -0.5, 0.0), (1.0, 0.0, math.tan(math.radians(12))), (0.0, 1.0, 0.0))
+    cloud = PointCloud(points=torch.cat([tilted, box((0, 0, 0.0), (0.1, 0.1, 0.2))]), frame_id=frame)
+    cloud = Compose(steps)(cloud, generator=seeded(0)) if steps else cloud
+    step = RemovePlane(which="supporting", up=(0, 0, 1), frame=frame)
+    with pytest.warns(TiltedPlaneWarning, match=rf"tilted by 1[12]\.\d degrees from up; likely {cause}"):
+        left = step(cloud)
+    assert left.meta[0]["planes"][0]["tilt"] == pytest.approx(math.radians(12), abs=0.01)
+    quiet = RemovePlane(which="supporting", up=(0, 0, 1), frame=frame, tilt_alarm=None)
+    assert quiet(cloud).meta[0]["planes"][0]["tilt"] == left.meta[0]["planes"][0]["tilt"]
+
+
+def test_what_is_known_of_the_plane_is_stored():
+    cloud = in_base(rectangle(**TABLE_SIZE, noise=0.002), *BLOCKS)
+    left = RemovePlane(which="supporting", cut="measured", up=(0, 0, 1), frame="base")(cloud)
+    (plane,) = left.meta[0]["planes"]
+    assert plane["inlier_share"] == plane["num_inliers"] / cloud.num_points
+    assert plane["rms"] == pytest.approx(0.002, rel=0.1)
+    assert plane["noise"] == pytest.approx(0.002, rel=0.15)
+    assert plane["tilt"] < 0.01
+    (hull,) = plane_hulls_in_cloud(left)
+    assert 3 <= len(hull) <= 24
+    edge = hull.roll(-1, 0) - hull
+    area = 0.5 * float((hull[:, 0] * edge[:, 1] - hull[:, 1] * edge[:, 0]).sum())  # counterclockwise from above
+    assert area == pytest.approx(1.0, rel=0.02)
+    largest = RemovePlane()(cloud).meta[0]["planes"][0]
+    assert "noise" not in largest
+    assert largest["hull"]

@@ -1,0 +1,84 @@
+"""What RemovePlane says of the planes it found: kept in the source frame, so that no later step makes it stale."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.selection import convex_hull, plane_axes
+from pcdata.structures import PointCloud
+
+_MOST_CORNERS = 24  # of a stored hull: meta is written with every sample
+_DIGITS = 5  # of metres: a hundredth of a millimetre
+
+
+def planes_in_cloud(cloud: PointCloud, b: int = 0) -> Tensor:
+    """Return (P, 4) float64 planes (unit normal, offset) found in cloud ``b``, in its present coordinates.
+
+    A point p is on the plane where ``normal @ p + offset == 0``.
+    """
+    stored = [[*plane["normal"], plane["offset"]] for plane in cloud.meta[b].get("planes", [])]
+    planes = torch.tensor(stored, dtype=torch.float64, device="cpu").reshape(-1, 4)
+    matrix = cloud.source_from_cloud[b].cpu()
+    return map_planes(planes, matrix.expand(len(planes), 4, 4))
+
+
+def plane_hulls_in_cloud(cloud: PointCloud, b: int = 0) -> list[Tensor]:
+    """Return the corners (C, 3) float64 of the hull of each plane's own points, in the cloud's present coordinates.
+
+    They lie on the plane of :func:`planes_in_cloud`, counterclockwise seen from where its normal points to, and are 24
+    at most: corners that matter least are left out.
+    """
+    cloud_from_source = torch.linalg.inv(cloud.source_from_cloud[b].cpu())
+    hulls = []
+    for plane in cloud.meta[b].get("planes", []):
+        corners = torch.tensor(plane["hull"], dtype=torch.float64, device="cpu").reshape(-1, 3)
+        hulls.append(corners @ cloud_from_source[:3, :3].T + cloud_from_source[:3, 3])
+    return hulls
+
+
+def map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
+    """Rewrite (P, 4) planes in new coordinates: a plane is a row vector, so it moves by the inverse matrix."""
+    moved = torch.einsum("pi,pij->pj", planes.double(), old_from_new)
+    return moved / moved[:, :3].norm(dim=1, keepdim=True)
+
+
+def plane_facts(
+    own: Tensor,  # (n, 3) the plane's own points
+    num_points: int,  # of the cloud
+    plane: Tensor,  # (4,) in the cloud's coordinates
+    cloud: PointCloud,
+    b: int,
+) -> dict[str, Any]:
+    """Return what is stored of one plane, in the source frame: itself, its share, its spread, and the hull of it."""
+    own, source_from_cloud = own.detach(), cloud.source_from_cloud[b]
+    (source_plane,) = map_planes(plane[None], torch.linalg.inv(source_from_cloud)[None])
+    off = own.double() @ plane[:3] + plane[3]
+    corners = hull_corners(own, plane)
+    moved = corners @ source_from_cloud[:3, :3].T + source_from_cloud[:3, 3]
+    return {
+        "normal": source_plane[:3].tolist(),
+        "offset": float(source_plane[3]),
+        "frame": cloud.source_frame,
+        "num_inliers": len(own),
+        "inlier_share": len(own) / max(num_points, 1),
+        "rms": math.sqrt(float(off.square().mean())) if len(own) else 0.0,
+        "hull": moved.cpu().numpy().round(_DIGITS).tolist(),
+    }
+
+
+def hull_corners(own: Tensor, plane: Tensor) -> Tensor:  # (C, 3) float64
+    """Return corners of the convex hull of points in a plane, moved onto it, without those that matter least."""
+    flat = own.double() @ plane_axes(plane)
+    rows = convex_hull(flat)
+    while len(rows) > _MOST_CORNERS:
+        # Leave out the corner whose triangle with its neighbors is smallest.
+        here = flat[rows]
+        before, after = here.roll(1, 0) - here, here.roll(-1, 0) - here
+        least = int((before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).abs().argmin())
+        rows = torch.cat([rows[:least], rows[least + 1 :]])
+    corners = own[rows].double()
+    return corners - (corners @ plane[:3] + plane[3])[:, None] * plane[:3]
