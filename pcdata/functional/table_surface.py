@@ -39,7 +39,7 @@ class TableSurface(NamedTuple):
     table: Tensor  # (N,) bool: the points of the table itself
     height: Tensor  # (N,) float32 above its surface, on the side that the normal points to
     noise: Tensor  # (B,) float64 standard deviation of height at the table's median distance from the viewpoint
-    inverse_noise: Tensor  # (B,) float64 the same of 1 / distance from the viewpoint; NaN where that is not known
+    disparity_noise: Tensor  # (B,) float64 the same of 1 / distance from the viewpoint; NaN where that is not known
     planes: Tensor  # (B, 4) float64, refitted to the table itself
 
 

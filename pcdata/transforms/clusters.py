@@ -19,7 +19,7 @@ from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
 from pcdata.transforms.families import DropLimit, LeftOutWarning
 from pcdata.transforms.field_types import Count, Metres
-from pcdata.transforms.planes import planes_in_cloud
+from pcdata.transforms.found_planes import planes_in_cloud
 
 
 class ClusterObjects(DropLimit):

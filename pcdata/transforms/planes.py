@@ -120,7 +120,7 @@ class RemovePlane(RemoveTransform):
                 grid=data.image_grid(),
             )
             planes, own, height = surface.planes, surface.table, surface.height
-            found = {"noise": surface.noise, "inverse_noise": surface.inverse_noise}
+            found = {"noise": surface.noise, "disparity_noise": surface.disparity_noise}
         keep = negated(own)
         if self.keep != "both":
             for b, plane in enumerate(planes.cpu()):
@@ -219,7 +219,7 @@ class RemovePlane(RemoveTransform):
             own = data.points[start:stop][params["per_point"][start:stop]]
             found = plane_facts(own, stop - start, plane, data, b)
             found["faces"] = self._faces(data, b, plane)
-            for name in ("noise", "inverse_noise"):
+            for name in ("noise", "disparity_noise"):
                 if name in params and math.isfinite(value := float(params[name][b])):
                     found[name] = value
             if self.up is not None:

@@ -62,7 +62,9 @@ def test_the_feet_of_blocks_stay_and_the_bent_noisy_table_goes(organized, noise,
 def test_noise_is_measured_and_heights_are_over_the_surface():
     points, table, height = seen_table(noise=0.002, bend=0.006)
     found = table_surface(points, planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of())
-    assert float(found.inverse_noise[0]) == pytest.approx(0.002, rel=0.1)  # seen from 1 m: of 1/distance as of heights
+    assert float(found.disparity_noise[0]) == pytest.approx(
+        0.002, rel=0.1
+    )  # seen from 1 m: of 1/distance as of heights
     assert float(found.noise[0]) == pytest.approx(0.002, rel=0.15)
     off = (found.height.double() - height)[table]
     assert abs(float(off.median())) < 2e-4
@@ -73,7 +75,7 @@ def test_without_a_viewpoint_noise_is_the_same_everywhere():
     table, block = rectangle(**TABLE, count=6000, noise=0.002), box((0.1, 0.2, 0.0), (0.1, 0.1, 0.1), count=1500)
     found = table_surface(torch.cat([table, block]), planes=LEVEL)
     assert float(found.noise[0]) == pytest.approx(0.002, rel=0.1)
-    assert math.isnan(float(found.inverse_noise[0]))
+    assert math.isnan(float(found.disparity_noise[0]))
     assert float(found.table[:6000].float().mean()) > 0.99
     assert float(found.table[6000:].float().mean()) < 0.1
 
@@ -136,4 +138,4 @@ def test_the_table_of_a_kinect_is_found_to_a_hundredth(name, test_data: Path):
     hit = int((found.table & truth).sum())
     assert hit / int(found.table.sum()) > 0.99
     assert hit / int(truth.sum()) > 0.99
-    assert 0.002 < float(found.inverse_noise[0]) < 0.003  # of a Kinect, in 1/m
+    assert 0.002 < float(found.disparity_noise[0]) < 0.003  # of a Kinect, in 1/m
