@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -42,3 +44,23 @@ def test_data() -> Path:
     if not path:
         pytest.skip("PCDATA_TEST_DATA is not set: it names a folder of real captures")
     return Path(path)
+
+
+@pytest.fixture
+def patches_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view that was fitted before is not fitted again, whatever its pose: a third of the time of aligning views."""
+    monkeypatch.setattr("pcdata.alignment.surfaces.fit_depth_patches", _fitted_once)
+
+
+_fitted: dict[bytes, Any] = {}
+
+
+def _fitted_once(depth: torch.Tensor, intrinsics: torch.Tensor, distortion: torch.Tensor | None = None) -> Any:
+    from pcdata.alignment.patches import fit_depth_patches  # most tests need none of it
+
+    key = hashlib.sha256()
+    for given in (depth, intrinsics, distortion):
+        key.update(b"none" if given is None else f"{given.shape}{given.dtype}".encode() + given.numpy().tobytes())
+    if key.digest() not in _fitted:
+        _fitted[key.digest()] = fit_depth_patches(depth, intrinsics, distortion)
+    return _fitted[key.digest()]

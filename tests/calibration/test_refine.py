@@ -19,6 +19,8 @@ from pcdata.structures import DepthFrame
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from tests.scenes import overlapping
 
+pytestmark = pytest.mark.usefixtures("patches_fitted_once")
+
 NAMES = ["left", "right", "top"]
 
 

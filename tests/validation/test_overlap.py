@@ -15,6 +15,8 @@ from pcdata.transforms import Compose, Deproject, MergeViews, ToFrame
 from pcdata.validation import OverlapLimits, OverlapResult, verify_overlap
 from tests.scenes import overlapping
 
+pytestmark = pytest.mark.usefixtures("patches_fitted_once")
+
 
 def rig(seed: int, num_views: int = 4, *, millimetres: float = 0.0, degrees: float = 0.0, wrong: int = 0) -> DepthFrame:
     error = Miscalibration(

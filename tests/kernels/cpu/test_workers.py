@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from pcdata.contracts.dispatch import why_unavailable
+from tests.warm import run_script
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 
@@ -59,6 +57,5 @@ if __name__ == "__main__":
 def test_workers_give_what_the_parent_gives_however_they_start(tmp_path: Path):
     script = tmp_path / "workers.py"
     script.write_text(SCRIPT)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    result = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=300)
+    result = run_script(script, folder=tmp_path)
     assert result.returncode == 0, result.stderr
