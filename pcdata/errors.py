@@ -86,6 +86,10 @@ class ConfigError(PcdataError, ValueError):
     faults: Sequence[tuple[tuple[int | str, ...], str]] = ()
 
 
+class ReplayError(PcdataError, ValueError):
+    """What a history says was decided cannot be repeated on these data, or the history is not of these steps."""
+
+
 class CaptureError(PcdataError, ValueError):
     """A raw capture (depth, color, intrinsics, pose, cloud file) cannot be trusted."""
 

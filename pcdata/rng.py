@@ -121,6 +121,10 @@ class Streams:
         """The key of each stream."""
         return self._keys.view(np.int64).tolist()
 
+    def here(self) -> NDArray[np.int64]:
+        """Return (B,) the key of a stream that begins with the next word of each."""
+        return (self._keys + np.uint64(self.place * _GOLDEN % 2**64)).view(np.int64)
+
     def __len__(self) -> int:
         return len(self._keys)
 

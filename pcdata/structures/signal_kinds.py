@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, near_matches
+from pcdata.geometry import rigid
 from pcdata.structures.pose_layouts import LAYOUTS, Fault, Motion, PoseLayout, applied, per_cloud
 
 
@@ -142,6 +143,17 @@ def pose_faults(values: Tensor, parts: Sequence[_Part]) -> Iterator[Fault]:
 
 def _columns(values: Tensor, parts: Sequence[_Part]) -> Sequence[Tensor]:
     return [values] if len(parts) == 1 else values.split([part.columns or 0 for part in parts], dim=-1)
+
+
+def poses_of_signal(kind: str, values: Tensor) -> Tensor | None:  # (B, ..., 4, 4) float64
+    """Return the poses that values are, as matrices; None where their kind is another, or has no position."""
+    parts = parse_kind(kind).parts
+    layout = parts[0].layout
+    if len(parts) > 1 or parts[0].name != "pose" or layout is None or not layout.has_position:
+        return None
+    position, rotation = layout.parts(values.double())
+    assert position is not None  # has_position
+    return rigid.from_rotation_translation(layout.rotation(rotation), position)
 
 
 # -- the words -----------------------------------------------------------------------------------------------------

@@ -9,20 +9,38 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
-from collections.abc import Callable, Iterator
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import dataclass_transform
 
-from pcdata.errors import ConfigError, DTypeError, FrameError, TooFewPointsError, UnitError, add_note
+from pcdata.errors import (
+    ConfigError,
+    DTypeError,
+    FrameError,
+    ReplayError,
+    TooFewPointsError,
+    UnitError,
+    add_note,
+)
 from pcdata.registry import Registry
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
-from pcdata.structures.kinds import FIELDS
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
+from pcdata.transforms.decisions import (
+    PER_ROW,
+    Decision,
+    Decisions,
+    Entry,
+    find_decisions,
+    histories_of,
+    sums_of_rows,
+)
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
 Data = DepthFrame | PointCloud
@@ -41,6 +59,9 @@ class Transform(nn.Module):
     keeps_clouds: ClassVar[bool] = True  # cloud b of the result is cloud b of the input: none is joined or split
     takes: ClassVar[type] = PointCloud
     gives: ClassVar[type] = PointCloud
+    # What it decides about rows is repeated on data where it comes to the same rows; or it depends on their number
+    # alone; or each point is judged by itself, by the fields and what the history tells, whatever data it is of.
+    decides_by: ClassVar[Literal["rows", "count", "point"]] = "rows"
     version: ClassVar[int] = 1  # raised when the same fields give another result
     no_streams: ClassVar[Streams]  # those of a step that is not random
 
@@ -85,6 +106,29 @@ class Transform(nn.Module):
         """Do: pure given the params; never draws, never changes its input."""
         raise NotImplementedError(f"{type(self).__name__}: write the method transform(self, data, params)")
 
+    def repeat(self, data: Any, decided: Decisions) -> Params:
+        """Decide as the history tells, on the data that it is of or on others.
+
+        By default everything is decided anew, with the same draws, and what the history tells replaces what came out.
+        """
+        params = self.make_params(data, decided.streams() if self.is_random else self.no_streams)
+        told = {name: decided.values(name, like=value) for name, value in params.items() if decided.has(name)}
+        return {**params, **told}
+
+    def origins(self, decisions: Sequence[Decision]) -> list[tuple[int, int | None]]:
+        """Say what was decided about each cloud that went in, given what was about each that came out.
+
+        For each that went in: a number of ``decisions``, and the view that it was before views were merged, or None.
+
+        Raises:
+            ReplayError: the step joins or splits clouds and does not say how.
+        """
+        if self.takes is DepthFrame:
+            return [(0, None)]
+        if not self.keeps_clouds:
+            raise ReplayError(f"{type(self).__name__}: joins or splits clouds; write its method origins to replay it")
+        return [(number, None) for number in range(len(decisions))]
+
     def frame_needed(self) -> str | None:
         """The coordinate frame that the fields are written in, or None when any will do."""
         return None
@@ -122,15 +166,86 @@ class Transform(nn.Module):
         """
         try:
             self.check_input(data)
-            streams = self.no_streams
+            streams, drawn = self.no_streams, None
             if self.is_random:
                 streams = Streams.of(self._generator(generator), num_clouds(data))
+                drawn = streams.here()
             params = self.make_params(data, streams)
             result = self.transform(data, params)
-            return self.recorded(data, result, params)
+            return self.recorded(data, result, params, drawn)
         except Exception as error:
             add_note(error, f"in {self!r} on {data!r}", step=type(self).__name__, sample_id=_sample_id(data))
             raise
+
+    def replay(self, data: Any, history: Any) -> Any:
+        """Repeat exactly what a history says was decided: draws, motions, planes, boxes, the rows that were chosen.
+
+        On the data that it was decided on the result is the same, bit for bit, history and all. On others of the same
+        capture (another camera's clouds in the same frame, other colors or labels, another mask) motions and regions
+        are the same ones; a step that chose among rows needs rows that it comes to the same choice with.
+
+        Args:
+            data: what the chain takes.
+            history: ``cloud.history`` of what came out, with as many clouds; or the history of one cloud, for all; or
+                that of a capture, ``capture.provenance["history"]``. It may tell of other steps too. From a stored
+                sample it is the same.
+
+        Raises:
+            ReplayError: the history is not of these steps, or a decision cannot be carried over to the data; the error
+                says which.
+        """
+        where = f"{type(self).__name__}.replay"
+        steps = self._steps_for(data)
+        histories, for_all = histories_of(where, history)
+        found = [find_decisions(where, steps, one) for one in histories]
+        # Of each cloud behind a step: whose history tells of it, and the view that it was before views were merged.
+        clouds: list[tuple[int, int | None]] = [(number, None) for number in range(len(found))]
+        levels = []
+        for position in range(len(steps) - 1, -1, -1):  # from what came out back to what went in
+            decisions = [found[number][position].of_view(view) for number, view in clouds]
+            levels.append(decisions)
+            origins = steps[position].origins(decisions)
+            clouds = [(clouds[k][0], clouds[k][1] if view is None else view) for k, view in origins]
+        for step, decisions in zip(steps, reversed(levels), strict=True):
+            data = step.replayed(data, _for_data(step, data, decisions, for_all))
+        return data
+
+    def _steps_for(self, data: Any) -> list[Transform]:
+        """The steps that data of this kind go through."""
+        return [self]
+
+    def replayed(self, data: Any, decided: Decisions) -> Any:
+        """Repeat what was decided, and record it as it was."""
+        try:
+            self.check_input(data)
+            if inspect.unwrap(type(self).forward) is not Transform.forward:
+                raise ReplayError(
+                    f"{type(self).__name__}: has a forward of its own, which replaying would not run; write "
+                    "replayed(self, data, decided) beside it"
+                )
+            params = self.repeat(data, decided)
+            decided.check_rows(self.told_rows(data, params))
+            drawn = decided.streams().here() if self.is_random else None
+            result = self.recorded(data, self.transform(data, params), params, drawn)
+            if isinstance(result, PointCloud):
+                decided.check_place(result.frame_id, result.unit)
+            return result
+        except Exception as error:
+            add_note(error, f"in {self!r} replayed on {data!r}", step=type(self).__name__, sample_id=_sample_id(data))
+            raise
+
+    def find_decision(self, entries: Sequence[Entry], stop: int) -> tuple[Decision, int] | None:
+        """Return what this step decided, if entry ``stop - 1`` of a history is its, and where its first entry is."""
+        entry, note = entries[stop - 1], self._note()
+        if all(entry.get(name) == note[name] for name in ("step", "version", "fields")):
+            return Decision(entry, stop - 1), stop - 1
+        return None
+
+    def told_rows(self, data: Any, params: Params) -> list[int] | None:
+        """Return a number per cloud that tells which rows were decided about; None where that needs no telling."""
+        if not isinstance(data, PointCloud) or self.decides_by == "point":
+            return None
+        return data.counts.tolist() if self.decides_by == "count" else sums_of_rows(params, data.ptr)
 
     def config_fields(self) -> dict[str, Any]:
         """Return the fields by name, as they were given."""
@@ -184,19 +299,43 @@ class Transform(nn.Module):
                 f"{name}: its fields are lengths in {lengths} but the cloud is {found}; {unit_advice(self)}"
             )
 
-    def recorded(self, data: Any, result: Any, params: Params) -> Any:
-        """Return the result of this step on the data with the step in its history."""
+    def recorded(self, data: Any, result: Any, params: Params, drawn: NDArray[np.int64] | None = None) -> Any:
+        """Return the result of this step on the data with the step in its history.
+
+        Args:
+            data: what went in.
+            result: what came out.
+            params: what was decided.
+            drawn: (B,) the streams as they were before a random step; see :meth:`Streams.here`.
+        """
+        rows = self.told_rows(data, params)
         if isinstance(result, DepthFrame):
-            note = self._note()
-            steps = [*result.provenance.get("history", ()), {**note, "fields": _anew(note["fields"]), "params": {}}]
-            return result.with_provenance({"history": steps})
+            (step,) = _NotedSteps(self._note(), _small(params, 1), drawn=drawn, rows=rows)
+            return result.with_provenance({"history": [*result.provenance.get("history", ()), step]})
         before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
-        return self.recorded_counts(result, before, result.counts.tolist(), params)
+        return self.recorded_counts(result, before, result.counts.tolist(), params, drawn=drawn, rows=rows)
 
     def recorded_counts(
-        self, result: PointCloud, before: list[int] | None, after: list[int], params: Params
+        self,
+        result: PointCloud,
+        before: list[int] | None,
+        after: list[int],
+        params: Params,
+        *,
+        drawn: NDArray[np.int64] | None = None,
+        rows: list[int] | None = None,
+        place: tuple[str, str] | None = None,
     ) -> PointCloud:
         """Return the result with the step in its history, given the points per cloud before and after it.
+
+        Args:
+            result: what came out.
+            before: points per cloud; None = they were other clouds.
+            after: points per cloud.
+            params: what was decided.
+            drawn: as :meth:`recorded` takes it.
+            rows: what :meth:`told_rows` gives.
+            place: frame and unit after the step; None = those of the result.
 
         Raises:
             TooFewPointsError: a cloud has lost its last point, or never had one.
@@ -215,8 +354,10 @@ class Transform(nn.Module):
                 f"{type(self).__name__}: cloud {b}{sample_name(result, b)} has no points: no reading, or steps "
                 "before left none (masks, ranges, crops); leave the capture out, or widen those"
             )
+        frame, unit = place or (result.frame_id, result.unit)
+        note = {**self._note(), "frame": frame, "unit": unit}
         return result.with_steps(
-            _NotedSteps(self._note(), _small(params, len(after)), before if keeps else None, after)
+            _NotedSteps(note, _small(params, len(after)), before if keeps else None, after, drawn, rows)
         )
 
     def _note(self) -> dict[str, Any]:
@@ -232,37 +373,53 @@ class Transform(nn.Module):
 
 
 class _NotedSteps:
-    """What a step did to each cloud of a batch, as entries of histories that are made when they are read."""
+    """What a step did to each cloud of a batch, or to a capture, as entries of histories that are made when read."""
 
-    __slots__ = ("_after", "_before", "_note", "_params")
+    __slots__ = ("_note", "_params", "_per_cloud")
 
     def __init__(
         self,
         note: dict[str, Any],
         params: dict[str, NDArray[Any]],  # (B, ...) each
-        before: list[int] | None,  # points of each cloud; None = other clouds
-        after: list[int],
+        before: list[int] | None = None,  # points of each cloud; None = other clouds
+        after: list[int] | None = None,  # None = a capture
+        drawn: NDArray[np.int64] | None = None,  # the stream of each cloud; None = the step is not random
+        rows: list[int] | None = None,  # a number that tells the rows of each
     ) -> None:
-        self._note, self._params, self._before, self._after = note, params, before, after
+        self._note, self._params = note, params
+        told = {"stream": drawn, "rows": rows, "points_before": before, "points": after}
+        self._per_cloud: dict[str, Any] = {name: value for name, value in told.items() if value is not None}
 
     def __len__(self) -> int:
-        return len(self._after)
+        return len(self._per_cloud["points"])
 
     def __getitem__(self, clouds: slice) -> _NotedSteps:
-        params = {name: value[clouds] for name, value in self._params.items()}
-        before = None if self._before is None else self._before[clouds]
-        return _NotedSteps(self._note, params, before, self._after[clouds])
+        some = _NotedSteps(self._note, {name: value[clouds] for name, value in self._params.items()})
+        some._per_cloud = {name: value[clouds] for name, value in self._per_cloud.items()}
+        return some
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         listed = {name: value.tolist() for name, value in self._params.items()}
-        for b, count in enumerate(self._after):
+        per_cloud = {name: [*map(int, value)] for name, value in self._per_cloud.items()}
+        for b in range(len(self) if "points" in per_cloud else 1):
             # Each entry may be changed where it is read, so lists are given anew.
             entry = {**self._note, "fields": _anew(self._note["fields"])}
             entry["params"] = {name: values[b] for name, values in listed.items()}
-            if self._before is not None:
-                entry["points_before"] = self._before[b]
-            entry["points"] = count
-            yield entry
+            yield entry | {name: values[b] for name, values in per_cloud.items()}
+
+
+def _for_data(step: Transform, data: Any, decisions: list[Decision], for_all: bool) -> Decisions:
+    """Return what a step decided about the clouds of the data, or about those that it makes of them."""
+    name = type(step).__name__
+    if step.keeps_clouds and isinstance(data, PointCloud):
+        if for_all and len(decisions) == 1:
+            decisions = decisions * data.num_clouds
+        if len(decisions) != data.num_clouds:
+            raise ReplayError(
+                f"{name}: the histories tell of {len(decisions)} clouds and there are {data.num_clouds}; give the "
+                "history of each, in their order, or that of one for all"
+            )
+    return Decisions(name, decisions)
 
 
 def _anew(fields: dict[str, Any]) -> dict[str, Any]:
@@ -327,7 +484,7 @@ def _small(params: Params, num: int) -> dict[str, NDArray[Any]]:
     kept: dict[str, NDArray[Any]] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in ("index", "ptr", "per_point", *FIELDS)
+        is_per_cloud = name not in PER_ROW
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
             kept[name] = value.detach().cpu().numpy()
     return kept

@@ -17,6 +17,7 @@ from pcdata.structures import PointCloud
 from pcdata.transforms.base import Data, Transform, num_clouds, sha256_of
 from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
 from pcdata.transforms.chain_rules import check_chain, warn_of_order
+from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
 from pcdata.transforms.fused_motions import motions_from, run_motions
@@ -130,13 +131,32 @@ class Compose(Transform):
     def _enter(self, data: Data, generator: GeneratorLike | None) -> tuple[int, GeneratorLike | None]:
         """Return the first step to run, and the generator or one for each cloud."""
         # A chain of images alone has no place for a cloud: its first step says so.
-        position = self._captures if isinstance(data, PointCloud) and issubclass(self.gives, PointCloud) else 0
+        position = len(self.steps) - len(self._steps_for(data))
         if self._last_random < position:
             return position, None
         generator = self._generator(generator)
         if not isinstance(generator, Generator | Streams):
             generator = Streams.of(generator, num_clouds(data))
         return position, generator
+
+    # -- running again ---------------------------------------------------------------------------------------------
+
+    def _steps_for(self, data: Data) -> list[Transform]:
+        return list(self.steps)[
+            self._captures if isinstance(data, PointCloud) and issubclass(self.gives, PointCloud) else 0 :
+        ]
+
+    def find_decision(self, entries: Sequence[Entry], stop: int) -> tuple[Decision, int] | None:
+        """Return what the steps decided, if their entries end one after another at ``stop``."""
+        found = in_a_row(list(self.steps), entries, stop)
+        return None if found is None else (Decision({}, stop - 1, found[0]), found[1])
+
+    def replayed(self, data: Data, decided: Decisions) -> Any:
+        """Repeat what each step decided."""
+        for number, step in enumerate(self.steps):
+            of_step = [one.within[number] for one in decided.of_clouds]
+            data = step.replayed(data, Decisions(type(step).__name__, of_step))
+        return data
 
     # -- what may be stored ----------------------------------------------------------------------------------------
 

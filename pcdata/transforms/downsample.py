@@ -233,6 +233,7 @@ class RandomSample(_Sample):
     """
 
     is_random = True
+    decides_by = "count"
 
     with_replacement: bool = False
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
-from pcdata.errors import PcdataWarning, TooFewPointsError
+from pcdata.errors import PcdataWarning, ReplayError, TooFewPointsError
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.field_types import Fraction
 
 
@@ -20,6 +22,13 @@ class LeftOutWarning(PcdataWarning):
 
 class SpatialTransform(Transform, abstract=True):
     """A step that moves every cloud by one 4x4: write ``make_params`` returning ``{"matrix": (B, 4, 4)}``."""
+
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The motion, wherever the cloud lies."""
+        matrix = decided.values("matrix", like=torch.empty(0, 4, 4, dtype=torch.float64, device="cpu"))
+        if not bool((torch.linalg.det(matrix) != 0).all()):
+            raise ReplayError(f"{type(self).__name__}: the history tells a matrix that has no inverse")
+        return {"matrix": matrix}
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud; the frame and the unit follow :meth:`frame_after` and :meth:`unit_given`."""
@@ -61,7 +70,7 @@ class DropLimit(Transform, abstract=True):
     drop_alarm: Literal["error", "warn"] = "error"
 
     def recorded_counts(
-        self, result: PointCloud, before: list[int] | None, after: list[int], params: Params
+        self, result: PointCloud, before: list[int] | None, after: list[int], params: Params, **told: Any
     ) -> PointCloud:
         """Hold the counts to the limit before they are recorded."""
         for b, (had, count) in enumerate(zip(before or [], after)):
@@ -75,7 +84,7 @@ class DropLimit(Transform, abstract=True):
             if self.drop_alarm == "error":
                 raise TooFewPointsError(text)
             warnings.warn(text, LeftOutWarning, stacklevel=2)
-        return super().recorded_counts(result, before, after, params)
+        return super().recorded_counts(result, before, after, params, **told)
 
 
 class RemoveTransform(DropLimit, SelectTransform, abstract=True):

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, FrameError, PcdataError
+from pcdata.errors import ConfigError, FrameError, PcdataError, ReplayError
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample, voxel_majority
 from pcdata.geometry import rigid
@@ -19,6 +19,7 @@ from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud, Signal
 from pcdata.structures.signal_joining import agreed_signals
 from pcdata.structures.signals import cloud_from_frame
 from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.decisions import OF_VIEW, PER_VIEW, Decision, Decisions
 from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.field_types import Matrix4, Metres, Name
 
@@ -78,6 +79,10 @@ class ToFrame(SpatialTransform):
                 )
         return {"matrix": frames[self.frame] @ torch.linalg.inv(frames[data.frame_id])}
 
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The frame: another camera's cloud comes to it by that camera's own pose."""
+        return self.make_params(data, self.no_streams)
+
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud and remember where the new frame lies."""
         moved = super().transform(data, params)
@@ -120,12 +125,29 @@ class MergeViews(Transform):
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide which clouds belong together: cloud ``group_ptr[g]:group_ptr[g+1]`` are the views of capture g."""
         starts = [b for b in range(data.num_clouds) if b == 0 or not _same_capture(data.meta[b - 1], data.meta[b])]
-        return {"group_ptr": torch.tensor([*starts, data.num_clouds], dtype=torch.int64, device="cpu")}
+        group_ptr = torch.tensor([*starts, data.num_clouds], dtype=torch.int64, device="cpu")
+        return {"group_ptr": group_ptr, "views": torch.diff(group_ptr)}
+
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The views of the data, as many of each capture as there were."""
+        params = self.make_params(data, self.no_streams)
+        views = decided.values("views", like=params["views"])
+        if not torch.equal(views, params["views"]):
+            raise ReplayError(
+                f"MergeViews: merged {views.tolist()} views of the captures, and these data have "
+                f"{params['views'].tolist()}; give the same views"
+            )
+        return params
+
+    def origins(self, decisions: Sequence[Decision]) -> list[tuple[int, int | None]]:
+        """Each view is told of by its part of the merged history."""
+        views = Decisions("MergeViews", decisions).values("views").long().tolist()
+        return [(number, view) for number, count in enumerate(views) for view in range(count)]
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Drop the boundaries between the views of a capture."""
         bounds = params["group_ptr"].tolist()
-        views = torch.diff(params["group_ptr"])
+        views = params["views"]
         if data.frame_id == CAMERA_FRAME and int(views.max()) > 1:
             raise FrameError(
                 f"MergeViews: the views are still in {CAMERA_FRAME!r}, each in its own camera's frame; "
@@ -230,11 +252,11 @@ def _merged_signals(data: PointCloud, bounds: Sequence[int]) -> tuple[dict[str, 
 def _merged_history(data: PointCloud, start: int, stop: int) -> list[dict[str, Any]]:
     """Join the views' histories step by step: points are added up, params that differ are listed per view.
 
-    Views that went different ways keep the first one's history.
+    Views that went different ways keep the first one's history, which says so.
     """
     histories = data.history[start:stop]
     if len({tuple(step.get("step") for step in steps) for steps in histories}) > 1:
-        return list(histories[0])
+        return [{**step, OF_VIEW: 0} for step in histories[0]]
     merged = []
     for steps in zip(*histories):
         counts = {
@@ -242,7 +264,10 @@ def _merged_history(data: PointCloud, start: int, stop: int) -> list[dict[str, A
             for name in ("points_before", "points")
             if all(name in step for step in steps)
         }
-        params = [step.get("params") for step in steps]
-        joined = {} if all(one == params[0] for one in params) else {"params": {"per_view": params}}
+        joined = {}
+        for name in ("params", "stream", "rows"):
+            told = [step.get(name) for step in steps]
+            if any(one != told[0] for one in told):
+                joined[name] = {PER_VIEW: told}
         merged.append({**steps[0], **joined, **counts})
     return merged

@@ -98,7 +98,7 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
         extra={name: made.rows[name] for name in moved.extra},
     )
     before, after = readings.tolist(), cloud.counts.tolist()
-    cloud = deproject.recorded_counts(cloud, None, before, {})
+    cloud = deproject.recorded_counts(cloud, None, before, {}, place=(bare.frame_id, bare.unit))
     if isinstance(move, ToFrame):
         cloud = move.recorded_counts(cloud, before, before, moves)
     return crop.recorded_counts(cloud, before, after, {})

@@ -68,6 +68,7 @@ def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_pla
     kept: tuple[Tensor, Tensor] | None = None
     for step in steps:
         step.check_input(cloud)
+        drawn = streams.here()
         params = step.make_params(cloud, streams)
         if isinstance(step, SpatialTransform):
             moved = cloud.with_facts_moved(params["matrix"])
@@ -79,7 +80,7 @@ def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_pla
         else:
             kept = params["index"], params["ptr"]
             moved = derived(cloud, ptr=params["ptr"])
-        cloud = step.recorded(cloud, moved, params)
+        cloud = step.recorded(cloud, moved, params, drawn)
     # Nothing is refused from here on: memory may change.
     rows = cloud.fields()
     if done:

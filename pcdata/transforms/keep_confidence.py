@@ -20,6 +20,8 @@ class KeepConfidence(RemoveTransform):
         minimum: the least confidence that stays.
     """
 
+    decides_by = "point"
+
     minimum: ConfidenceName = "reliable"
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import NORMALIZED, PointCloud
 from pcdata.transforms.base import Params, sample_name
+from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.field_types import Name, Vec3
 
@@ -123,6 +124,11 @@ class ShiftToOrigin(SpatialTransform):
             "matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device=data.device), -origin),
             "extent": upper - lower,
         }
+
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The motion, and the extents of the box that it was found by."""
+        like = torch.empty(0, 3, dtype=torch.float64, device="cpu")
+        return {**super().repeat(data, decided), "extent": decided.values("extent", like=like)}
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Move the cloud and note its extents."""

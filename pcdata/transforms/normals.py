@@ -6,7 +6,6 @@ from typing import Literal
 
 from pcdata.errors import FrameError
 from pcdata.functional.normals import estimate_normals, orient_normals
-from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.field_types import Count, Metres
@@ -29,8 +28,8 @@ class EstimateNormals(Transform):
     max_neighbors: Count = 30
     orient: Literal["viewpoint", "none"] = "viewpoint"
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Estimate from the points of each cloud alone."""
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
+        """Estimate from the points of each cloud alone, and write the normals."""
         normals = estimate_normals(
             data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=data.image_grid()
         )
@@ -42,8 +41,4 @@ class EstimateNormals(Transform):
                     "stood, or choose orient: none"
                 )
             normals = orient_normals(data.points, normals, viewpoint)
-        return {"normals": normals}
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Write the normals."""
-        return data.with_fields(normals=params["normals"])
+        return data.with_fields(normals=normals)

@@ -15,7 +15,7 @@ from torch import Tensor
 from pcdata.contracts.host import negated
 from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.functional.plane_segments import supporting_plane
-from pcdata.functional.planes import ransac_plane
+from pcdata.functional.planes import near_planes, ransac_plane
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_after_mask
 from pcdata.functional.selection import over_hull
 from pcdata.functional.table_surface import table_surface
@@ -24,6 +24,7 @@ from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
 from pcdata.transforms.base import Params, sample_name
+from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
 from pcdata.transforms.found_planes import plane_facts
@@ -69,6 +70,7 @@ class RemovePlane(RemoveTransform):
     """
 
     runs_statistics = True
+    decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
     version = 3
 
     distance: Metres = 0.01
@@ -100,6 +102,8 @@ class RemovePlane(RemoveTransform):
             raise ConfigError("RemovePlane: give up and the frame it is in together, or neither")
         if self.max_tilt is not None and self.up is None:
             raise ConfigError("RemovePlane: max_tilt is measured from up; give up and frame too")
+        if self.keep == "over" or self.cut == "measured":
+            self.decides_by = "rows"  # type: ignore[misc, assignment]
 
     def frame_needed(self) -> str | None:
         """The frame of ``up``."""
@@ -108,19 +112,21 @@ class RemovePlane(RemoveTransform):
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Find the plane of every cloud and the rows that stay."""
         planes, own = self._found(data)
-        found: Params = {}
-        height = None
-        if self.cut == "measured":
-            surface = table_surface(
-                data.points,
-                data.ptr,
-                planes=planes,
-                distance=self.distance,
-                viewpoint=data.viewpoint_per_point(),
-                grid=data.image_grid(),
-            )
-            planes, own, height = surface.planes, surface.table, surface.height
-            found = {"noise": surface.noise, "disparity_noise": surface.disparity_noise}
+        if self.cut == "slab":
+            return self._apart(data, planes, own)
+        surface = table_surface(
+            data.points,
+            data.ptr,
+            planes=planes,
+            distance=self.distance,
+            viewpoint=data.viewpoint_per_point(),
+            grid=data.image_grid(),
+        )
+        found = {"noise": surface.noise, "disparity_noise": surface.disparity_noise}
+        return {**self._apart(data, surface.planes, surface.table, surface.height), **found}
+
+    def _apart(self, data: PointCloud, planes: Tensor, own: Tensor, height: Tensor | None = None) -> Params:
+        """Say which rows stay beside the points of each cloud's plane, by their height above it."""
         keep = negated(own)
         if self.keep != "both":
             for b, plane in enumerate(planes.cpu()):
@@ -145,7 +151,6 @@ class RemovePlane(RemoveTransform):
             "planes": planes,
             "num_inliers": count_per_cloud(own, data.ptr),
             "per_point": own,
-            **found,
         }
 
     def _found(self, data: PointCloud) -> tuple[Tensor, Tensor]:
@@ -179,6 +184,13 @@ class RemovePlane(RemoveTransform):
             likely_up=likely_up,
             viewpoint=_viewpoints(data),
         )
+
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The planes that the history tells, and the rows near them."""
+        if self.decides_by == "rows":
+            return super().repeat(data, decided)
+        planes = decided.values("planes", like=torch.empty(0, 4, dtype=torch.float64, device="cpu")).to(data.device)
+        return self._apart(data, planes, near_planes(data.points, data.ptr, planes.cpu(), self.distance))
 
     def _require_upper_side(self, data: PointCloud, b: int, plane: Tensor) -> None:
         """Refuse a plane whose normal noise could turn round: it decides which half of the scene is dropped."""

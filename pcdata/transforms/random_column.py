@@ -10,6 +10,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.field_types import Count, Metres
 
 _TRIALS = 100  # columns drawn before a scene counts as too sparse
@@ -30,6 +31,7 @@ class RandomColumn(Transform):
     """
 
     is_random = True
+    decides_by = "point"
 
     size: Metres = 1.0
     min_points: Count = 1025
@@ -37,32 +39,39 @@ class RandomColumn(Transform):
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw until a column is full enough."""
         bounds = data.ptr.tolist()
-        masks, centers = [], []
-        for b, seed in enumerate(streams.seeds().tolist()):
-            mask, center = self._draw(data, b, data.points[bounds[b] : bounds[b + 1]], seed)
-            masks.append(mask)
-            centers.append(center)
-        index = torch.nonzero(torch.cat(masks)).squeeze(1)
-        return {
-            "index": index,
-            "ptr": ptr_after_mask(torch.cat(masks), data.ptr),
-            "center": torch.stack(centers),
-        }
+        seeds = streams.seeds().tolist()
+        return self._around(
+            data,
+            [self._draw(data, b, data.points[bounds[b] : bounds[b + 1]], seed) for b, seed in enumerate(seeds)],
+        )
+
+    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
+        """The columns about the points that the history tells, however full."""
+        like = torch.empty(0, 3, dtype=torch.float32, device="cpu")
+        return self._around(data, [*decided.values("center", like=like).to(data.device)])
+
+    def _around(self, data: PointCloud, centers: list[Tensor]) -> Params:
+        parts = torch.tensor_split(data.points, data.ptr[1:-1].cpu())
+        mask = torch.cat([self._column(points, center) for points, center in zip(parts, centers, strict=True)])
+        index = torch.nonzero(mask).squeeze(1)
+        return {"index": index, "ptr": ptr_after_mask(mask, data.ptr), "center": torch.stack(centers)}
+
+    def _column(self, points: Tensor, center: Tensor) -> Tensor:
+        return ((points[:, :2] - center[:2]).abs() <= self.size / 2).all(dim=1)
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows and note the centers."""
         column = data.select(params["index"], params["ptr"])
         return column.with_meta([{"column_center": center} for center in params["center"].tolist()])
 
-    def _draw(self, data: PointCloud, b: int, points: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    def _draw(self, data: PointCloud, b: int, points: Tensor, seed: int) -> Tensor:
         generator = seeded(seed)
         fullest = 0
         for _ in range(_TRIALS if len(points) else 0):
             center = points[int(torch.randint(len(points), (), generator=generator, device="cpu"))]
-            mask = ((points[:, :2] - center[:2]).abs() <= self.size / 2).all(dim=1)
-            count = int(mask.sum())
+            count = int(self._column(points, center).sum())
             if count >= self.min_points:
-                return mask, center
+                return center
             fullest = max(fullest, count)
         raise TooFewPointsError(
             f"RandomColumn: cloud {b}{sample_name(data, b)}: of {_TRIALS} columns of {self.size} m none has "

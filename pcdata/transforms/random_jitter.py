@@ -29,6 +29,7 @@ class RandomJitter(Transform):
     """
 
     is_random = True
+    decides_by = "count"
 
     sigma: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 0.001
     clip: Positive | None = None
@@ -81,6 +82,7 @@ class RandomPointDropout(SelectTransform):
     """
 
     is_random = True
+    decides_by = "count"
 
     low: Fraction = 0.05
     high: Fraction = 0.10

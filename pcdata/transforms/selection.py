@@ -30,6 +30,8 @@ class DropNonFinite(RemoveTransform):
         fields: where to look.
     """
 
+    decides_by = "point"
+
     fields: tuple[Name, ...] = ("points",)
 
     def check_fields(self) -> None:
@@ -60,6 +62,8 @@ class KeepValues(RemoveTransform):
         high: largest value that stays.
         invert: drop those, and keep the others.
     """
+
+    decides_by = "point"
 
     field: Name = "labels"
     values: tuple[int, ...] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
@@ -76,6 +77,10 @@ class RandomSensorNoise(Transform):
     def make_params(self, data: DepthFrame, streams: Streams) -> Params:
         """Draw a seed: with it the noise can be drawn again exactly."""
         return {"seed": streams.seeds()}
+
+    def told_rows(self, data: DepthFrame, params: Params) -> list[int]:
+        """The number of views, rows and columns: the noise is that of pixels."""
+        return [zlib.crc32(repr(tuple(data.depth.shape)).encode())]
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Return the capture as the sensor would report it."""

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-import torch
-
 from pcdata.errors import ConfigError
 from pcdata.functional.neighborhoods import neighborhood_covariance, shape_features
-from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.structures.kinds import Kind
 from pcdata.transforms.base import Params, Transform
@@ -46,8 +43,8 @@ class DescribeShape(Transform):
         if not self.features or len(set(self.features)) < len(self.features):
             raise ConfigError(f"DescribeShape: features must name some, each once, got {self.features}")
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Measure the points of each cloud alone."""
+    def transform(self, data: PointCloud, params: Params) -> PointCloud:
+        """Measure the points of each cloud alone, and write the features."""
         _, covariance, _ = neighborhood_covariance(
             data.points.detach(),
             data.ptr,
@@ -56,10 +53,6 @@ class DescribeShape(Transform):
             grid=data.image_grid(),
         )
         found = shape_features(covariance, *self.features)
-        return {"per_point": torch.stack([found[name] for name in self.features], dim=1).float()}
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Write the features."""
-        for name, values in zip(self.features, params["per_point"].unbind(1), strict=True):
-            data = data.with_extra(name, values.contiguous(), Kind.INVARIANT)
+        for name in self.features:
+            data = data.with_extra(name, found[name].float(), Kind.INVARIANT)
         return data

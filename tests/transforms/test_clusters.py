@@ -122,7 +122,16 @@ def test_split_counts_no_points_before_even_when_the_numbers_agree():
     # Two clouds become two: one of the first, one of the second; the history says the same either way.
     parts = SplitObjects()(PointCloud.cat([blobs(10), blobs(20)]))
     assert [steps[-1] for steps in parts.history] == [
-        {"step": "SplitObjects", "version": 1, "fields": {}, "params": {}, "points": count} for count in (10, 20)
+        {
+            "step": "SplitObjects",
+            "version": 1,
+            "fields": {},
+            "frame": "base",
+            "unit": "m",
+            "params": {"label": 0, "rank": 0},
+            "points": count,
+        }
+        for count in (10, 20)
     ]
 
 
