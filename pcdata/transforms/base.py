@@ -15,10 +15,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import dataclass_transform
 
+from pcdata.contracts.host import checksums
 from pcdata.errors import (
     ConfigError,
     DTypeError,
@@ -39,7 +41,6 @@ from pcdata.transforms.decisions import (
     Entry,
     find_decisions,
     histories_of,
-    sums_of_rows,
 )
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 
@@ -245,7 +246,18 @@ class Transform(nn.Module):
         """Return a number per cloud that tells which rows were decided about; None where that needs no telling."""
         if not isinstance(data, PointCloud) or self.decides_by == "point":
             return None
-        return data.counts.tolist() if self.decides_by == "count" else sums_of_rows(params, data.ptr)
+        if self.decides_by == "count":
+            return data.counts.tolist()
+        bounds, sums = data.ptr.tolist(), None
+        for name, values in params.items():
+            if name not in PER_ROW or name == "ptr":
+                continue
+            if name == "index" and values.dtype is not torch.bool:
+                own = checksums(values, params["ptr"].tolist(), bounds)
+            else:
+                own = checksums(values, bounds)
+            sums = own if sums is None else [31 * one + other for one, other in zip(sums, own)]
+        return sums
 
     def config_fields(self) -> dict[str, Any]:
         """Return the fields by name, as they were given."""
@@ -375,7 +387,7 @@ class Transform(nn.Module):
 class _NotedSteps:
     """What a step did to each cloud of a batch, or to a capture, as entries of histories that are made when read."""
 
-    __slots__ = ("_note", "_params", "_per_cloud")
+    __slots__ = ("_after", "_before", "_drawn", "_note", "_params", "_rows")
 
     def __init__(
         self,
@@ -386,26 +398,33 @@ class _NotedSteps:
         drawn: NDArray[np.int64] | None = None,  # the stream of each cloud; None = the step is not random
         rows: list[int] | None = None,  # a number that tells the rows of each
     ) -> None:
-        self._note, self._params = note, params
-        told = {"stream": drawn, "rows": rows, "points_before": before, "points": after}
-        self._per_cloud: dict[str, Any] = {name: value for name, value in told.items() if value is not None}
+        self._note, self._params, self._drawn, self._rows = note, params, drawn, rows
+        self._before, self._after = before, after
 
     def __len__(self) -> int:
-        return len(self._per_cloud["points"])
+        return 1 if self._after is None else len(self._after)
 
     def __getitem__(self, clouds: slice) -> _NotedSteps:
-        some = _NotedSteps(self._note, {name: value[clouds] for name, value in self._params.items()})
-        some._per_cloud = {name: value[clouds] for name, value in self._per_cloud.items()}
-        return some
+        params = {name: value[clouds] for name, value in self._params.items()}
+        lists = (self._before, self._after, self._drawn, self._rows)
+        return _NotedSteps(self._note, params, *(None if one is None else one[clouds] for one in lists))  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         listed = {name: value.tolist() for name, value in self._params.items()}
-        per_cloud = {name: [*map(int, value)] for name, value in self._per_cloud.items()}
-        for b in range(len(self) if "points" in per_cloud else 1):
+        drawn = None if self._drawn is None else self._drawn.tolist()
+        for b in range(1 if self._after is None else len(self._after)):
             # Each entry may be changed where it is read, so lists are given anew.
             entry = {**self._note, "fields": _anew(self._note["fields"])}
             entry["params"] = {name: values[b] for name, values in listed.items()}
-            yield entry | {name: values[b] for name, values in per_cloud.items()}
+            if drawn is not None:
+                entry["stream"] = drawn[b]
+            if self._rows is not None:
+                entry["rows"] = self._rows[b]
+            if self._before is not None:
+                entry["points_before"] = self._before[b]
+            if self._after is not None:
+                entry["points"] = self._after[b]
+            yield entry
 
 
 def _for_data(step: Transform, data: Any, decisions: list[Decision], for_all: bool) -> Decisions:

@@ -6,8 +6,6 @@ a number that tells which rows it decided about where that depends on the rows: 
 
 from __future__ import annotations
 
-import itertools
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -148,30 +146,6 @@ class Decisions:
                     f"{self.step}: cloud {b} was in {then[0]!r} [{then[1]}] after it and is in {frame!r} [{unit}] now, "
                     "where what was decided means something else; bring the data into that frame and unit first"
                 )
-
-
-def sums_of_rows(params: Mapping[str, Tensor], before: Tensor) -> list[int] | None:
-    """Return a number per cloud that tells which rows params decide about; None where they are about no rows.
-
-    Args:
-        params: ``index`` with its ``ptr``, and (N, ...) params per point.
-        before: (B+1,) row pointers of the cloud that was decided about.
-    """
-    per_row = [name for name in params if name in PER_ROW and name != "ptr"]
-    if not per_row:
-        return None
-    bounds = before.tolist()
-    sums = [0] * (len(bounds) - 1)
-    for name in per_row:
-        values = params[name].detach().cpu().contiguous()
-        is_index = name == "index" and values.dtype is not torch.bool
-        cuts = params["ptr"].tolist() if is_index else bounds
-        for b, (start, stop) in enumerate(itertools.pairwise(cuts)):
-            own = values[start:stop]
-            # By their number within the cloud, and -1 for none.
-            own = torch.where(own < 0, own, own - bounds[b]) if is_index else own
-            sums[b] = zlib.crc32(own.numpy().tobytes(), sums[b])
-    return sums
 
 
 # -- finding the steps of a chain in a history -------------------------------------------------------------------------
