@@ -187,7 +187,7 @@ class RemovePlane(RemoveTransform):
 
     def repeat(self, data: PointCloud, decided: Decisions) -> Params:
         """The planes that the history tells, and the rows near them."""
-        if self.decides_by == "rows":
+        if self.keep == "over" or self.cut == "measured":
             return super().repeat(data, decided)
         planes = decided.values("planes", like=torch.empty(0, 4, dtype=torch.float64, device="cpu")).to(data.device)
         return self._apart(data, planes, near_planes(data.points, data.ptr, planes.cpu(), self.distance))
