@@ -64,7 +64,7 @@ NEIGHBOR_OPERATIONS = {
     "ball_query": [{"radius": 0.03, "max_neighbors": 5}, {"radius": 0.04, "max_neighbors": 40}],
     "knn": [{"k": 4}, {"k": 40}],
     "dbscan": [{"eps": 0.03, "min_points": 4}, {"eps": 0.02, "min_points": 7}],
-    "estimate_normals": [{"radius": 0.05, "max_neighbors": 12}],
+    "estimate_normals": [{"radius": 0.05, "max_neighbors": 12}, {"radius": None, "max_neighbors": 9}],
     "neighborhood_covariance": [{"radius": 0.05, "max_neighbors": 12}],
     "radius_neighbors": [{"radius": 0.03}, {"radius": 0.06, "exclude_self": True}],
     "radius_outlier_mask": [{"radius": 0.03, "min_neighbors": 2}, {"radius": 0.02, "min_neighbors": 6}],

@@ -82,6 +82,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "CropPolygon": _of("CropPolygon", {"frame": "base", "polygon": ((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (0, 0))}),
     "DropNonFinite": _of("DropNonFinite", {}),
     "KeepValues": _of("KeepValues", {"values": (0, 1)}),
+    "MapLabels": _of("MapLabels", {"mapping": ((0, 7), (1, 0)), "others": -1}),
     "RemoveDuplicates": _of("RemoveDuplicates", {}),
     "DescribeShape": _of("DescribeShape", {"radius": 0.05, "features": ("planarity", "surface_variation")}),
     "EstimateNormals": _of("EstimateNormals", {"radius": 0.05}, {"max_neighbors": 8, "orient": "none"}),

@@ -46,6 +46,7 @@ _HOMES = {
         "KeepConfidence",
         "KeepValues",
         "InpaintDepth",
+        "MapLabels",
         "MarkUnreliableDepth",
         "MaskDepth",
         "MergeViews",

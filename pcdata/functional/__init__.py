@@ -2,9 +2,9 @@
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
 decimated, resized, undistorted and filled depth, undistorted images, disparity, distances between clouds, distances and
-covariances of neighbors, the motion between paired points. None flow through decisions (indices, masks, labels, planes,
-sizes, which points are neighbors), nor through estimated normals, ``register_depth``, rendering, ``spatial_filter`` and
-TSDF volumes.
+covariances of neighbors, interpolated features, the motion between paired points. None flow through decisions (indices,
+masks, labels, planes, sizes, which points are neighbors), nor through estimated normals, ``register_depth``, rendering,
+``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.clusters import core_point_mask, dbscan
@@ -19,6 +19,7 @@ from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.interpolation import interpolate_features
 from pcdata.functional.metrics import chamfer_distance, f_score, hausdorff_distance
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
@@ -42,6 +43,7 @@ from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, p
 from pcdata.functional.table_surface import TableSurface, table_surface
 from pcdata.functional.voxels import (
     find_voxel_size,
+    voxel_cells,
     voxel_downsample,
     voxel_majority,
     voxel_maximum,
@@ -89,6 +91,7 @@ __all__ = [
     "flying_pixel_mask",
     "hausdorff_distance",
     "image_clusters",
+    "interpolate_features",
     "knn",
     "neighborhood_covariance",
     "orient_normals",
@@ -116,6 +119,7 @@ __all__ = [
     "undistort_depth",
     "undistort_image",
     "undistort_normalized",
+    "voxel_cells",
     "voxel_downsample",
     "voxel_majority",
     "voxel_maximum",

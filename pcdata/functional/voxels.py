@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
-from pcdata.errors import DTypeError, TooFewPointsError, UnitError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import (
     cloud_of_rows,
     counts_from_ptr,
@@ -170,6 +170,32 @@ def find_voxel_size(
         count = torch.where(leaves_enough, found, count)
         too_large = torch.where(open_ & ~leaves_enough, middle, too_large)
     return enough
+
+
+def voxel_cells(
+    points: Tensor,  # (N, 3) float32
+    voxel_size: float | Sequence[float],
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Tensor:  # (N, 3) int64
+    """Return the integer coordinates of every point's voxel: ``floor((point - origin) / voxel_size)``, in float32.
+
+    What sparse convolutions and their loaders call grid coordinates; :func:`voxel_downsample` works in float64, so a
+    point on a face may be counted to another voxel there.
+
+    Args:
+        points: in any unit of length.
+        voxel_size: edge length, one or one per axis.
+        origin: a corner of a voxel.
+
+    Raises:
+        ConfigError: a voxel size that is not positive.
+    """
+    edges = [voxel_size] if isinstance(voxel_size, float) else list(voxel_size)
+    if not all(math.isfinite(edge) and edge > 0 for edge in edges):
+        raise ConfigError(f"voxel_cells: voxel_size must be positive, got {voxel_size}")
+    # A number stays one: torch multiplies by its reciprocal, as in the loaders that this must agree with.
+    size = voxel_size if isinstance(voxel_size, float) else points.new_tensor(voxel_size)
+    return torch.floor((points - points.new_tensor(origin) if any(origin) else points) / size).long()
 
 
 def voxel_nearest(

@@ -82,6 +82,28 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
             raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
 
 
+def check_affine(where: str, matrix: Tensor) -> None:
+    """Require finite (B, 4, 4) matrices with last row 0 0 0 1 and a linear part that can be undone.
+
+    A matrix made for row vectors has its translation in the last row, and would move nothing.
+
+    Raises:
+        PoseError: another matrix, with what was found.
+    """
+    rows = matrix.detach().tolist()
+    for index, ((a, b, c, _), (d, e, f, _), (g, h, i, _), last) in enumerate(rows):
+        name = f"{where}: matrix {index}" if len(rows) > 1 else f"{where}: the matrix"
+        if not math.isfinite(sum(map(sum, rows[index]))):
+            raise PoseError(f"{name} has NaN or infinite values")
+        if max(abs(last[0]), abs(last[1]), abs(last[2]), abs(last[3] - 1.0)) > 1e-6:
+            raise PoseError(
+                f"{name} must have the last row 0 0 0 1, got {last}; one that is made for row vectors (x @ M, as "
+                "PyTorch3D's) is to be transposed, and a projective one moves no cloud"
+            )
+        if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) == 0.0:
+            raise PoseError(f"{name} is singular: it makes the cloud flat, and nothing leads back to the source")
+
+
 def is_rigid(matrix: Tensor, *, tolerance: float = 1e-5) -> bool:
     """Say whether all (..., 4, 4) matrices are rotations and translations, or mirrors: they keep every distance."""
     linear = matrix[..., :3, :3].double()

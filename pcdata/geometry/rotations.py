@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pcdata.errors import ConfigError
+
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     """Return (..., 4) unit quaternions (w, x, y, z), w >= 0, of (..., 3, 3) rotations; exact near half turns too.
@@ -85,15 +87,30 @@ def rotation_from_two_vectors(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y, dim=-1)], dim=-1)
 
 
-def rotation_from_euler(angles: Tensor, axes: str) -> Tensor:
-    """Return (..., 3, 3) rotations of (..., 3) angles in radians about fixed axes, one after the other.
+def _fixed_axes(axes: str) -> tuple[list[int], bool]:
+    """Return the order of fixed axes, and whether the angles are to be taken from last to first."""
+    if sorted(axes.lower()) != ["x", "y", "z"] or axes not in (axes.lower(), axes.upper()):
+        raise ConfigError(
+            f"euler angles: axes must be an order of 'xyz' (fixed) or of 'XYZ' (axes that move along), got {axes!r}"
+        )
+    moving = axes.isupper()
+    return ["xyz".index(axis) for axis in (axes.lower()[::-1] if moving else axes)], moving
 
-    ``axes`` is an order of "xyz": with "xyz" the first angle turns about x, the next about y, the last about z.
+
+def rotation_from_euler(angles: Tensor, axes: str) -> Tensor:
+    """Return (..., 3, 3) rotations of (..., 3) angles in radians about three axes, one after the other.
+
+    Small letters are fixed axes: with "xyz" the first angle turns about x, the next about y, the last about z. Capitals
+    are axes that move along, as in SciPy: "XYZ" is "zyx" with the angles from last to first.
+
+    Raises:
+        ConfigError: axes that are no such order.
     """
-    x, y, z = torch.eye(3, dtype=torch.float64, device=angles.device).unbind(0)
+    order, moving = _fixed_axes(axes)
+    unit = torch.eye(3, dtype=torch.float64, device=angles.device)
     turns = [
-        quaternion_from_rotation_vector(angle[..., None] * {"x": x, "y": y, "z": z}[axis])
-        for axis, angle in zip(axes, angles.double().unbind(-1), strict=True)
+        quaternion_from_rotation_vector(angle[..., None] * unit[axis])
+        for axis, angle in zip(order, (angles.flip(-1) if moving else angles).double().unbind(-1), strict=True)
     ]
     return rotation_from_unit_quaternion(multiplied(turns[2], multiplied(turns[1], turns[0])))
 
@@ -103,15 +120,19 @@ def euler_from_rotation(rotation: Tensor, axes: str) -> Tensor:
 
     The middle one is at most a quarter turn. Where it is one, the other two are not unique; they give the rotation too,
     since the last is read off what the first two leave of it.
+
+    Raises:
+        ConfigError: axes that are no order of them.
     """
-    i, j, k = ("xyz".index(axis) for axis in axes)
+    (i, j, k), moving = _fixed_axes(axes)
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     r = rotation.double()
     middle = torch.atan2(-sign * r[..., k, i], torch.hypot(r[..., i, i], r[..., j, i]))
     first = torch.atan2(sign * r[..., k, j], r[..., k, k])
     column = first.cos()[..., None] * r[..., :, j] - sign * first.sin()[..., None] * r[..., :, k]
     last = torch.atan2(-sign * column[..., i], column[..., j])
-    return torch.stack([first, middle, last], dim=-1)
+    angles = torch.stack([first, middle, last], dim=-1)
+    return angles.flip(-1) if moving else angles
 
 
 def closest_rotation(linear: Tensor) -> Tensor:

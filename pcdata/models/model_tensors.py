@@ -10,10 +10,9 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, pad_rows, segment_min, transform_points
-from pcdata.functional.voxels import voxel_mean
+from pcdata.functional.voxels import voxel_cells, voxel_mean
 from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import PointCloud
-from pcdata.transforms.voxel_sample import voxel_cells
 
 # torchvision's: the colors that ImageNet backbones were trained with.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)

@@ -15,6 +15,7 @@ from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import cloud_of_rows, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
 from pcdata.structures.cloud_checks import check_cloud
 from pcdata.structures.image_layout import within_image
@@ -273,10 +274,12 @@ class PointCloud(CloudBatch):
 
         Raises:
             ShapeError: there is not one matrix for each cloud.
+            PoseError: a matrix is not affine (is it made for row vectors?), not finite, or singular.
         """
-        matrix = matrix.to(dtype=torch.float64, device=self.device)
         if tuple(matrix.shape) != (self.num_clouds, 4, 4):
             raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
+        check_affine("PointCloud.transformed", matrix)
+        matrix = matrix.to(dtype=torch.float64, device=self.device)
         rows = moved(self.fields(), self.kinds, self.ptr, matrix)
         return self._with_rows(rows, **self._facts_moved(matrix, frame_id, unit))
 

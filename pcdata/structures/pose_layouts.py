@@ -198,18 +198,13 @@ def _two_vectors(rows: bool) -> Ways:
 
 def _euler(order: str, *, intrinsic: bool) -> Ways:
     """Angles in radians, one per column, about the axes that the order names: fixed ones, or ones that turn along."""
-
-    def turned_round(angles: Tensor) -> Tensor:
-        # Turns about axes that turn along are turns about fixed ones, the last one first.
-        return angles.flip(-1) if intrinsic else angles
-
-    axes = order[::-1] if intrinsic else order
+    axes = order.upper() if intrinsic else order
 
     def matrix(part: Tensor) -> Tensor:
-        return rotations.rotation_from_euler(turned_round(part), axes)
+        return rotations.rotation_from_euler(part, axes)
 
     def written(rotation: Tensor) -> Tensor:
-        return turned_round(rotations.euler_from_rotation(rotation, axes))
+        return rotations.euler_from_rotation(rotation, axes)
 
     return {**_by_matrix(matrix, written), "faults": _no_faults}
 

@@ -22,6 +22,7 @@ from pcdata.transforms.found_planes import plane_hulls_in_cloud, planes_in_cloud
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
 from pcdata.transforms.keep_confidence import KeepConfidence
+from pcdata.transforms.labels import MapLabels
 from pcdata.transforms.mixing import mix_scenes
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace, ShiftToOrigin
 from pcdata.transforms.normals import EstimateNormals
@@ -61,6 +62,7 @@ __all__ = [
     "KeepConfidence",
     "KeepValues",
     "LeftOutWarning",
+    "MapLabels",
     "MarkUnreliableDepth",
     "MaskDepth",
     "MergeViews",

@@ -9,19 +9,11 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
+from pcdata.functional.voxels import voxel_cells
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
 from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Count, Positive, Unit, Vec3
-
-
-def voxel_cells(
-    points: Tensor, voxel_size: float | tuple[float, ...], origin: tuple[float, ...] = (0.0, 0.0, 0.0)
-) -> Tensor:
-    """Return the (N, 3) int64 cells ``floor((x - origin) / voxel_size)``, in float32."""
-    # A number stays one: torch multiplies by its reciprocal, as in the loaders that this must agree with.
-    size = voxel_size if isinstance(voxel_size, float) else points.new_tensor(voxel_size)
-    return torch.floor((points - points.new_tensor(origin) if any(origin) else points) / size).long()
 
 
 class _OnePerVoxel(SelectTransform, abstract=True):

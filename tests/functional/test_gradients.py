@@ -62,6 +62,7 @@ WITH = {
     "fill_holes",
     "fit_paired_points",  # tests/functional/test_paired_points.py
     "hausdorff_distance",
+    "interpolate_features",  # tests/functional/test_interpolation.py
     "knn",
     "neighborhood_covariance",
     "project_points",
@@ -99,6 +100,7 @@ def slope_error(function, leaf: Tensor, step: float) -> float:
 def test_every_operation_is_on_one_of_the_two_lists():
     assert not WITH & WITHOUT
     assert set(OPERATIONS) == WITH | WITHOUT
+    assert {name for name, operation in OPERATIONS.items() if operation.gradient} == WITH
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,11 @@ def with_queries(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "queries": points(count // 2 + 1, seed + 50)}
 
 
+def with_features(count: int, seed: int) -> dict[str, Tensor]:
+    features = torch.rand(count, 4, generator=seeded(seed + 3))
+    return {**with_queries(count, seed), "features": features}
+
+
 def in_six_dimensions(count: int, seed: int) -> dict[str, Tensor]:
     return {key: torch.cat([value, value.flip(1)], 1) for key, value in with_queries(count, seed).items()}
 
@@ -154,6 +159,11 @@ def in_pairs(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": cloud, "targets": targets, "weights": torch.rand(count, generator=seeded(seed + 9))}
 
 
+def in_pairs_of_a_plane(count: int, seed: int) -> dict[str, Tensor]:
+    pairs = in_pairs(count, seed)
+    return {name: pairs[name][:, :2].contiguous() for name in ("points", "targets")}
+
+
 def ranges_alone(count: int, seed: int) -> dict[str, Tensor]:
     return {"ranges": depth_image(count, seed)["depth"]}
 
@@ -217,8 +227,10 @@ EXAMPLES = [
     Example("fill_holes", depth_alone, ("row", "row"), {"rule": "nearest"}),
     Example("find_voxel_size", one_cloud, ("cloud",), {"num_points": 12}),
     Example("fit_paired_points", in_pairs, ("cloud",) * 3, {"with_scale": True}),
+    Example("fit_paired_points", in_pairs_of_a_plane, ("cloud",) * 3),
     Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("image_clusters", on_an_image, ("row",), {"size": (12, 16), "eps": 0.1, "reach": 2}),
+    Example("interpolate_features", with_features, ("row",), {"k": 5}),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("knn", in_six_dimensions, ("index", "row"), {"k": 4}),

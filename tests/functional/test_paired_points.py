@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pcdata.errors import ConfigError, DTypeError, PoseError, TooFewPointsError
+from pcdata.errors import ConfigError, DTypeError, PoseError, ShapeError, TooFewPointsError
 from pcdata.functional import fit_paired_points
 from pcdata.geometry import rigid
 from pcdata.rng import seeded
@@ -105,3 +105,25 @@ def test_ten_thousand_small_clouds_are_one_call():
     ptr = torch.arange(0, 80_001, 8)
     found = fit_paired_points(points, targets, ptr)
     torch.testing.assert_close(found.matrix[:, :3, :3], turn(1).expand(10_000, 3, 3), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("columns", [2, 4, 7])
+def test_points_of_any_number_of_columns_are_turned_and_never_mirrored(columns):
+    generator = seeded(columns)
+    rotation = torch.linalg.qr(torch.randn(columns, columns, generator=generator, dtype=torch.float64))[0]
+    rotation[:, 0] *= torch.linalg.det(rotation)
+    points = torch.randn(30, columns, generator=generator, dtype=torch.float64)
+    found = fit_paired_points(points, 1.5 * points @ rotation.T + 2.0, with_scale=True)
+    torch.testing.assert_close(found.matrix[0, :columns, :columns], 1.5 * rotation, atol=1e-9, rtol=0)
+    torch.testing.assert_close(found.matrix[0, :, columns], torch.tensor([2.0] * columns + [1.0], dtype=torch.float64))
+    mirrored = points.clone()
+    mirrored[:, 0] *= -1
+    linear = fit_paired_points(points, mirrored).matrix[0, :columns, :columns]
+    assert float(torch.linalg.det(linear)) == pytest.approx(1.0)
+
+
+def test_one_column_and_points_of_a_plane_in_one_place_are_refused():
+    with pytest.raises(ShapeError, match="two columns or more"):
+        fit_paired_points(torch.rand(4, 1), torch.rand(4, 1))
+    with pytest.raises(PoseError, match="do not spread"):
+        fit_paired_points(torch.ones(4, 2), torch.rand(4, 2))

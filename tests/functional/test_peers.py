@@ -54,6 +54,10 @@ PEERS = {
     "flying_pixel_mask": ("functional/depth/test_flying_pixels.py", "PCL `ShadowPoints`"),
     "hausdorff_distance": ("functional/test_metrics.py", "SciPy `directed_hausdorff`"),
     "image_clusters": ("functional/test_image_clusters.py", "PCL `OrganizedEuclideanClusterExtraction`"),
+    "interpolate_features": (
+        "functional/test_interpolation.py",
+        "PyG `knn_interpolate`; Open3D-ML `three_interpolate`",
+    ),
     "knn": ("functional/test_neighbors.py", "torch-cluster `knn`; PyTorch3D `knn_points`; Open3D `knn_search`"),
     "neighborhood_covariance": (
         "functional/test_neighborhoods.py",

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from pcdata.errors import ConfigError
 from pcdata.geometry import rotations
 
 ANGLES = (0.0, 1e-300, 1e-12, 1e-8, 1e-4, 1.0, math.pi - 1e-4, math.pi - 1e-8, math.pi - 1e-12, math.pi)
@@ -81,3 +82,19 @@ def test_the_closest_rotation_takes_scales_out_and_keeps_mirrors(known):
         torch.testing.assert_close(rotations.closest_rotation(linear), turned, atol=1e-14, rtol=0)
     mirror = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
     torch.testing.assert_close(rotations.closest_rotation(2.0 * turned @ mirror), turned @ mirror, atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("axes", ["xyz", "yxz", "zyx", "XYZ", "ZXY", "ZYX"])
+def test_euler_angles_about_fixed_and_moving_axes_are_those_of_scipy(axes):
+    rotation = Rotation.random(20, random_state=4)
+    angles = torch.from_numpy(rotation.as_euler(axes))
+    same(rotations.rotation_from_euler(angles, axes), matrices(rotation))
+    torch.testing.assert_close(rotations.euler_from_rotation(matrices(rotation), axes), angles, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("axes", ["xyx", "xy", "Xyz", "abc", ""])
+def test_an_order_of_axes_that_is_none_is_refused(axes):
+    with pytest.raises(ConfigError, match="axes must be an order of 'xyz'"):
+        rotations.rotation_from_euler(torch.zeros(3), axes)
+    with pytest.raises(ConfigError, match="axes must be an order of 'xyz'"):
+        rotations.euler_from_rotation(torch.eye(3), axes)

@@ -191,6 +191,12 @@ OPEN3D = Section(
             by(lambda a: a.transformation, lambda b: b, 1e-3),
         ),
         Call(
+            "np.stack([voxels.get_voxel(p) for p in points.double().numpy()])",
+            "F.voxel_cells(points, 0.05, (points.amin(0) - 0.025).tolist())",
+            "the origin is stated; the grid of `voxels` starts half an edge below the lowest corner",
+            same(0),
+        ),
+        Call(
             "other_pcd.select_by_index(list(range(10)), invert=True)",
             "others[10:]",
             "rows and masks of torch; `cloud.select` for all fields",
@@ -206,6 +212,7 @@ pcd.normals = o3d.utility.Vector3dVector(normals.double().numpy())
 surface_pcd, shifted_pcd = _cloud(surface), _cloud(surface + 0.003)
 shifted_pcd.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
 pairs = o3d.utility.Vector2iVector(np.stack([np.arange(200)] * 2, 1))
+voxels = o3d.geometry.VoxelGrid.create_from_point_cloud(pcd, 0.05)
 nns = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points.numpy()))
 nns.knn_index(), nns.fixed_radius_index(0.05), nns.hybrid_index(0.05)
 fx, fy, cx, cy = K[0, 0, 0], K[0, 1, 1], K[0, 0, 2], K[0, 1, 2]
@@ -270,7 +277,8 @@ PYTORCH3D = Section(
         Call(
             "corresponding_points_alignment(points, moved, weights, estimate_scale=True)",
             "F.fit_paired_points(points, moved, weights=weights, with_scale=True)",
-            "4x4 for column vectors, scale inside; never a reflection; an undetermined rotation is an error",
+            "any number of columns; 4x4 for column vectors, scale inside; never a reflection; an undetermined "
+            "rotation is an error",
         ),
         Call(
             "iterative_closest_point(points, moved)",
@@ -414,6 +422,11 @@ PYG = Section(
             "RadiusGraph(0.05)(data).edge_index",
             "F.radius_neighbors(points, ptr, radius=0.05, exclude_self=True)",
             "compressed rows",
+        ),
+        Call(
+            "knn_interpolate(features, points, queries, k=3)",
+            "F.interpolate_features(points, features, queries=queries, k=3)",
+            "a query on a point has exactly its features; gradients to features in both",
         ),
         Call(
             "Compose([...])(data)",
@@ -586,6 +599,16 @@ MMDETECTION3D = Section(
             "VoxelBasedPointSampler",
             "pcdata.RandomVoxelSample(voxel_size=0.05)(cloud, generator=generator)",
             "one point per voxel",
+        ),
+        Call(
+            "PointSegClassMapping with seg_label_mapping={10: 1, 252: 1}",
+            "pcdata.MapLabels(mapping=((10, 1), (252, 1)), others=0)(cloud)",
+            "labels that the table leaves out stay, or become `others`",
+        ),
+        Call(
+            "Voxelization(voxel_size=[0.05] * 3, max_num_points=-1)",
+            "F.voxel_cells(points, 0.05)",
+            "cells as (x, y, z), of any sign; `F.voxel_downsample` for the points of each",
         ),
         Call(
             "PolarMix, LaserMix", "pcdata.transforms.mixing.mix_scenes(cloud, cloud)", "whole scenes, labels kept apart"

@@ -107,6 +107,12 @@ SCIPY = Section(
             same(1e-9),
         ),
         Call(
+            "transform.Rotation.from_euler('ZYX', [0.1, 0.2, 0.3]).as_matrix()",
+            "pcdata.geometry.rotations.rotation_from_euler(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), 'ZYX')",
+            "three different axes",
+            same(1e-9),
+        ),
+        Call(
             "transform.Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat()[[3, 0, 1, 2]]",
             "pcdata.geometry.rotations.quaternion_from_rotation_vector(torch.tensor([0.1, -0.2, 0.3], "
             "dtype=torch.float64))",
@@ -202,6 +208,11 @@ TORCHIO = Section(
             "per cloud",
         ),
         Call("RandomNoise(std=0.01)", "pcdata.RandomJitter(sigma=0.01)(cloud, generator=generator)", ""),
+        Call(
+            "RemapLabels({2: 1, 5: 1})",
+            "pcdata.MapLabels(mapping=((2, 1), (5, 1)))(cloud)",
+            "`RemoveLabels`: to -1, or `KeepValues(values=..., invert=True)`",
+        ),
         Call(
             "subject.apply_inverse_transform()",
             "cloud.transformed(cloud.source_from_cloud).points",

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcdata.errors import DeviceError, DTypeError, FrameError, ShapeError, UnitError
+from pcdata.errors import DeviceError, DTypeError, FrameError, PoseError, ShapeError, UnitError
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.geometry import rigid
 from pcdata.structures import METRE, NORMALIZED, Kind, PointCloud
@@ -326,3 +326,21 @@ def test_the_repr_says_how_many_points_where_and_what():
     assert repr(cloud_in_base((3,))).startswith("PointCloud(3 points in 'base' [m]: colors, normals")
     assert repr(cloud_in_base((3, 0, 9))).startswith("PointCloud(3 clouds of 0-9 in 'base' [m]")
     assert repr(cloud_in_base((3, 9)).padded()) == "PaddedClouds(2 x 9 in 'base' [m])"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda matrix: matrix.mT, r"matrix 1 must have the last row 0 0 0 1, got .*made for row vectors"),
+        (lambda matrix: matrix + torch.eye(4).double()[3] * 0.5, "matrix 0 must have the last row 0 0 0 1"),
+        (lambda matrix: matrix * torch.nan, "matrix 0 has NaN or infinite values"),
+        (lambda matrix: matrix * torch.tensor([1.0, 1, 0, 1]).double(), "matrix 0 is singular"),
+    ],
+    ids=["transposed", "projective", "nan", "flat"],
+)
+def test_a_matrix_that_is_not_affine_moves_no_cloud(spoil, words):
+    cloud = cloud_in_base((5, 4))
+    matrix = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    matrix[1, :3, 3] = torch.tensor([0.1, 0.2, 0.3])
+    with pytest.raises(PoseError, match=rf"PointCloud.transformed: {words}"):
+        cloud.transformed(spoil(matrix))

@@ -137,6 +137,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "InpaintDepth": _of(T.InpaintDepth(), T.InpaintDepth(max_distance=1), make=frame_with_counts),
     "KeepConfidence": _of(T.KeepConfidence(), T.KeepConfidence(minimum="completed")),
     "KeepValues": _of(T.KeepValues(values=(0, 1)), T.KeepValues(field="weight", low=0.2, high=0.9, invert=True)),
+    "MapLabels": _of(T.MapLabels(mapping=((0, 7), (1, 0))), T.MapLabels(mapping=((1, 3), (2, 3)), others=-1)),
     "MarkUnreliableDepth": _of(
         T.MarkUnreliableDepth(sensor="realsense_d435"),
         T.MarkUnreliableDepth(sensor="kinect_v1", enclosed=False),

@@ -66,6 +66,7 @@ class _Projection(NamedTuple):
     color_distortion="V E : float",
     color_size=checked_image_size,
     max_jump=partial(checked_positive, finite=False),
+    gradient=False,
 )
 def register_depth(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading

@@ -45,6 +45,7 @@ def disparity_to_depth(disparity: Tensor, focal: Tensor, baseline: float) -> Ten
     alpha=checked_fraction,
     delta=partial(checked_positive, finite=False),
     iterations=checked_count,
+    gradient=False,
 )
 def spatial_filter(
     disparity: Tensor,  # (V, H, W) float32, 0 = no reading

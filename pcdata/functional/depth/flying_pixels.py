@@ -17,6 +17,7 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair 
     depth="V H W : depth",
     tolerance=partial(checked_positive, finite=False),
     min_neighbors=partial(checked_count, maximum=8),
+    gradient=False,
 )
 def flying_pixel_mask(
     depth: Tensor,  # (V, H, W) float32 metres, 0 = no reading
