@@ -105,7 +105,7 @@ def _sunlight(shapes: Sequence[Shape], points: Tensor, normals: Tensor, index: T
     sun = _unit(SUN, points)
     side = torch.nn.functional.normalize(torch.linalg.cross(sun, _unit((0.0, 1.0, 0.0), sun)), dim=0)
     other = torch.linalg.cross(sun, side)
-    samples = torch.arange(SUN_SAMPLES, dtype=torch.float64)
+    samples = torch.arange(SUN_SAMPLES, dtype=torch.float64, device="cpu")
     radius, angle = SUN_SPREAD * ((samples + 0.5) / SUN_SAMPLES).sqrt(), samples * GOLDEN_ANGLE
     across = (radius * torch.stack([angle.cos(), angle.sin()])).T.to(points)  # (SUN_SAMPLES, 2)
     toward = sun + across @ torch.stack([side, other])
