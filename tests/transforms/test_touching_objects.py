@@ -119,3 +119,14 @@ def test_a_cloud_that_left_its_image_is_refused():
     cloud, _ = scene(*LOW_AND_HIGH)
     with pytest.raises(ConfigError, match="needs the depth image that the points lie on"):
         STEP(VoxelDownsample(voxel_size=0.004)(cloud))
+
+
+def test_one_smooth_thing_without_contacts_and_a_cloud_without_things_have_no_cuts():
+    cloud, _ = scene((0, 0, 0.2, 0.2, 0.1))
+    top = cloud.select(cloud.points[:, 1] < 0, torch.tensor([0, int((cloud.points[:, 1] < 0).sum())]))
+    found = STEP(top)
+    assert [one["label"] for one in found.meta[0]["objects"]] == [0]
+    assert found.meta[0]["touching"]["cuts"] == []
+    nothing = ClusterObjects(**{**STEP_FIELDS, "min_size": 100_000, "max_size": 200_000, "keep": "all"})(cloud)
+    assert (nothing.labels == -1).all()
+    assert nothing.meta[0]["touching"]["cuts"] == nothing.meta[0]["objects"] == []

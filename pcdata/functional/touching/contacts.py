@@ -44,7 +44,7 @@ def region_contacts(
     first, second = torch.cat(pairs, 1)
     fitted, side = torch.cat([first, second]).unique(return_inverse=True)
     right, down, middle, normal, mean, found = _own_planes(inverse, label, fitted, camera, noise, limits)
-    a, b = side.split(len(first))
+    a, b = side[: len(first)], side[len(first) :]
     turn = normal[b] - normal[a]
     angle = torch.where(found[a] & found[b], _length(turn), 0.0)
     lean = _dot(turn, mean[b] - mean[a])
