@@ -90,18 +90,19 @@ def chamfer_distance(
     return total.float() if turned is None else torch.stack([total, turned], dim=1).float()
 
 
-@op(points_a="N 3", ptr_a="ptr N B >= 1", points_b="M 3", ptr_b="ptr M B >= 1", steps=(nearest_rows,))
+@op(points_a="N D", ptr_a="ptr N B >= 1", points_b="M D", ptr_b="ptr M B >= 1", steps=(nearest_rows,))
 def hausdorff_distance(
-    points_a: Tensor,  # (N, 3) float32
+    points_a: Tensor,  # (N, D) float32
     ptr_a: Tensor | None,  # (B+1,); None = one cloud
-    points_b: Tensor,  # (M, 3) float32
+    points_b: Tensor,  # (M, D) float32
     ptr_b: Tensor | None,  # (B+1,); None = one cloud
     *,
     backend: str = "auto",
 ) -> Tensor:  # (B, 2) float32: from a to b, from b to a
     """Return how far the point farthest from the other cloud is, each way; the larger is the Hausdorff distance.
 
-    In the points' unit. The result carries gradients to the two points that decide it.
+    In the points' unit, of three columns or any other number. The result carries gradients to the two points that
+    decide it.
 
     Raises:
         TooFewPointsError: a cloud is empty; the message names it.
@@ -117,18 +118,18 @@ def hausdorff_distance(
 
 
 @op(
-    points_a="N 3",
+    points_a="N D",
     ptr_a="ptr N B >= 1",
-    points_b="M 3",
+    points_b="M D",
     ptr_b="ptr M B >= 1",
     threshold=checked_length,
     steps=(nearest_rows,),
     gradient=False,
 )
 def f_score(
-    points_a: Tensor,  # (N, 3) float32
+    points_a: Tensor,  # (N, D) float32
     ptr_a: Tensor | None,  # (B+1,); None = one cloud
-    points_b: Tensor,  # (M, 3) float32
+    points_b: Tensor,  # (M, D) float32
     ptr_b: Tensor | None,  # (B+1,); None = one cloud
     *,
     threshold: float,

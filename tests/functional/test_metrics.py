@@ -111,8 +111,10 @@ def test_sides_norms_and_normals_are_those_of_all_pairs_in_float64():
             torch.testing.assert_close(found["both"], found["a_to_b"] + found["b_to_a"])
 
 
-def test_hausdorff_is_scipys_each_way():
+@pytest.mark.parametrize("columns", [3, 2, 6])
+def test_hausdorff_is_scipys_each_way(columns):
     a, ptr_a, b, ptr_b = pairs()
+    a, b = (torch.cat([points, points.flip(1) * 0.7], dim=1)[:, :columns].contiguous() for points in (a, b))
     found = F.hausdorff_distance(a, ptr_a, b, ptr_b)
     for cloud, (one, other) in enumerate(((slice(0, 40), slice(0, 15)), (slice(40, 70), slice(15, 55)))):
         wanted = [
@@ -120,6 +122,11 @@ def test_hausdorff_is_scipys_each_way():
             directed_hausdorff(b[other].numpy(), a[one].numpy())[0],
         ]
         assert found[cloud].tolist() == pytest.approx(wanted, rel=1e-5)
+
+
+def test_f_scores_know_any_number_of_columns():
+    a, b = torch.tensor([[0.0, 0], [1, 0]]), torch.tensor([[0.0, 0.05], [1, 5], [2, 5], [3, 5]])
+    assert F.f_score(a, None, b, None, threshold=0.1)[0].tolist() == pytest.approx([1 / 3, 0.5, 0.25])
 
 
 def test_f_scores_count_what_is_near():

@@ -126,7 +126,7 @@ OPENCV = Section(
         Call(
             "cv2.undistort(depth[0].numpy(), K[0].numpy(), lens[0].numpy())",
             "F.undistort_image(depth[:1, ..., None], K[:1], lens)",
-            "not rounded to 1/32 pixel; a mask of what the camera saw",
+            "not rounded to 1/32 pixel, nor blended with black at the border; a mask of what the camera saw",
         ),
         Call(
             "cv2.rgbd.depthTo3d(depth, K)",
