@@ -17,6 +17,7 @@ from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
+from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
 from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.interpolation import interpolate_features
@@ -28,6 +29,7 @@ from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_
 from pcdata.functional.paired_points import PairedMotion, fit_paired_points
 from pcdata.functional.plane_segments import segment_planes, supporting_plane
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.rectangles import smallest_rectangle
 from pcdata.functional.rendering import (
     RenderedPoints,
     RenderedTriangles,
@@ -57,8 +59,10 @@ from pcdata.geometry.lens import distort_normalized, undistort_normalized
 __all__ = [
     "SHAPE_FEATURES",
     "DepthAverage",
+    "GraspChecks",
     "ImageGrid",
     "PairedMotion",
+    "ParallelJaw",
     "RegisteredDepth",
     "RenderedPoints",
     "RenderedTriangles",
@@ -68,6 +72,7 @@ __all__ = [
     "ball_query",
     "box_mask",
     "chamfer_distance",
+    "check_grasps",
     "cloud_of_rows",
     "convex_hull",
     "core_point_mask",
@@ -111,6 +116,7 @@ __all__ = [
     "resize_depth",
     "segment_planes",
     "shape_features",
+    "smallest_rectangle",
     "spatial_filter",
     "statistical_outlier_mask",
     "supporting_plane",

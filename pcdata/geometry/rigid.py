@@ -65,21 +65,24 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
     if pose.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: a pose must be (..., 4, 4), got {tuple(pose.shape)}")
     flat = pose.detach().double().reshape(-1, 4, 4)
-    for index, matrix in enumerate(flat):
+    rotation, last = flat[:, :3, :3], flat[:, 3]
+    eye = torch.eye(4, dtype=torch.float64, device=flat.device)
+    error = (rotation @ rotation.mT - eye[:3, :3]).abs().amax((1, 2))
+    mirrored, off = torch.linalg.det(rotation) < 0, (last - eye[3]).abs().amax(1)
+    wrong = ~(error <= tolerance) | mirrored | ~(off <= 1e-6)  # of a pose with NaN the comparisons are false
+    for index in wrong.nonzero().squeeze(1).tolist():
         name = f"{where}: pose {index}" if len(flat) > 1 else f"{where}: the pose"
+        matrix = flat[index]
         if not bool(torch.isfinite(matrix).all()):
             raise PoseError(f"{name} has NaN or infinite values (tracking lost?); drop this frame")
-        rotation = matrix[:3, :3]
-        error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=matrix.device)).abs().max())
-        if error > tolerance:
+        if float(error[index]) > tolerance:
             raise PoseError(
-                f"{name} is not rigid: R R^T differs from the identity by {error:.2g} (at most {tolerance:g}); "
-                "is there a scale in it, or is it transposed or truncated?"
+                f"{name} is not rigid: R R^T differs from the identity by {float(error[index]):.2g} (at most "
+                f"{tolerance:g}); is there a scale in it, or is it transposed or truncated?"
             )
-        if float(torch.linalg.det(rotation)) < 0:
+        if bool(mirrored[index]):
             raise PoseError(f"{name} is a mirror (determinant -1), not a rotation; check the axis convention")
-        if float((matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > 1e-6:
-            raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
+        raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
 
 
 def check_affine(where: str, matrix: Tensor) -> None:

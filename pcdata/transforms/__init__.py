@@ -21,11 +21,13 @@ from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTr
 from pcdata.transforms.found_planes import plane_hulls_in_cloud, planes_in_cloud
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
+from pcdata.transforms.grasps import judge_grasps
 from pcdata.transforms.keep_confidence import KeepConfidence
 from pcdata.transforms.labels import MapLabels
 from pcdata.transforms.mixing import mix_scenes
 from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWorkspace, ShiftToOrigin
 from pcdata.transforms.normals import EstimateNormals
+from pcdata.transforms.object_facts import ObjectFacts, describe_objects, label_image
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
 from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning
 from pcdata.transforms.random_apply import RandomApply
@@ -69,6 +71,7 @@ __all__ = [
     "NearestCompletion",
     "NormalizeUnitSphere",
     "NormalizeWorkspace",
+    "ObjectFacts",
     "PipelineOrderWarning",
     "RandomApply",
     "RandomColorDrop",
@@ -108,6 +111,9 @@ __all__ = [
     "Undistort",
     "VoxelDownsample",
     "VoxelSample",
+    "describe_objects",
+    "judge_grasps",
+    "label_image",
     "mix_scenes",
     "plane_hulls_in_cloud",
     "planes_in_cloud",

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from pcdata.errors import NoPlaneError, ShapeError
 from pcdata.functional import ImageGrid, supporting_plane, table_surface
+from pcdata.functional.table_surface import window_medians
 from pcdata.io import read_pcd
 from pcdata.rng import seeded
 from tests.tables import TABLE, box, rectangle
@@ -39,9 +41,8 @@ def seen_table(
     return points, ~on_block.reshape(-1), height.reshape(-1)
 
 
-def grid_of(kept: Tensor | None = None) -> ImageGrid:
-    pixel = torch.arange(SIZE[0] * SIZE[1])
-    return ImageGrid(pixel if kept is None else pixel[kept], SIZE, K)
+def grid_of(pixel: Tensor | None = None) -> ImageGrid:
+    return ImageGrid(torch.arange(SIZE[0] * SIZE[1]) if pixel is None else pixel, SIZE, K)
 
 
 FACING = torch.tensor([[0.0, 0.0, -1.0, 1.0]], dtype=torch.float64)
@@ -112,11 +113,24 @@ def test_specks_are_the_table_whatever_the_resolution():
 
 def test_a_table_without_anything_on_it_is_all_table_and_what_is_far_below_is_not():
     points, _, _ = seen_table(noise=0.001, blocks=False)
-    kept = torch.ones(len(points), dtype=torch.bool)
     below = torch.arange(len(points)) % SIZE[1] > 140
     points[below] *= 1.1
-    found = table_surface(points, planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of(kept))
+    found = table_surface(points, planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of())
     assert bool((found.table == ~below).all())
+
+
+def test_heights_are_judged_by_the_lower_median_of_the_pixels_around():
+    pixel = (torch.rand(SIZE[0] * SIZE[1], generator=seeded(0)) < 0.8).nonzero().squeeze(1)
+    values = torch.rand(len(pixel), generator=seeded(1))
+    image = torch.full(SIZE, torch.nan).reshape(-1)
+    image[pixel] = values
+    image = image.reshape(SIZE).numpy()
+    found = window_medians(values, torch.zeros(len(pixel), 3), torch.tensor([0, len(pixel)]), grid_of(pixel))
+    for row in range(0, len(pixel), 37):
+        v, u = divmod(int(pixel[row]), SIZE[1])
+        around = np.sort(image[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2], axis=None)
+        around = around[~np.isnan(around)]
+        assert float(found[row]) == around[(len(around) - 1) // 2]
 
 
 def test_planes_that_are_none_are_refused():

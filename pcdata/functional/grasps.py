@@ -1,0 +1,195 @@
+"""Grasps of parallel-jaw grippers against a table and against points: angle of approach, clearance, collisions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pcdata.contracts.dispatch import inner
+from pcdata.contracts.tensors import check_tensors
+from pcdata.errors import ConfigError, ShapeError
+from pcdata.geometry.rigid import check_rigid
+
+Axis = Literal["x", "y", "z"]
+_AXES = ("x", "y", "z")
+_PAIRS = 1 << 22  # of grasps and points whose offsets are alive at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParallelJaw:
+    """A gripper of two fingers and a palm, each a box, and the axes that grasps are written in; metres.
+
+    Grasps are 4x4: the columns of the rotation are the axes of the gripper, the translation its origin. ``tip`` says
+    where that origin is: the tips of the fingers are this far from it along the approach.
+
+    Args:
+        opening: between the open fingers; that of every grasp where none are given.
+        finger_length: from the palm to the tips.
+        finger_thickness: along the closing direction.
+        finger_width: across both.
+        palm_length: of the palm and what is behind it, along the approach.
+        palm_span: of the palm along the closing direction; None = what the open fingers span.
+        palm_width: across both; None = as the fingers.
+        tip: from the origin of a grasp to the tips.
+        approach: the axis that points from the palm to the tips.
+        closing: the axis that the fingers move along.
+
+    Raises:
+        ConfigError: a length that is not positive, or one axis for both.
+    """
+
+    opening: float
+    finger_length: float
+    finger_thickness: float
+    finger_width: float
+    palm_length: float
+    palm_span: float | None = None
+    palm_width: float | None = None
+    tip: float
+    approach: Axis = "z"
+    closing: Axis = "x"
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("approach", "closing"):
+                if value not in _AXES:
+                    raise ConfigError(f"ParallelJaw: {field.name} must be one of {_AXES}, got {value!r}")
+            elif value is not None and not (isinstance(value, (int, float)) and math.isfinite(value)):
+                raise ConfigError(f"ParallelJaw: {field.name} must be a finite number of metres, got {value!r}")
+            elif value is not None and field.name != "tip" and value <= 0:
+                raise ConfigError(f"ParallelJaw: {field.name} must be more than 0, got {value!r}")
+        if self.approach == self.closing:
+            raise ConfigError(f"ParallelJaw: approach and closing must be two axes, both are {self.approach!r}")
+
+    def boxes(self, openings: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper corners (4, G, 3) float64 of palm, two fingers and the room between them.
+
+        The coordinates are along approach, closing direction and across both, from the origin of a grasp.
+
+        Args:
+            openings: (G,) metres.
+        """
+        half = openings.double() / 2
+        outer = half + self.finger_thickness
+        start, width = torch.full_like(half, self.tip - self.finger_length), self.finger_width / 2
+        tip, across = torch.full_like(half, self.tip), torch.full_like(half, width)
+        palm = outer if self.palm_span is None else torch.full_like(half, self.palm_span / 2)
+        palm_across = across if self.palm_width is None else torch.full_like(half, self.palm_width / 2)
+        lower = [
+            torch.stack([start - self.palm_length, -palm, -palm_across], 1),
+            torch.stack([start, -outer, -across], 1),
+            torch.stack([start, half, -across], 1),
+            torch.stack([start, -half, -across], 1),
+        ]
+        upper = [
+            torch.stack([start, palm, palm_across], 1),
+            torch.stack([tip, -half, across], 1),
+            torch.stack([tip, outer, across], 1),
+            torch.stack([tip, half, across], 1),
+        ]
+        return torch.stack(lower), torch.stack(upper)
+
+    def axes(self, grasps: Tensor) -> Tensor:
+        """Return (G, 3, 3) float64, in whose rows approach, closing direction and the one across both stand."""
+        columns = grasps[:, :3, :3].double().mT
+        approach, closing = columns[:, _AXES.index(self.approach)], columns[:, _AXES.index(self.closing)]
+        return torch.stack([approach, closing, torch.linalg.cross(approach, closing)], 1)
+
+
+class GraspChecks(NamedTuple):
+    """What :func:`check_grasps` found of G grasps."""
+
+    angle: (
+        Tensor | None
+    )  # (G,) float64 radians between the approach and straight down to the table; over pi/2: from below
+    clearance: (
+        Tensor | None
+    )  # (G,) float64 metres from the table to the nearest corner of the gripper; negative = in it
+    hits: Tensor  # (G,) int64 points inside palm or fingers
+    held: Tensor  # (G,) int64 points between the fingers
+
+
+def check_grasps(
+    points: Tensor,  # (N, 3) float32
+    *,
+    grasps: Tensor,  # (G, 4, 4) float, frame_from_gripper in the coordinates of the points
+    gripper: ParallelJaw,
+    openings: Tensor | None = None,  # (G,) float, metres
+    plane: Tensor | None = None,  # (4,) float64
+) -> GraspChecks:
+    """Check grasps against a table and against points, all in one frame and in metres.
+
+    Points on the faces of the gripper's boxes are inside, in float64. The table is the whole plane, also
+    beyond its edges.
+
+    Args:
+        points: what the gripper must not hit, and what it is to hold.
+        grasps: rigid poses of the gripper, approaching along its own axis.
+        gripper: its dimensions and axes.
+        openings: between the fingers; None = the gripper's own. What exceeds that is refused.
+        plane: unit normal, away from the table, and offset; None = no table.
+
+    Raises:
+        PoseError: a grasp is not rigid.
+        ConfigError: an opening that is not positive, or more than the gripper's.
+        ShapeError, DTypeError, NonFiniteError: an argument breaks the contract above.
+    """
+    where = "check_grasps"
+    given = {"points": points, "grasps": grasps, "openings": openings, "plane": plane}
+    specs = {"points": "N 3", "grasps": "G 4 4 : float", "openings": "G : float", "plane": "P : float64"}
+    check_tensors(where, given, specs)
+    if plane is not None and plane.shape != (4,):
+        raise ShapeError(f"{where}: plane must be (4,), got {tuple(plane.shape)}")
+    check_rigid(f"{where}: grasps", grasps)
+    wide = torch.full((len(grasps),), gripper.opening, dtype=torch.float64, device=grasps.device)
+    if openings is not None:
+        wide = openings.double()
+        if bool(((wide <= 0) | (wide > gripper.opening * (1 + 1e-6))).any()):
+            raise ConfigError(f"{where}: openings must be above 0 and at most the gripper's {gripper.opening:g}")
+    lower, upper = gripper.boxes(wide)
+    axes, origin = gripper.axes(grasps), grasps[:, :3, 3].double()
+    angle = clearance = None
+    if plane is not None:
+        down = (axes @ plane[:3]).clamp(-1, 1)  # (G, 3): of each axis along the normal
+        angle = torch.acos(-down[:, 0])
+        # The corner of a box that is lowest along the normal takes, on each axis, the side that goes down.
+        lowest = torch.minimum(lower * down, upper * down).sum(-1)[:3].amin(0)
+        clearance = origin @ plane[:3] + plane[3] + lowest
+    hits, held = points_in_grippers(points, axes, origin, lower, upper)
+    return GraspChecks(angle, clearance, hits, held)
+
+
+@inner
+def points_in_grippers(
+    points: Tensor,  # (N, 3) float32
+    axes: Tensor,  # (G, 3, 3) float64
+    origin: Tensor,  # (G, 3) float64
+    lower: Tensor,  # (4, G, 3) float64, as ParallelJaw.boxes
+    upper: Tensor,
+) -> tuple[Tensor, Tensor]:  # (G,), (G,) int64
+    """Count the points in palm or fingers, and between the fingers, of each gripper.
+
+    Boxes hold their faces; fingers and the room between them do not hold the one at the palm, so none counts twice.
+    """
+    wide = points.double()
+    hits = torch.zeros(len(axes), dtype=torch.int64, device=points.device)
+    held = torch.zeros_like(hits)
+    for some in torch.arange(len(axes), dtype=torch.int64, device=points.device).split(
+        max(1, _PAIRS // max(len(points), 1))
+    ):
+        dx, dy, dz = (wide[None] - origin[some, None]).unbind(-1)
+        along, aside, across = ((dx * row[:, :1] + dy * row[:, 1:2]) + dz * row[:, 2:] for row in axes[some].unbind(1))
+        inside = []
+        for box, (low, high) in enumerate(zip(lower[:, some, :, None], upper[:, some, :, None])):
+            within = (along > low[:, 0] if box else along >= low[:, 0]) & (along <= high[:, 0])
+            within &= (aside >= low[:, 1]) & (aside <= high[:, 1])
+            inside.append(within & (across >= low[:, 2]) & (across <= high[:, 2]))
+        palm, left, right, between = inside
+        hits[some] = (palm | left | right).sum(1)
+        held[some] = between.sum(1)
+    return hits, held
