@@ -41,7 +41,8 @@ UNDECLARED = {
     ),
     "torch": (
         "T.SpatialTransform",
-        "def make_params(self, data, streams):\n    return {'matrix': torch.rand(3, 4, 4).double()}",
+        "def make_params(self, data, streams):\n"
+        "    return {'matrix': torch.diag_embed(torch.cat([torch.rand(3, 3), torch.ones(3, 1)], 1)).double()}",
         r"torch's global generator \(rand\)",
     ),
     "torch in place": (
