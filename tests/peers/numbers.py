@@ -183,7 +183,7 @@ SCIKIT_LEARN = Section(
 
 TORCHIO = Section(
     "TorchIO",
-    "Steps are frozen and know what they decided: `cloud.meta` has the history of every sample.",
+    "Steps are frozen; what they decided is in the history of every cloud (`cloud.history`).",
     (
         Call(
             "Compose([...])(subject)",
@@ -212,6 +212,12 @@ TORCHIO = Section(
             "RemapLabels({2: 1, 5: 1})",
             "pcdata.MapLabels(mapping=((2, 1), (5, 1)))(cloud)",
             "`RemoveLabels`: to -1, or `KeepValues(values=..., invert=True)`",
+        ),
+        Call(
+            "transformed.get_composed_history()(other_subject)",
+            "(lambda chain: chain.replay(cloud, chain(cloud, generator=generator).history))"
+            "(pcdata.Compose([pcdata.RandomRotation()]))",
+            "`chain.replay(data, history)`: bit for bit, also on other fields of the capture",
         ),
         Call(
             "subject.apply_inverse_transform()",
