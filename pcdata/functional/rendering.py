@@ -16,7 +16,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_image_size, checked_positive
 from pcdata.errors import ConfigError
-from pcdata.functional.depth.deproject import pixel_rays, projected
+from pcdata.functional.depth.deproject import pixel_rays, project_points, projected
 from pcdata.functional.rows import cloud_of_rows
 
 _INDEX_BITS = 32  # of a key; the bits of its depth lie above them
@@ -94,12 +94,41 @@ def render_points(
     return RenderedPoints(depth, torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(points)))
 
 
+@inner
+def front_triangles(
+    boxes: tuple[Tensor, Tensor, Tensor],  # (T,) int64 each: the first pixel of a triangle's box, pixels across, down
+    width: int,  # of an image
+    rays: Tensor,  # (P, 2) float64 x/z, y/z of every pixel of all images
+    normal: Tensor,  # (T, 3) float64
+    offset: Tensor,  # (T,) float64
+    sides: Tensor,  # (T, 3, 3) float64
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # depth (P,) float32, index (P,) int64, weights (P, 3) float32
+    """Return the nearest triangle that the ray of every pixel meets; depth 0, T and weights 0 where it meets none."""
+    image = torch.full((len(rays),), _EMPTY, dtype=torch.int64, device=rays.device)
+    for rows, target in _Boxes(*boxes, width).pixels():
+        depth = _met(rays[target], normal[rows], offset[rows], sides[rows])[0]
+        hit = depth > 0
+        image.scatter_reduce_(0, target[hit], _keys(depth[hit].float(), rows[hit]), "amin")
+    found = (image != _EMPTY).nonzero().squeeze(1)
+    index = torch.full((len(rays),), len(normal), dtype=torch.int64, device=rays.device)
+    index[found] = image[found] & ((1 << _INDEX_BITS) - 1)
+    front = index[found]
+    depth_at, weights_at = _met(rays[found], normal[front], offset[front], sides[front])
+    depth = torch.zeros(len(rays), dtype=torch.float32, device=rays.device)
+    weights = torch.zeros(len(rays), 3, dtype=torch.float32, device=rays.device)
+    depth[found], weights[found] = depth_at.float(), weights_at.float()
+    return depth, index, weights
+
+
 @op(
     triangles="T 3 3",
     ptr="ptr T V",
     intrinsics="V 3 3 : float",
     distortion="V D : float",
     size=checked_image_size,
+    steps=(front_triangles,),
     gradient=False,
 )
 def render_triangles(
@@ -123,7 +152,8 @@ def render_triangles(
     """
     assert ptr is not None
     corners = triangles.double()
-    pixels, _ = projected(corners.flatten(0, 1), 3 * ptr, intrinsics, distortion)
+    project = projected if backend == "torch" else project_points
+    pixels, _ = project(corners.flatten(0, 1), 3 * ptr, intrinsics=intrinsics, distortion=distortion)
     pixels = pixels.reshape(-1, 3, 2)
     visible = ~pixels.isnan().flatten(1).any(1)
     at = torch.where(visible[:, None, None], pixels, 0.0)
@@ -136,20 +166,7 @@ def render_triangles(
     sides = torch.stack(
         [torch.linalg.cross(corners[:, i], corners[:, j], dim=-1) for i, j in ((1, 2), (2, 0), (0, 1))], 1
     )
-    pixel_count = len(intrinsics) * size[0] * size[1]
-    image = torch.full((pixel_count,), _EMPTY, dtype=torch.int64, device=triangles.device)
-    for rows, target in boxes.pixels():
-        depth = _met(rays[target], normal[rows], offset[rows], sides[rows])[0]
-        hit = depth > 0
-        image.scatter_reduce_(0, target[hit], _keys(depth[hit].float(), rows[hit]), "amin")
-    found = (image != _EMPTY).nonzero().squeeze(1)
-    index = torch.full((pixel_count,), len(triangles), dtype=torch.int64, device=triangles.device)
-    index[found] = image[found] & ((1 << _INDEX_BITS) - 1)
-    front = index[found]
-    depth_at, weights_at = _met(rays[found], normal[front], offset[front], sides[front])
-    depth = torch.zeros(pixel_count, dtype=torch.float32, device=triangles.device)
-    weights = torch.zeros(pixel_count, 3, dtype=torch.float32, device=triangles.device)
-    depth[found], weights[found] = depth_at.float(), weights_at.float()
+    depth, index, weights = front_triangles(boxes[:3], size[1], rays, normal, offset, sides, backend=backend)
     shape = (len(intrinsics), *size)
     return RenderedTriangles(depth.reshape(shape), index.reshape(shape), weights.reshape(*shape, 3))
 
@@ -166,7 +183,7 @@ def _met(rays: Tensor, normal: Tensor, offset: Tensor, sides: Tensor) -> tuple[T
     inside = ((volumes >= 0).all(-1) | (volumes <= 0).all(-1)) & (total != 0)
     safe = torch.where(inside, total, 1.0)
     depth = torch.where(inside, offset / safe, 0.0)
-    shares = volumes.sum(-1, keepdim=True)
+    shares = ((volumes[..., 0] + volumes[..., 1]) + volumes[..., 2])[..., None]
     weights = volumes / torch.where(shares == 0, 1.0, shares)
     return torch.where(inside & (depth > 0), depth, 0.0), weights
 

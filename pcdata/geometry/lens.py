@@ -20,14 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import inner
 from pcdata.errors import ShapeError
 from pcdata.geometry.lens_models import LENS_MODELS, ROW, WIDEST_PLAIN, check_distortion, lens_facts
 from pcdata.geometry.radial_lenses import bend_radially, radial_fold, unbend_radially
 
 # Normalized units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
-_CONVERGED = 1e-12
+CONVERGED = 1e-12
 # Newton needs 4 to 6 steps on real lenses; only pixels beside the fold of the model, where it slows down, need more.
-_MAX_STEPS = 60
+MAX_STEPS = 60
 # Coordinates inverted at once: the dozens of intermediate tensors stay in a CPU core's cache.
 _CHUNK = 16384
 # A zero this near a pole, as a share of it, takes it away: a fit with coefficients to spare makes such pairs. Together
@@ -128,9 +129,7 @@ def _undistort_view(target: Tensor, row: Tensor) -> Tensor:
         target = _through(torch.linalg.inv(_tilt(polynomial.tilt)), target)
     with torch.no_grad():
         fold = float(fold_radius(row[None]))
-        reduced = polynomial._replace(twelve=_without_canceled_poles(polynomial.twelve)).split(1)
-        chunks = [_invert(some, reduced, fold) for some in target.split(_CHUNK)]
-        solved = torch.cat(chunks) if chunks else target.clone()
+        solved = unbent(target.detach(), _without_canceled_poles(polynomial.twelve.detach()), polynomial.after, fold)
     if torch.is_grad_enabled() and (target.requires_grad or row.requires_grad):
         solved = _with_gradient(solved, target, polynomial.split(1))
     return solved
@@ -249,17 +248,25 @@ def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
     return [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and 0 < root.real <= _FAR]
 
 
+@inner
+def unbent(target: Tensor, twelve: Tensor, after: bool, fold: float) -> Tensor:
+    """Undistort (P, 2) coordinates by one reduced polynomial (12,); NaN where it has no inverse within the fold."""
+    coefficients = _Polynomial(twelve, None, after).split(1)
+    chunks = [_invert(some, coefficients, fold) for some in target.split(_CHUNK)]
+    return torch.cat(chunks) if chunks else target.clone()
+
+
 def _invert(target: Tensor, coefficients: _Coefficients, fold: float) -> Tensor:
     """Undistort (P, 2) coordinates of one view; those that have converged drop out of each further step."""
     target_x, target_y = target.unbind(-1)
     x, y = target_x.clone(), target_y.clone()
     open_ = torch.arange(len(x), dtype=torch.int64, device=x.device)
-    for _ in range(_MAX_STEPS):
+    for _ in range(MAX_STEPS):
         px, py = x[open_], y[open_]
         bent_x, bent_y = _bend(px, py, coefficients)
         error_x, error_y = bent_x - target_x[open_], bent_y - target_y[open_]
         # Written so that a NaN stays open.
-        unsolved = ~((error_x.abs() <= _CONVERGED) & (error_y.abs() <= _CONVERGED) & (px * px + py * py < fold * fold))
+        unsolved = ~((error_x.abs() <= CONVERGED) & (error_y.abs() <= CONVERGED) & (px * px + py * py < fold * fold))
         if not bool(unsolved.any()):
             return torch.stack([x, y], dim=-1)
         open_, px, py = open_[unsolved], px[unsolved], py[unsolved]
@@ -276,8 +283,16 @@ def _newton_step(
     new_x = x - (yy * error_x - xy * error_y) / determinant
     new_y = y - (xx * error_y - yx * error_x) / determinant
     # A step over the fold comes back to just inside it; a singular Jacobian (NaN) is left to fail.
-    shrink = (0.999 * fold / torch.hypot(new_x, new_y)).clamp(max=1.0)
-    return new_x * shrink, new_y * shrink
+    squared, edge = new_x * new_x + new_y * new_y, 0.999 * fold
+    over = squared > edge * edge
+    new_x[over], new_y[over] = _onto(edge, new_x[over], new_y[over], squared[over])
+    return new_x, new_y
+
+
+def _onto(edge: float, x: Tensor, y: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """Bring coordinates back to a radius; NumPy's root is correctly rounded, torch's may be one unit off."""
+    shrink = edge / torch.from_numpy(np.sqrt(squared.cpu().numpy())).to(x.device)
+    return x * shrink, y * shrink
 
 
 def _bend(x: Tensor, y: Tensor, c: _Coefficients) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pcdata.kernels.cpu import depth_to_color as cpu_registration
 from pcdata.kernels.cpu import fusion as cpu_fusion
 from pcdata.kernels.cpu import images as cpu_images
+from pcdata.kernels.cpu import lenses as cpu_lenses
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
 from pcdata.kernels.cpu import noise as cpu_noise
 from pcdata.kernels.cpu import rendering as cpu_rendering
@@ -16,6 +17,7 @@ from pcdata.kernels.cpu.native import unavailable
 __all__ = [
     "cpu_fusion",
     "cpu_images",
+    "cpu_lenses",
     "cpu_neighbors",
     "cpu_noise",
     "cpu_registration",

@@ -67,3 +67,24 @@ def least_at_pixels(value: Tensor, pixel: Tensor, num_pixels: int) -> tuple[Tens
     least, index = room_for(((num_pixels,), torch.float32), ((num_pixels,), torch.int64))
     call("pc_least_at_pixels", value.contiguous(), pixel.contiguous(), len(value), num_pixels, least, index)
     return least, index
+
+
+@kernel("front_triangles", "cpu")
+def front_triangles(
+    boxes: tuple[Tensor, Tensor, Tensor], width: int, rays: Tensor, normal: Tensor, offset: Tensor, sides: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw all triangles, some at a time; then look up where in the nearest one every pixel lies."""
+    if len(normal) > _MAX_ROWS:
+        found: tuple[Tensor, Tensor, Tensor] = INNER["front_triangles"].reference(
+            boxes, width, rays, normal, offset, sides
+        )
+        return found
+    pixels = len(rays)
+    depth, index, weights = room_for(((pixels,), torch.float32), ((pixels,), torch.int64), ((pixels, 3), torch.float32))
+    planes = normal.contiguous(), offset.contiguous(), sides.contiguous()
+    call(
+        "pc_front_triangles",
+        *(*(part.contiguous() for part in boxes), len(normal), width, rays.contiguous(), pixels),
+        *(*planes, depth, index, weights),
+    )
+    return depth, index, weights

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x3AA4376FC279FDE
+INTERFACE_NUMBER = 0x639E33E381B18B3
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -39,6 +39,13 @@ pc_project_points: double* points, int64* ptr, int64 views, double* intrinsics, 
 pc_render_points: float* points, int64* ptr, int64 views, double* intrinsics, double* lenses, int64 height, int64 width,
     double point_size, float* depth, int64* index
 pc_least_at_pixels: float* value, int64* pixel, int64 rows, int64 pixels, float* least, int64* index
+pc_front_triangles: int64* first, int64* across, int64* down, int64 triangles, int64 width, double* rays, int64 pixels,
+    double* normals, double* offsets, double* sides, float* depth, int64* index, float* weights
+pc_unbend: double* bent, int64 count, double* lens, int64 steps, double converged, double* solved
+pc_sample_image: uint8* whole, float* real, int64 views, int64 height, int64 width, int64 channels, double* places,
+    int64 out_pixels, int64 nearest, uint8* sampled_whole, float* sampled_real, uint8* valid
+pc_sample_depth: float* depth, int64 views, int64 height, int64 width, double* places, int64 out_pixels, int64 surface,
+    double max_jump, float* sampled, int64* pixel_index
 pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
     int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
 pc_wide_neighbors: float* points, int64* ptr, int64 num_clouds, int64 width, float* queries, int64* queries_ptr, int64

@@ -158,6 +158,36 @@ PC_EXPORT int32_t pc_render_points(const pc_context* context, const float* point
 PC_EXPORT int32_t pc_least_at_pixels(const pc_context* context, const float* value, const int64_t* pixel, int64_t rows,
                                      int64_t pixels, float* least, int64_t* index);
 
+// Rays (pixels, 2) against triangles, each within its box of an image: first (triangles,) pixel, across and down it;
+// the normals (triangles, 3), offsets (triangles,) and sides (triangles, 3, 3) are those of math::meet. depth
+// (pixels,), 0 where nothing is met, index of the nearest triangle, and weights (pixels, 3) of its corners.
+PC_EXPORT int32_t pc_front_triangles(const pc_context* context, const int64_t* first, const int64_t* across,
+                                     const int64_t* down, int64_t triangles, int64_t width, const double* rays,
+                                     int64_t pixels, const double* normals, const double* offsets, const double* sides,
+                                     float* depth, int64_t* index, float* weights);
+
+// -- lenses -----------------------------------------------------------------------------------------------------------
+
+// Invert a lens (14,) at bent coordinates (count, 2) by Newton's method inside the fold; NaN where `steps` steps do not
+// come to `converged`.
+PC_EXPORT int32_t pc_unbend(const pc_context* context, const double* bent, int64_t count, const double* lens,
+                            int64_t steps, double converged, double* solved);
+
+// Pixels of images (views, height, width, channels), either whole (uint8) or real (float), the other null, at places
+// (views, out_pixels, 2) u, v -> sampled (views, out_pixels, channels) of the same type, and valid, 0 beyond the image.
+// Bilinear, or the nearest pixel where nearest is not 0.
+PC_EXPORT int32_t pc_sample_image(const pc_context* context, const uint8_t* whole, const float* real, int64_t views,
+                                  int64_t height, int64_t width, int64_t channels, const double* places,
+                                  int64_t out_pixels, int64_t nearest, uint8_t* sampled_whole, float* sampled_real,
+                                  uint8_t* valid);
+
+// Depths (views, height, width) at places (views, out_pixels, 2): the nearest reading, or with surface not 0 the mean
+// of the inverse depths around where they differ by at most max_jump times the least; pixel_index is the nearest pixel,
+// -1 beyond the image.
+PC_EXPORT int32_t pc_sample_depth(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                  int64_t width, const double* places, int64_t out_pixels, int64_t surface,
+                                  double max_jump, float* sampled, int64_t* pixel_index);
+
 // -- neighbors --------------------------------------------------------------------------------------------------------
 
 // queries null: the points; pixel null: no grid; neighbors have d2 <= limit; count may be null.

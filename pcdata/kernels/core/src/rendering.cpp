@@ -4,6 +4,7 @@
 #include <cstring>
 
 #include "pc/math/camera.hpp"
+#include "pc/math/triangle.hpp"
 #include "pc/memory.hpp"
 #include "pc/threads.hpp"
 
@@ -11,6 +12,7 @@ namespace pc::rendering {
 namespace {
 
 constexpr int64_t kRowsPerPiece = 4096;
+constexpr int64_t kTrianglesPerPiece = 64;
 constexpr int64_t kPixelsPerPiece = int64_t{1} << 16;
 constexpr double kLargest = 65.0;  // pixels that a point is wide at most
 constexpr uint64_t kEmpty = ~uint64_t{0};
@@ -85,7 +87,8 @@ void z_buffer(const pc_context& context, int64_t pixels, int64_t missing, float*
   auto* image = reinterpret_cast<uint64_t*>(index);
   parallel_for(context, pixels, kPixelsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { std::fill(image + begin, image + end, kEmpty); });
-  for_each_piece(context, pieces, kRowsPerPiece, [&](const CloudPiece& piece, int64_t) { bring_piece(piece, image); });
+  parallel_for(context, static_cast<int64_t>(pieces.size()), 1,
+               [&](int64_t p, int64_t, int64_t) { bring_piece(pieces[static_cast<size_t>(p)], image); });
   parallel_for(context, pixels, kPixelsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { read(image, begin, end, missing, depth, index); });
 }
@@ -135,5 +138,39 @@ PC_EXPORT int32_t pc_least_at_pixels(const pc_context* context, const float* val
                for (int64_t i = piece.begin; i < piece.end; ++i)
                  if (pixel[i] >= 0) bring(image + pixel[i], key_of(value[i], i));
              });
+  });
+}
+
+PC_EXPORT int32_t pc_front_triangles(const pc_context* context, const int64_t* first, const int64_t* across,
+                                     const int64_t* down, int64_t triangles, int64_t width, const double* rays,
+                                     int64_t pixels, const double* normals, const double* offsets, const double* sides,
+                                     float* depth, int64_t* index, float* weights) {
+  using namespace pc;
+  using namespace pc::rendering;
+  return guarded([&] {
+    const auto meet = [&](int64_t triangle, int64_t pixel) {
+      return math::meet(normals + 3 * triangle, offsets[triangle], sides + 9 * triangle, rays[2 * pixel],
+                        rays[2 * pixel + 1]);
+    };
+    const int64_t ptr[2] = {0, triangles};
+    z_buffer(*context, pixels, triangles, depth, index, cut_clouds(ptr, 1, kTrianglesPerPiece),
+             [&](const CloudPiece& piece, uint64_t* image) {
+               for (int64_t t = piece.begin; t < piece.end; ++t)
+                 for (int64_t row = 0; row < down[t]; ++row)
+                   for (int64_t column = 0; column < across[t]; ++column) {
+                     const int64_t pixel = first[t] + (row * width + column);
+                     const double at = meet(t, pixel).depth;
+                     if (at > 0) bring(image + pixel, key_of(static_cast<float>(at), t));
+                   }
+             });
+    parallel_for(*context, pixels, kPixelsPerPiece, [&](int64_t begin, int64_t end, int64_t) {
+      for (int64_t pixel = begin; pixel < end; ++pixel) {
+        const bool found = index[pixel] < triangles;
+        const math::Meeting met = found ? meet(index[pixel], pixel) : math::Meeting{};
+        depth[pixel] = static_cast<float>(met.depth);
+        for (int corner = 0; corner < 3; ++corner)
+          weights[3 * pixel + corner] = found ? static_cast<float>(met.weight(corner)) : 0.0F;
+      }
+    });
   });
 }
