@@ -17,6 +17,7 @@ from pcdata.kernels.cpu import images
 from pcdata.structures import Camera
 from pcdata.structures.rendering import render
 from pcdata.structures.surface_mesh import SurfaceMesh
+from pcdata.synthetic import tabletop
 
 SIZE = (720, 1280)
 K = torch.tensor([[[640.0, 0.0, 640.0], [0.0, 640.0, 360.0], [0.0, 0.0, 1.0]]])
@@ -50,7 +51,7 @@ def cloud_cases(cloud: pcdata.PointCloud) -> Iterator[Case]:
     plain = pcdata.PointCloud(
         points=points, ptr=torch.tensor([0, len(points)]), unit="m", frame_id="camera", colors=colors
     )
-    camera = Camera.pinhole(640.0, 640.0, 640.0, 360.0, SIZE)
+    camera = Camera.pinhole(fx=640.0, fy=640.0, cx=640.0, cy=360.0, size=SIZE)
     if not installed("open3d"):
         return
     import open3d as o3d
@@ -84,11 +85,7 @@ def mesh_cases() -> Iterator[Case]:
         return
     import open3d as o3d
 
-    scene = pcdata.synthetic.tabletop(0, noise="none", size=(360, 640)) if hasattr(pcdata, "synthetic") else None
-    if scene is None:
-        from pcdata.synthetic import tabletop
-
-        scene = tabletop(0, noise="none", size=(360, 640))
+    scene = tabletop(0, noise=None, size=(360, 640))
     volume = pcdata.TSDFVolume(voxel_size=0.005)
     volume.integrate(scene.frame)
     mesh: SurfaceMesh = volume.extract_mesh()
@@ -109,7 +106,7 @@ def mesh_cases() -> Iterator[Case]:
         "mesh to depth", len(triangles), lambda: F.render_triangles(corners, intrinsics=K, size=SIZE).depth,
         "Open3D RaycastingScene", cast, covered,
     )  # fmt: skip
-    camera = Camera.pinhole(640.0, 640.0, 640.0, 360.0, SIZE)
+    camera = Camera.pinhole(fx=640.0, fy=640.0, cx=640.0, cy=360.0, size=SIZE)
     yield Case(
         "TSDF volume to depth, normals, color", len(triangles),
         lambda: render(volume, camera, world_from_camera=scene.frame.world_from_camera).frame.depth,

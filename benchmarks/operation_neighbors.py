@@ -155,7 +155,7 @@ def metric_cases(points: torch.Tensor) -> Iterator[Case]:
 
         def within(ours: Any, theirs: Any) -> str:
             value = float(np.asarray(ours).reshape(-1)[0])
-            return f"{abs(value - float(theirs)) / float(theirs):.0e} of it apart"
+            return f"{abs(value - float(theirs)) / max(float(theirs), 1e-30):.0e} of it apart"
 
         yield Case(
             "Chamfer, both sides", count, lambda: F.chamfer_distance(a, None, b, None), "SciPy cKDTree",

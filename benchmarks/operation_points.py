@@ -182,15 +182,18 @@ def sampling_cases(points: torch.Tensor, colors: torch.Tensor) -> Iterator[Case]
             lambda: F.farthest_point_sample(points, num_samples=SAMPLES, labels=labels), "fpsample in a loop", by_label,
             lambda a, b: f"{len(a[0])} and {len(b)} picks",
         )  # fmt: skip
-    if installed("torch_fps"):
-        import torch_fps
+    if installed("fpsample") and installed("scipy"):
+        from scipy.spatial import cKDTree
 
-        few, valid = points[None, ::8].contiguous(), torch.ones(1, -(-count // 8), dtype=torch.bool)
+        def peer_groups() -> np.ndarray:
+            picked = fpsample.bucket_fps_kdline_sampling(points.numpy(), SAMPLES, h=7, start_idx=0)
+            array = points.numpy()
+            return cKDTree(array[picked.astype(np.int64)]).query(array, workers=-1)[0]
+
         yield Case(
-            "farthest points and nearest sample", few.shape[1],
-            lambda: F.farthest_point_groups(few[0], num_samples=SAMPLES), "torch-fps",
-            lambda: torch_fps.farthest_point_sampling_with_assign(few, valid, SAMPLES, start_idx=torch.tensor([0])),
-            lambda a, b: same(a[0].numpy(), b[0][0].numpy()),
+            "farthest points and nearest sample", count,
+            lambda: F.farthest_point_groups(points, num_samples=SAMPLES), "fpsample and SciPy", peer_groups,
+            lambda a, b: f"farthest from its sample: {float(a[3].max()):.4f} and {b.max():.4f} m",
         )  # fmt: skip
 
 

@@ -1,9 +1,8 @@
 """Time operations against their peers in one run, check that the results are equal, and try 10,000 small clouds.
 
-    OMP_NUM_THREADS=2 python benchmarks/operations.py       # the options of operations; writes results/operations.json
+    OMP_NUM_THREADS=2 python benchmarks/operations.py       # options; writes results/operations.json and docs/speed.md
     PCDATA_TEST_DATA=... python benchmarks/operations.py --frame    # the README's; writes results/operations_*.json
     python benchmarks/operations.py --kept                      # prints the kept results of --frame as in the README
-    python benchmarks/operations.py --page                      # prints those of the options as in the docs
 
 Method: see ``operation_timing.py``. The options run on synthetic clouds (or parts of the real tabletop frame where
 PCDATA_TEST_DATA names it), so that the whole takes less than three minutes. Peers that are not installed are left out
@@ -19,19 +18,19 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import operation_frame
 import operation_images
 import operation_neighbors
 import operation_points
 import operation_ragged
+from operation_page import PAGE, page, table
 from operation_timing import RESULTS, Case, Row, facts, measure
 
 import pcdata
 from pcdata.report import text_table
 
-PEERS = ("open3d", "fpsample", "torch_fps", "scipy", "sklearn", "cv2", "kornia", "torch_cluster", "pytorch3d")
+PEERS = ("open3d", "fpsample", "scipy", "sklearn", "cv2", "kornia", "torch_cluster", "pytorch3d")
 
 
 def main() -> None:
@@ -40,12 +39,9 @@ def main() -> None:
     parser.add_argument("--only", default="", help="run only operations whose name contains this; nothing is kept")
     parser.add_argument("--frame", action="store_true", help="time the operations of the README on a whole frame")
     parser.add_argument("--kept", action="store_true", help="measure nothing; print the kept results of --frame")
-    parser.add_argument("--page", action="store_true", help="measure nothing; print the kept results of the options")
     arguments = parser.parse_args()
     if arguments.kept:
-        return print(markdown(json.loads((RESULTS / "operations_graspnet_frame.json").read_text())["rows"]))
-    if arguments.page:
-        return print(page(json.loads((RESULTS / "operations.json").read_text())))
+        return print(table(json.loads((RESULTS / "operations_graspnet_frame.json").read_text())["rows"]))
     cloud, name = load_cloud()
     rows = []
     for case in operation_frame.cases(cloud) if arguments.frame else option_cases(cloud):
@@ -53,11 +49,11 @@ def main() -> None:
             rows.append(measure(case, arguments.repeats))
             print(line(rows[-1]), flush=True)
     header = ["operation", "points", "pcdata ms", "peer", "peer ms", "ratio", "results"]
-    table = [
+    cells = [
         [r.operation, r.points, f"{r.pcdata_ms:.1f}", r.peer, f"{r.peer_ms:.1f}", f"{r.ratio:.1f}x", r.results]
         for r in rows
     ]
-    print("\n" + text_table(header, table))
+    print("\n" + text_table(header, cells))
     result = {"frame": name, "repeats": arguments.repeats}
     result |= facts(operation_frame.PEERS if arguments.frame else PEERS) | {"rows": [asdict(row) for row in rows]}
     if not arguments.frame:
@@ -66,6 +62,8 @@ def main() -> None:
         RESULTS.mkdir(exist_ok=True)
         kept = RESULTS / (f"operations_{name}.json" if arguments.frame else "operations.json")
         kept.write_text(json.dumps(result, indent=1) + "\n")
+        if not arguments.frame:
+            PAGE.write_text(page(result), encoding="utf-8")
 
 
 def option_cases(cloud: pcdata.PointCloud) -> Iterator[Case]:
@@ -91,30 +89,6 @@ def line(row: Row) -> str:
         f"{row.operation} ({row.points:,}): {row.pcdata_ms:.1f} ms, {row.peer} {row.peer_ms:.1f} ms, {row.ratio:.1f}x"
         f" ({row.results})"
     )
-
-
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table of the README."""
-    lines = ["| operation | points | pcdata | peer | ratio | results |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        ratio = f"{row['ratio']:,.0f}x" if row["ratio"] >= 100 else f"{row['ratio']:.1f}x"
-        lines.append(
-            f"| {row['operation']} | {row['points']:,} | {row['pcdata_ms']:.1f} ms | {row['peer']} "
-            f"{row['peer_ms']:,.0f} ms | {ratio} | {row['results']} |"
-        )
-    return "\n".join(lines)
-
-
-def page(result: dict[str, Any]) -> str:
-    """The tables of the docs: the options, then the small clouds."""
-    lines = [
-        markdown(result["rows"]),
-        "",
-        "| operation | 10,000 clouds of 50 | one cloud of 500,000 |",
-        "|---|---|---|",
-    ]
-    lines += [f"| {row['operation']} | {row['many_ms']:.1f} ms | {row['one_ms']:.1f} ms |" for row in result["ragged"]]
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

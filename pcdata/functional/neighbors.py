@@ -99,7 +99,7 @@ def knn(
     """Find the k nearest points of its own cloud for every query.
 
     A cloud with fewer than k points fills the rest with index N and distance infinity. Any number of columns will do;
-    three are searched by trees and image windows, others by looking at all pairs of a cloud.
+    on the CPU all are searched by trees, three by image windows too, and elsewhere others than three by all pairs.
 
     Args:
         points: the clouds to search, in any unit of length; distances are in the same unit.

@@ -20,6 +20,7 @@ from pcdata.contracts.dispatch import INNER, OPERATIONS, why_unavailable
 from pcdata.errors import PcdataError, add_note
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import ptr_from_counts
+from pcdata.geometry.lens import plain_lenses
 from pcdata.geometry.lens_models import lens_row
 from pcdata.kernels.cpu import native
 
@@ -321,6 +322,9 @@ def fuzz_rendering(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> Non
     check("project_points", seen, ptr, **cameras)
     check("render_points", seen, ptr, size=size, point_size=float(rng.choice([0.0, 0.1, 10.0])), **cameras)
     check("render_ranges", seen, ptr, size=size)
+    triangles = points.detach()[: len(points) // 3 * 3].reshape(-1, 3, 3) + torch.tensor([0.0, 0.0, 2.0])
+    counts = [len(triangles) if view == 0 else 0 for view in range(views)]
+    check("render_triangles", triangles, ptr_from_counts(counts), size=size, **cameras)
 
 
 def fuzz_rows(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> None:
@@ -356,6 +360,28 @@ def fuzz_images(rng: np.random.Generator) -> None:
     size = int(rng.integers(1, 40)), int(rng.integers(1, 50))
     to_color = {"color_size": size, "distortion": lens, "color_distortion": lens}
     check("register_depth", depth, intrinsics, intrinsics, motion, **to_color)
+    fuzz_lenses(rng, depth, intrinsics, a_lens(rng, views))
+
+
+def fuzz_lenses(rng: np.random.Generator, depth: Tensor, intrinsics: Tensor, lens: Tensor | None) -> None:
+    views, height, width = depth.shape
+    if lens is None:
+        return
+    rule = str(rng.choice(["nearest", "surface"]))
+    size = None if rng.random() < 0.5 else (int(rng.integers(1, 40)), int(rng.integers(1, 50)))
+    check("undistort_depth", depth, intrinsics, lens, size=size, rule=rule, max_jump=float(rng.choice([0.002, 0.5])))
+    for image in (
+        torch.from_numpy(rng.integers(0, 256, (views, height, width, 3), dtype=np.uint8)),
+        torch.from_numpy(rng.normal(size=(views, height, width, 1))).float(),
+    ):
+        check("undistort_image", image, intrinsics, lens, size=size, rule=str(rng.choice(["nearest", "bilinear"])))
+    plain = plain_lenses(lens)
+    if plain is not None:
+        target = torch.from_numpy(rng.normal(size=(200, 2)))
+        given = target, plain[0, :12], bool(plain[0, 12]), float(plain[0, 13])
+        ours, theirs = (body(*given) for body in both("unbent"))
+        assert torch.equal(ours.isnan(), theirs.isnan())
+        assert torch.equal(ours.nan_to_num(), theirs.nan_to_num())
 
 
 def each_case(first: int, body: Callable[[np.random.Generator], None]) -> None:
