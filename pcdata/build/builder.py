@@ -21,6 +21,7 @@ from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
 from pcdata.files.urls import is_in_process, is_url, path_of
+from pcdata.io.sources.apart import check_apart
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
@@ -120,6 +121,8 @@ def build_dataset(
         raise ConfigError(
             f"build_dataset: {folder}: retry_quarantined takes a folder of this machine; build it again: --overwrite"
         )
+    if isinstance(building, BuildingFolder):
+        check_apart("build_dataset", building.target, source)
     report = BuildReport(building.target.url if isinstance(building, BuildingUrl) else building.target)
     report.skipped.update(skipped_of(source))
     building.check_target(overwrite)
@@ -164,6 +167,8 @@ def building_at(folder: str | Path) -> BuildingFolder | BuildingUrl:
         ConfigError: there is no such kind of URL.
         MissingExtraError: what opens it is not installed.
     """
+    if folder == "":
+        raise ConfigError("build_dataset: the folder is an empty text; name one")
     if isinstance(folder, str) and ":" in folder:
         if is_url(folder):
             return BuildingUrl(folder)

@@ -45,6 +45,7 @@ def add_to(commands: Any) -> None:
 def _fuse(arguments: argparse.Namespace) -> None:
     out = _checked_target(arguments)  # before the work, not after
     from pcdata.io import write_ply, write_volume
+    from pcdata.io.sources.apart import check_apart
     from pcdata.structures import TSDFVolume
 
     volume = TSDFVolume(
@@ -55,6 +56,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
         max_bytes=arguments.max_megabytes << 20,
     )
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
+    check_apart("fuse: --out", out, source)
     with ProgressBar("fuse") as progress:
         for done, sample_id in enumerate(source.ids, 1):
             volume.integrate(source.load(sample_id))

@@ -15,7 +15,7 @@ from pcdata.cli.printable import printable_output
 from pcdata.cli.signals import signals_interrupt
 from pcdata.cli.threads import wait_asleep
 from pcdata.cli.warning_lines import warnings_in_one_line
-from pcdata.errors import ConfigError, PcdataError
+from pcdata.errors import ConfigError, PcdataError, near_matches
 
 _NOTHING_LEFT = "nothing half-written was left behind"
 
@@ -45,11 +45,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     wait_asleep()
     words = sys.argv[1:] if argv is None else [*argv]
-    arguments = _parser().parse_args(words)
+    arguments = _parsed(words)
     arguments.words = words[next((place for place, word in enumerate(words) if word[:1] != "-"), 0) + 1 :]
     try:
         _import(getattr(arguments, "imports", []))
+        _refuse_empty(arguments)
         _refuse_url(arguments)
+        _refuse_replacing(arguments)
         verdict: int | None = arguments.run(arguments)  # a command that judges returns its exit code
         sys.stdout.flush()
     except PcdataError as error:
@@ -71,6 +73,27 @@ def _run(argv: Sequence[str] | None) -> int:
     return verdict or 0
 
 
+def _parsed(words: Sequence[str]) -> argparse.Namespace:
+    """Read the words; of one that the command does not know, say which it may have been."""
+    parser = _parser()
+    arguments, unknown = parser.parse_known_args(words)
+    if not unknown:
+        return arguments
+    for word in words:
+        below = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+        parser = below[0].choices.get(word, parser) if below else parser
+    flags = [flag for action in parser._actions for flag in action.option_strings]
+    strange = next((word for word in unknown if word.startswith("-")), unknown[0])
+    parser.error(f"unrecognized arguments: {' '.join(unknown)}{near_matches(strange.partition('=')[0], flags)}")
+
+
+def _refuse_empty(arguments: argparse.Namespace) -> None:
+    """Refuse a path without a letter, which would stand for the folder that one is in."""
+    for name in ("path", "source", "config", "out", "file", "json", "figure", "calibration", "table"):
+        if getattr(arguments, name, None) == "":
+            raise ConfigError(f"{name}: is empty; give a path, or leave it out (is a variable of the shell not set?)")
+
+
 def _refuse_url(arguments: argparse.Namespace) -> None:
     """Refuse a URL as --out of a command that writes to the disk alone, before it does anything."""
     out = getattr(arguments, "out", None)
@@ -79,6 +102,17 @@ def _refuse_url(arguments: argparse.Namespace) -> None:
 
         if hint := url_hint(out):
             raise ConfigError(f"--out: {hint}")
+
+
+def _refuse_replacing(arguments: argparse.Namespace) -> None:
+    """Refuse a report or a picture among what is read: it could replace a file there, or be taken for one of them."""
+    for written in ("json", "figure"):
+        place = getattr(arguments, written, None)
+        for read in ("path", "source"):
+            if isinstance(place, str) and place != "-" and isinstance(path := getattr(arguments, read, None), str):
+                from pcdata.io.sources.apart import check_apart
+
+                check_apart(f"--{written}", place, path)
 
 
 def _tell_what_is_needed(words: Sequence[str], message: str) -> None:

@@ -27,6 +27,7 @@ from pcdata.exports.targets import target_named
 from pcdata.files.inputs import recording
 from pcdata.files.scratch import scratch_beside
 from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
+from pcdata.io.sources.apart import check_apart
 from pcdata.io.sources.capture_source import REFUSALS, CaptureSource, episodes_of, inputs_of
 from pcdata.progress import Progress
 from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
@@ -104,6 +105,7 @@ def export_dataset(
         chosen = chosen.with_splits(part_of)
     ids = list(opened.ids)
     folder = Path(os.path.realpath(Path(out).expanduser()))
+    check_apart("export", folder, source)
     report = _ExportReport(folder, chosen.name)
     run = _Run(chosen, opened, report, progress)
     if skip_bad:

@@ -161,6 +161,8 @@ def hidden_neighbors(folder: Path, what: str) -> list[Path]:
 
 
 def _prefix(folder: Path, what: str) -> str:
+    if not folder.name:
+        raise CacheError(f"{folder} is the root of a disk, beside which nothing can be written; name a folder in it")
     name = os.fsencode(folder.name)
     return f".{folder.name if len(name) <= _LONGEST else hashlib.sha256(name).hexdigest()[:32]}.{what}-"
 

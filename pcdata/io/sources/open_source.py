@@ -96,6 +96,8 @@ def read_skip_file(path: str | os.PathLike[str]) -> list[str]:
 
 
 def _open(path: str | os.PathLike[str], kind: str | None, options: dict[str, Any]) -> Source | JoinedSource:
+    if not os.fspath(path):
+        raise ConfigError(f"{_WHERE}: the path is empty; give one, or '.' for the folder that this runs in")
     given = Path(path).expanduser()
     check_links([given])
     if given.exists():

@@ -9,7 +9,8 @@ from typing import Any
 
 from pcdata.errors import CacheError, ConfigError, PcdataError, add_note, write_fault
 from pcdata.files.whole_folders import complete_or_nothing, is_free
-from pcdata.io.sources.capture_source import all_within, checked_ids, episodes_of, skipped_of, unread_of
+from pcdata.io.sources.apart import check_apart
+from pcdata.io.sources.capture_source import checked_ids, episodes_of, skipped_of, unread_of
 from pcdata.io.sources.combine import SubsetSource
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.writers.registry import writer_named
@@ -55,7 +56,7 @@ def convert(
     writer = writer_named(_WHERE, to, options)
     opened = open_source(source) if isinstance(source, (str, os.PathLike)) else source
     folder = Path(os.path.realpath(Path(out).expanduser()))
-    _check_outside(folder, opened)
+    check_apart(_WHERE, folder, opened)
     if not is_free(folder):
         raise CacheError(f"{_WHERE}: {folder} exists already, and nothing is written over; choose a new folder")
     report = WrittenReport(folder, writer.kind, left_out=skipped_of(opened), not_read=unread_of(opened))
@@ -91,14 +92,6 @@ def _tried(source: Any, writer: Writer, report: WrittenReport, progress: Progres
     report.looked_at, report.samples, report.episodes = len(some), len(ids), len(episodes_of(source))
     report.size = size * len(ids) // len(some)
     return report
-
-
-def _check_outside(folder: Path, source: Any) -> None:
-    """Require a folder that no capture is read from: what is written there would become part of it."""
-    for one in all_within(source):
-        path = getattr(one, "path", None)
-        if isinstance(path, Path) and folder.is_relative_to(real := Path(os.path.realpath(path))):
-            raise ConfigError(f"{_WHERE}: {folder} is inside the captures {real}; choose a folder outside")
 
 
 __all__ = ["WRITERS", "convert"]
