@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from pcdata.build.building import Building
 from pcdata.build.building_folder import BuildingFolder
 from pcdata.build.building_url import BuildingUrl
 from pcdata.build.config import BuildConfig
 from pcdata.build.engines.in_process import work_here
 from pcdata.build.finishing import complete_dataset, counts_of
+from pcdata.build.kept_for_retry import take_over
 from pcdata.build.plan import Plan, plan_of
 from pcdata.build.records import BuiltSample, ShardRecord
 from pcdata.build.shard_work import Job
@@ -107,40 +109,46 @@ def build_dataset(
             captures failed; steps drop too much (strict).
         PcdataError: all of the first 8 captures failed, or all; of the type that the first one raised.
     """
-    _check_arguments(config, source)
-    _check_ways(workers, timeout, engine, part, finalize)
-    if retry_quarantined and (restart or finalize or part is not None):
-        raise ConfigError(
-            "build_dataset: retry_quarantined goes on with a whole build: without restart, finalize, part"
-        )
+    building = checked_request(
+        config,
+        source,
+        folder,
+        restart=restart,
+        workers=workers,
+        timeout=timeout,
+        max_bad=max_bad,
+        engine=engine,
+        part=part,
+        finalize=finalize,
+        retry_quarantined=retry_quarantined,
+    )
     overwrite = overwrite or retry_quarantined
-    building = building_at(folder)
-    if isinstance(building, BuildingUrl) and is_in_process(folder) and (workers or engine != "pool"):
-        raise ConfigError(f"build_dataset: {folder} is in the memory of this process: build it with workers=0")
-    if isinstance(building, BuildingUrl) and retry_quarantined:
-        raise ConfigError(
-            f"build_dataset: {folder}: retry_quarantined takes a folder of this machine; build it again: --overwrite"
-        )
-    if isinstance(building, BuildingFolder):
-        check_apart("build_dataset", building.target, source)
-    report = BuildReport(building.target.url if isinstance(building, BuildingUrl) else building.target)
+    report = BuildReport(building.target if isinstance(building, BuildingFolder) else building.target.url)
     report.skipped.update(skipped_of(source))
-    building.check_target(overwrite)
-    plan = plan_of(config, source, hash_captures=hash_captures)
-    limit = most_bad(max_bad, len(plan.ids))
-    job = Job.of(config, source, plan, building)
 
     def tell(text: str) -> None:
         report.notes.append(text)
         if note is not None:
             note(text)
 
+    plan = plan_of(config, source, hash_captures=hash_captures)
+    if (
+        (part is not None or finalize)
+        and not overwrite
+        and (quarantined := building.quarantined_of(plan.identity)) is not None
+    ):  # a job that is started again when all is done
+        tell("the dataset was put into place before")
+        report.quarantined.update(quarantined)
+        return replace(report, num_shards=plan.num_shards, num_finished=plan.num_shards, is_complete=True)
+    building.check_target(overwrite)
+    limit = most_bad(max_bad, len(plan.ids))
+    job = Job.of(config, source, plan, building)
     what = "finalize" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
     with building.opened(plan, what, restart=restart, note=tell):
         replaced = building.prepared(overwrite, tell) if part is None else None
         shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
         if retry_quarantined and isinstance(building, BuildingFolder):
-            building.take_over(plan)
+            take_over(building, plan)
         done = _finished(job, shards, tell, retry_quarantined=retry_quarantined)
         if finalize and len(done) < plan.num_shards:
             missing = plan.num_shards - len(done)
@@ -158,6 +166,45 @@ def build_dataset(
             config, source, job, done, part, replaced, overwrite=overwrite, strict=strict, note=tell
         )
     return _told(report, [done[shard] for shard in shards if shard in done], plan.num_shards, len(done), is_complete)
+
+
+def checked_request(
+    config: BuildConfig,
+    source: CaptureSource,
+    folder: str | Path,
+    *,
+    restart: bool,
+    workers: int,
+    timeout: float | None,
+    max_bad: int | str | None,
+    engine: str,
+    part: tuple[int, int] | None,
+    finalize: bool,
+    retry_quarantined: bool,
+) -> BuildingFolder | BuildingUrl:
+    """Return where the unfinished build is that arguments of :func:`build_dataset` ask for; nothing is written.
+
+    Raises:
+        ConfigError: they do not fit together, or the folder is among the captures.
+    """
+    _check_arguments(config, source)
+    _check_ways(workers, timeout, engine, part, finalize)
+    most_bad(max_bad, len(source.ids))
+    if retry_quarantined and (restart or finalize or part is not None):
+        raise ConfigError(
+            "build_dataset: retry_quarantined goes on with a whole build: without restart, finalize, part"
+        )
+    building = building_at(folder)
+    if isinstance(building, BuildingFolder):
+        check_apart("build_dataset", building.target, source)
+        return building
+    if is_in_process(folder) and (workers or engine != "pool"):
+        raise ConfigError(f"build_dataset: {folder} is in the memory of this process: build it with workers=0")
+    if retry_quarantined:
+        raise ConfigError(
+            f"build_dataset: {folder}: retry_quarantined takes a folder of this machine; build it again: --overwrite"
+        )
+    return building
 
 
 def building_at(folder: str | Path) -> BuildingFolder | BuildingUrl:
@@ -257,7 +304,7 @@ def _finish(
     return True
 
 
-def _tell_kept(error: BaseException, building: BuildingFolder | BuildingUrl, plan: Plan) -> None:
+def _tell_kept(error: BaseException, building: Building, plan: Plan) -> None:
     kept = building.finished(plan)
     if any(record.samples for record in kept.values()):
         add_note(

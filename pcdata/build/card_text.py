@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -174,10 +175,10 @@ def _left_out(facts: CardFacts) -> list[str]:
     for word, left in (("dropped", facts.manifest.skipped), ("quarantined", facts.manifest.quarantined)):
         parts.append(f"{len(left):,} captures were {word}{'.' if not left else ':'}")
         if left:
-            rows = [*left.items()][:_SHOWN]
+            rows = [*itertools.islice(left.items(), _SHOWN)]
             parts.append(_table(("capture", "why"), rows))
             if len(left) > _SHOWN:
-                parts.append(f"and {len(left) - _SHOWN:,} more, which `dataset.json` lists.")
+                parts.append(f"and {len(left) - _SHOWN:,} more, which `dataset.json` or arrays in `index/` list.")
     return parts
 
 

@@ -13,6 +13,7 @@ from pcdata.build.written_texts import FILE_NAME as TEXTS
 from pcdata.build.written_texts import edited_texts
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.errors import CacheError
+from pcdata.io.store.left_out import FILES as LEFT_OUT_FILES
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.sample_index import FILES as INDEX_FILES
 from pcdata.io.store.sample_index import FOLDER as INDEX
@@ -115,7 +116,7 @@ def _known(
     folder: Path, manifest: Manifest | None, tables: Mapping[int, Collection[str]]
 ) -> tuple[set[str], dict[str, set[str]]]:
     """Return the files that a build writes, and of every shard the keys of the captures that may lie beside it."""
-    known = _TOP | {f"{INDEX}/{name}" for name in INDEX_FILES}
+    known = _TOP | {f"{INDEX}/{name}" for name in (*INDEX_FILES, *LEFT_OUT_FILES)}
     raw: dict[str, set[str]] = {}
     if manifest is None:
         return known, raw

@@ -13,6 +13,7 @@ from urllib.parse import quote
 from pcdata.build.card_answers import UNKNOWN
 from pcdata.build.card_facts import CardFacts
 from pcdata.datasets.splits import FILE_NAME as SPLITS
+from pcdata.io.store.left_out import FILES as LEFT_OUT_FILES
 from pcdata.io.store.manifest import FILE_NAME
 from pcdata.io.store.sample_index import FILES as INDEX_FILES
 from pcdata.io.store.sample_index import FOLDER as INDEX
@@ -99,7 +100,13 @@ def _name(title: str) -> str:
 
 def _files(facts: CardFacts) -> list[dict[str, Any]]:
     folder, manifest = facts.folder, facts.manifest
-    names = [FILE_NAME, "pipeline.yaml", "load.py", SPLITS, *(f"{INDEX}/{name}" for name in INDEX_FILES)]
+    names = [
+        FILE_NAME,
+        "pipeline.yaml",
+        "load.py",
+        SPLITS,
+        *(f"{INDEX}/{name}" for name in (*INDEX_FILES, *LEFT_OUT_FILES)),
+    ]
     tables = [shard_folder(folder, number) for number in range(manifest.index.num_shards)]
     names += [(table / TABLE).relative_to(folder).as_posix() for table in tables]
     listed = [_file(name, *hash_of(folder / name)) for name in names if (folder / name).is_file()]

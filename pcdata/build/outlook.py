@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pcdata.build.builder import building_at
+from pcdata.build.builder import checked_request
+from pcdata.build.building import Building
+from pcdata.build.building_folder import BuildingFolder
 from pcdata.build.config import BuildConfig
+from pcdata.build.kept_for_retry import records_for_retry
 from pcdata.build.plan import plan_of
 from pcdata.build.source_state import captures_digest, files_of
 from pcdata.errors import CacheError
@@ -23,42 +26,76 @@ class Outlook:
     identity: str
     bytes_to_read: int | None  # of the files of all captures; None = they have none
     num_finished: int = 0  # shards
+    num_to_do: int = 0  # shards, of this job where it is one of several
     bytes_finished: int = 0
-    quarantined: dict[str, str] = field(default_factory=dict)
+    quarantined: dict[str, str] = field(default_factory=dict)  # so far; all of them are tried again where that is asked
+    replaces: bool = False  # a dataset is there, which the new one takes the place of
     hindrances: list[str] = field(default_factory=list)  # why it would not begin
 
 
-def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path, *, hash_captures: bool = False) -> Outlook:
-    """Return what ``build_dataset`` would do with these arguments.
+def outlook(
+    config: BuildConfig,
+    source: CaptureSource,
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    restart: bool = False,
+    workers: int = 0,
+    timeout: float | None = None,
+    max_bad: int | str | None = None,
+    engine: str = "pool",
+    part: tuple[int, int] | None = None,
+    finalize: bool = False,
+    hash_captures: bool = False,
+    retry_quarantined: bool = False,
+) -> Outlook:
+    """Return what :func:`build_dataset` would do with these arguments, which are its own.
 
     Raises:
         CaptureError: the source has no captures, or two of one id.
+        ConfigError: the arguments do not fit together.
     """
     checked_ids("build", source)
-    plan, building = plan_of(config, source, hash_captures=hash_captures), building_at(folder)
-    hindrances = []
-    try:
-        building.check_target(overwrite=True)
-        try:
-            building.check_target(overwrite=False)
-        except CacheError:
-            hindrances.append("a dataset is there; --overwrite replaces it")
-    except CacheError as error:
-        hindrances.append(str(error))
+    building = checked_request(
+        config,
+        source,
+        folder,
+        restart=restart,
+        workers=workers,
+        timeout=timeout,
+        max_bad=max_bad,
+        engine=engine,
+        part=part,
+        finalize=finalize,
+        retry_quarantined=retry_quarantined,
+    )
+    plan = plan_of(config, source, hash_captures=hash_captures)
+    replaces, hindrances = _target(building, overwrite or retry_quarantined)
     try:
         different = building.differences(plan)
     except CacheError as error:
         different = [str(error)]
-    if different:
+    if different and not restart:
         hindrances.append(
             f"an unfinished build, which differs in its {', '.join(different)}; --restart deletes it and begins anew"
         )
-    records = building.finished(plan) if different == [] else {}
-    done = [
+    records = building.finished(plan) if different == [] and not restart else {}
+    if retry_quarantined and isinstance(building, BuildingFolder) and not different:
+        try:
+            records = records_for_retry(building, plan)
+        except CacheError as error:
+            hindrances.append(str(error))
+    known = [
         record
         for shard, record in records.items()
-        if captures_digest(source, plan.ids_of(shard), hash_captures) == record.captures
+        if captures_digest(source, plan.ids_of(shard), hash_captures) == record.captures and not record.is_doubtful
     ]
+    done = [record for record in known if not (retry_quarantined and record.quarantined)]
+    shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
+    if finalize and len(done) < plan.num_shards:
+        hindrances.append(
+            f"{plan.num_shards - len(done)} of {plan.num_shards} shards are not finished; build them first"
+        )
     files = files_of(source, plan.ids)
     return Outlook(
         num_samples=len(plan.ids),
@@ -67,7 +104,22 @@ def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path, *, h
         identity=plan.identity,
         bytes_to_read=sum(path.stat().st_size for path in files if path.is_file()) if files else None,
         num_finished=len(done),
+        num_to_do=len({*shards} - {record.shard for record in done}),
         bytes_finished=sum(sum(record.files.values()) for record in done),
-        quarantined={name: why for record in done for name, why in record.quarantined.items()},
+        quarantined={name: why for record in known for name, why in record.quarantined.items()},
+        replaces=replaces,
         hindrances=hindrances,
     )
+
+
+def _target(building: Building, overwrite: bool) -> tuple[bool, list[str]]:
+    """Return whether a dataset is there that would be replaced, and what is in the way of that."""
+    try:
+        building.check_target(overwrite=True)
+    except CacheError as error:
+        return False, [str(error)]
+    try:
+        building.check_target(overwrite=False)
+    except CacheError:
+        return overwrite, [] if overwrite else ["a dataset is there; --overwrite replaces it"]
+    return False, []

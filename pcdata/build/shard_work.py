@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from pcdata.build.building_folder import SHARD, SIGNALS, BuildingFolder
-from pcdata.build.building_url import BuildingUrl
+from pcdata.build.building import SHARD, SIGNALS, Building
 from pcdata.build.capture_work import CaptureWork, keep_raw
 from pcdata.build.config import BuildConfig
 from pcdata.build.origins import Origin, counted
@@ -51,12 +50,12 @@ class Job:
     imports: tuple[ImportedFile, ...] = field(repr=False)  # first: what follows may be of classes from them
     work: CaptureWork
     plan: Plan
-    folder: BuildingFolder | BuildingUrl
+    folder: Building
     format: str
     compression: Compression
 
     @classmethod
-    def of(cls, config: BuildConfig, source: CaptureSource, plan: Plan, folder: BuildingFolder | BuildingUrl) -> Job:
+    def of(cls, config: BuildConfig, source: CaptureSource, plan: Plan, folder: Building) -> Job:
         """Return the job of a build."""
         output = config.output
         return cls(imported_files(), CaptureWork(config, source), plan, folder, output.format, output.compression)

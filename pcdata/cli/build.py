@@ -133,27 +133,24 @@ def _build(arguments: argparse.Namespace) -> int:
         raise ConfigError("build: needs --out DIR, the folder of the new dataset")
     source = config.source.open()
     part = _part(arguments)
+    asked = {
+        "overwrite": arguments.overwrite,
+        "restart": arguments.restart,
+        "timeout": arguments.timeout,
+        "max_bad": arguments.max_bad,
+        "engine": arguments.engine,
+        "part": part,
+        "finalize": arguments.finalize,
+        "hash_captures": arguments.hash_captures,
+        "retry_quarantined": arguments.retry_quarantined,
+        "workers": _workers(arguments, 1 if is_in_process(arguments.out) else plan_of(config, source).num_shards),
+    }
     if arguments.dry_run:
-        print(plan_text(config, source, arguments.out, hash_captures=arguments.hash_captures))
+        print(plan_text(config, source, arguments.out, **asked))
         return 0
     with ProgressBar("build") as progress:
         report = build_dataset(
-            config,
-            source,
-            arguments.out,
-            overwrite=arguments.overwrite,
-            restart=arguments.restart,
-            workers=_workers(arguments, 1 if is_in_process(arguments.out) else plan_of(config, source).num_shards),
-            timeout=arguments.timeout,
-            max_bad=arguments.max_bad,
-            engine=arguments.engine,
-            part=part,
-            finalize=arguments.finalize,
-            strict=arguments.strict,
-            hash_captures=arguments.hash_captures,
-            retry_quarantined=arguments.retry_quarantined,
-            progress=progress,
-            note=progress.note,
+            config, source, arguments.out, strict=arguments.strict, progress=progress, note=progress.note, **asked
         )
     print(build_text(report))
     if report.is_complete:

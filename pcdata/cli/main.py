@@ -89,7 +89,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
 def _refuse_empty(arguments: argparse.Namespace) -> None:
     """Refuse a path without a letter, which would stand for the folder that one is in."""
-    for name in ("path", "source", "config", "out", "file", "json", "figure", "calibration", "table"):
+    for name in ("path", "dataset", "source", "config", "out", "file", "json", "figure", "calibration", "table"):
         if getattr(arguments, name, None) == "":
             raise ConfigError(f"{name}: is empty; give a path, or leave it out (is a variable of the shell not set?)")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from pcdata.build import BuildConfig, BuildReport, outlook
 from pcdata.io.sources.capture_source import CaptureSource
@@ -33,22 +34,28 @@ def build_text(report: BuildReport) -> str:
     return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
 
 
-def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, *, hash_captures: bool = False) -> str:
-    """Tell what a build would do, how large the result may become, and what of it is finished."""
-    plan = outlook(config, source, folder, hash_captures=hash_captures)
-    left = plan.num_shards - plan.num_finished
+def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, **asked: Any) -> str:
+    """Tell what a build would do, how large the result may become, and what of it is finished.
+
+    ``asked`` is what :func:`pcdata.build.outlook` takes besides.
+    """
+    plan = outlook(config, source, folder, **asked)
+    tries_again = bool(asked.get("retry_quarantined"))
     rows = [
         ["captures", f"{plan.num_samples:,} in {plan.num_shards:,} shards of {plan.shard_size:,}"],
         ["read", "unknown" if plan.bytes_to_read is None else size_in_words(plan.bytes_to_read)],
         ["format", f"{config.output.format}, compression {config.output.compression}"],
         ["steps", ", ".join(type(step).__name__ for step in config.pipeline.split()[0].steps) or "none"],
         ["identity", plan.identity[:16]],
-        ["finished", f"{plan.num_finished:,} shards, {size_in_words(plan.bytes_finished)}"],
-        ["to do", f"{left:,} shards"],
+        ["kept" if tries_again else "finished", f"{plan.num_finished:,} shards, {size_in_words(plan.bytes_finished)}"],
+        ["to do", f"{plan.num_to_do:,} shards" + ("" if asked.get("part") is None else " of this job")],
     ]
     if plan.num_finished:
         rows.append(["about", f"{size_in_words(plan.bytes_finished / plan.num_finished * plan.num_shards)} in the end"])
     if plan.quarantined:
-        rows.append(["quarantined", f"{len(plan.quarantined)} so far"])
+        captures = f"{len(plan.quarantined)} captures"
+        rows.append(["tried again", captures] if tries_again else ["quarantined", f"{captures} so far"])
+    if plan.replaces:
+        rows.append(["replaces", "the dataset that is there, once this is built"])
     rows += [["in the way", text] for text in plan.hindrances]
     return text_table(["build", str(folder)], rows)

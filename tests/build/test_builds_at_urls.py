@@ -19,6 +19,7 @@ import torch
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset, outlook
 from pcdata.build.building_url import BuildingUrl
+from pcdata.build.placing_at_url import PlacingAtUrl
 from pcdata.errors import CacheError, ConfigError
 from pcdata.files import urls
 from pcdata.files.url_writing import WritableUrl
@@ -336,15 +337,15 @@ def test_two_builds_at_once_give_one_dataset(url, tmp_path, monkeypatch):
 
 @IN_MEMORY
 def test_two_that_put_it_into_place_at_once_give_one_dataset(url, tmp_path, monkeypatch):
-    wanted, whole = plain(tmp_path), BuildingUrl._begin_placing
+    wanted, whole = plain(tmp_path), PlacingAtUrl._begin
 
     def begin(self, names, replaced):
         gone = whole(self, names, replaced)
-        monkeypatch.setattr(BuildingUrl, "_begin_placing", whole)
+        monkeypatch.setattr(PlacingAtUrl, "_begin", whole)
         build(url, finalize=True)  # another process does it all, after this one has begun
         return gone
 
-    monkeypatch.setattr(BuildingUrl, "_begin_placing", begin)
+    monkeypatch.setattr(PlacingAtUrl, "_begin", begin)
     assert build(url).is_complete
     assert objects(url) == wanted
     assert beside(url) == {"set"}

@@ -90,6 +90,80 @@ def test_a_dry_run_tells_and_writes_nothing(capsys, config, captures, tmp_path):
     assert re.search(r"^finished +1 shards, ", out, re.MULTILINE)
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--max-bad", "two"], "max_bad must be"),
+        (["--engine", "rai"], "engine must be one of"),
+        (["--timeout", "-1"], "timeout must be"),
+        (["--timeout", "2", "--workers", "0"], "timeout needs a process"),
+        (["--retry-quarantined", "--restart"], "without restart"),
+        (["--finalize", "--num-shards", "2", "--shard-index", "0"], "finalize takes no part"),
+    ],
+    ids=" ".join,
+)
+def test_a_dry_run_refuses_what_the_build_would(capsys, config, captures, tmp_path, words, told):
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out", *words]
+    for line in (call, [*call, "--dry-run"]):
+        code, out, err = run(capsys, *line)
+        assert (code, out) == (2, "")
+        assert told in err
+
+
+def test_a_dry_run_tells_what_the_options_change(capsys, config, captures, tmp_path):
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=2"]
+
+    def dry(*words):
+        code, out, _ = run(capsys, *call, *words, "--dry-run")
+        assert code == 0
+        return dict(re.split("  +", line, maxsplit=1) for line in out.splitlines() if "  " in line)
+
+    assert dry("--num-shards", 2, "--shard-index", 1)["to do"] == "1 shards of this job"
+    assert "2 of 2 shards are not finished" in dry("--finalize")["in the way"]
+    assert "no captures of it are quarantined" in dry("--retry-quarantined")["in the way"]
+    assert run(capsys, *call, "--num-shards", 2, "--shard-index", 0)[0] == 0
+    assert dry()["finished"].startswith("1 shards")
+    assert dry("--restart")["to do"] == "2 shards"
+    assert "--restart deletes it" in dry("--format", "pt")["in the way"]
+    assert "in the way" not in dry("--format", "pt", "--restart")
+    assert run(capsys, *call)[0] == 0
+    assert "--overwrite replaces it" in dry()["in the way"]
+    assert "once this is built" in dry("--overwrite")["replaces"]
+
+
+def test_a_dry_run_of_a_retry_tells_what_is_kept_and_what_is_tried_again(capsys, config, captures, tmp_path):
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=1"]
+    file = captures / "depth" / "scan1.png"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:40])
+    assert run(capsys, *call, "--workers", 0)[0] == 3
+    file.write_bytes(whole)
+    _, out, _ = run(capsys, *call, "--retry-quarantined", "--dry-run")
+    told = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines() if "  " in line)
+    assert told["kept"].startswith("3 shards, ")
+    assert (told["to do"], told["tried again"]) == ("1 shards", "1 captures")
+    assert "once this is built" in told["replaces"]
+    assert "in the way" not in told
+    code, out, err = run(capsys, *call, "--retry-quarantined", "--workers", 0)
+    assert (code, "3 of 4 shards were finished before" in err) == (0, True)
+
+
+def test_a_job_that_is_started_again_after_the_last_one_has_nothing_to_do(capsys, config, captures, tmp_path):
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=1"]
+    for index in (0, 1):
+        assert run(capsys, *call, "--num-shards", 2, "--shard-index", index)[0] == 0
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    for words in (["--num-shards", 2, "--shard-index", 0], ["--finalize"]):
+        code, _, err = run(capsys, *call, *words)
+        assert code == 0
+        assert "the dataset was put into place before" in err
+    other = ["--set", "cloud.FarthestPointSample.num_points=7"]
+    code, _, err = run(capsys, *call, *other, "--num-shards", 2, "--shard-index", 0)
+    assert code == 1
+    assert "exists already" in err
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
 def test_jobs_take_their_index_from_the_environment(capsys, config, captures, tmp_path, monkeypatch):
     call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=1"]
     code, _, err = run(capsys, *call, "--num-shards", 2)

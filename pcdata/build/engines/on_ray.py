@@ -22,6 +22,7 @@ from pcdata.files.interrupts import shielded
 from pcdata.files.strict_json import json_object
 
 _WAIT = 1.0  # seconds between two looks at signals
+_STARTS = 4  # tries to start a Ray: each gives up after 30 s by itself, which a machine with other work may need
 
 
 def work_on_ray(job: Job, shards: Iterable[int], tally: Tally, *, tasks: int, timeout: float | None) -> None:
@@ -68,13 +69,25 @@ def work_on_ray(job: Job, shards: Iterable[int], tally: Tally, *, tasks: int, ti
 
 
 def _start(ray: Any) -> None:
-    try:
-        ray.init(log_to_driver=False, logging_level="warning")
-    except Exception as error:  # of many types: no such cluster, another version, a machine that is too busy
-        raise CacheError(
-            f"build_dataset: no Ray can be reached or started: {str(error) or type(error).__name__:.500}; see "
-            "RAY_ADDRESS and 'ray status', or build with --engine pool"
-        ) from error
+    """Reach the Ray of ``RAY_ADDRESS`` or of this machine, or start one; on a busy machine that takes several tries.
+
+    Raises:
+        CacheError: there is none.
+    """
+    tries = 1 if os.environ.get("RAY_ADDRESS") else _STARTS
+    for number in range(1, tries + 1):
+        try:
+            # A dashboard, of a Ray that ends with the build, is several processes that nobody looks at.
+            ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
+            return
+        except Exception as error:  # of many types: no such cluster, another version, a machine that is too busy
+            with suppress(Exception):  # what came up of it
+                ray.shutdown()
+            if number == tries:
+                raise CacheError(
+                    f"build_dataset: no Ray can be reached or started: {str(error) or type(error).__name__:.500}; see "
+                    "RAY_ADDRESS and 'ray status', or build with --engine pool"
+                ) from error
 
 
 def _take(ray: Any, done: Any, task: Task, job: Job, schedule: Schedule, tally: Tally) -> None:

@@ -17,7 +17,8 @@ from pcdata.files.scratch import retired_of
 from pcdata.files.urls import url_hint
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
-from pcdata.io.store.sample_index import Sample, SampleIndex
+from pcdata.io.store.left_out import KINDS, MOST_IN_JSON, read_left_out, write_left_out
+from pcdata.io.store.sample_index import Sample, SampleIndex, written
 from pcdata.io.store.shards import SIGNALS_FOLDER, hashes_below, read_tables
 from pcdata.io.store.stores import STORES, Compression
 from pcdata.structures import Episode
@@ -84,11 +85,17 @@ class Manifest:
         content["num_samples"] = len(self.index)
         content["signals_files"] = hashes_below(folder / SIGNALS_FOLDER)
         content["index"] = self.index.write(folder, read_tables(folder))
-        with open(folder / FILE_NAME, "x", encoding="utf-8") as file:
-            json.dump({**content, _CHECKSUM: checksum_of(content)}, file, indent=1, allow_nan=False)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
+        for kind in KINDS:
+            if len(content[kind]) > MOST_IN_JSON:
+                content[kind] = write_left_out(folder, kind, content[kind])
+        text = json.dumps({**content, _CHECKSUM: checksum_of(content)}, indent=1, allow_nan=False) + "\n"
+        if len(text) > _MAX_BYTES:
+            largest = max(content, key=lambda name: len(json.dumps(content[name])))
+            raise CacheError(
+                f"{folder / FILE_NAME}: would have {len(text):,} bytes, most of them its {largest}, and at most "
+                f"{_MAX_BYTES:,} are read; build fewer captures into one dataset"
+            )
+        written(folder / FILE_NAME, text.encode())
 
     @classmethod
     def read(cls, folder: str | Path) -> Manifest:
@@ -140,6 +147,8 @@ class Manifest:
             for name in ("imports", "streams", "steps", "origins", "alarms"):
                 if isinstance(content.get(name), list):
                     listed[name] = tuple(content.pop(name))
+            for kind in KINDS:
+                content[kind] = read_left_out(folder, kind, content.get(kind, {}))
             if "episodes" in content:
                 listed["episodes"] = tuple(
                     episodes_from_json("the dataset", content.pop("episodes"), len(samples), error=CacheError)
@@ -182,8 +191,6 @@ def _check(manifest: Manifest) -> None:
         ("identity", str),
         ("pipeline", dict),
         ("versions", dict),
-        ("skipped", dict),
-        ("quarantined", dict),
         ("model", dict),
         ("source", dict),
         ("signals", dict),

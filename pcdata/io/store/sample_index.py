@@ -242,11 +242,7 @@ class SampleIndex(Sequence[Sample]):
         self._take({**self.arrays, _TABLES: np.frombuffer(b"".join(tables), np.uint8).reshape(-1, 32)})
         for name, (dtype, row) in FILES.items():
             content = npy_bytes(np.ascontiguousarray(self.arrays[name], dtype).reshape(-1, *row))
-            with open(folder / FOLDER / name, "xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            told[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            told[name] = written(folder / FOLDER / name, content)
         return told
 
     @classmethod
@@ -264,7 +260,7 @@ class SampleIndex(Sequence[Sample]):
         if not isinstance(told, dict) or set(told) != {*FILES}:
             raise CacheError(f"index must tell of {', '.join(FILES)}, got {told!r:.200}")
         index = cls.__new__(cls)
-        index._take({name: _mapped(folder, name, told[name]) for name in FILES})
+        index._take({name: mapped_array(folder, name, told[name], form) for name, form in FILES.items()})
         if not len(index.tables):
             raise CacheError("it has no shards; rebuild the dataset")
         index._check()
@@ -294,13 +290,36 @@ def _of_arrays(arrays: Mapping[str, NDArray[Any]]) -> SampleIndex:
     return index
 
 
-def _mapped(folder: Path, name: str, told: Any) -> NDArray[Any]:
-    """Return the array of one file, read-only and still on disk."""
-    return _mapped_at(folder / FOLDER / name, folder, name, told)
+def written(path: Path, content: bytes | memoryview) -> dict[str, Any]:
+    """Write a new file and force it to disk; return its size and SHA-256.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    with open(path, "xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def mapped_array(folder: Path, name: str, told: Any, form: tuple[str, tuple[int, ...]]) -> NDArray[Any]:
+    """Return the array of one file of the index, read-only and still on disk.
+
+    Args:
+        folder: of the dataset.
+        name: of the file.
+        told: its size and SHA-256.
+        form: its dtype, and the shape of a row.
+
+    Raises:
+        CacheError: missing, changed, damaged or hostile.
+    """
+    return _mapped_at(folder / FOLDER / name, folder, name, told, form)
 
 
 @locates_path
-def _mapped_at(path: Path, folder: Path, name: str, told: Any) -> NDArray[Any]:
+def _mapped_at(path: Path, folder: Path, name: str, told: Any, form: tuple[str, tuple[int, ...]]) -> NDArray[Any]:
     size, sha256 = (told.get("bytes"), told.get("sha256")) if isinstance(told, dict) else (None, None)
     if type(size) is not int or not isinstance(sha256, str):
         raise CacheError(f"index must give bytes and sha256 of {name}, got {told!r:.200}")
@@ -320,7 +339,7 @@ def _mapped_at(path: Path, folder: Path, name: str, told: Any) -> NDArray[Any]:
         header = parse_header(bytes(content[: header_length(bytes(content[:PREFIX]))]), size)
     except CacheError as error:
         raise CacheError(f"{where}: {error}") from error
-    dtype, row = FILES[name]
+    dtype, row = form
     if header.dtype.str != dtype or header.shape[1:] != row or not header.shape or (header.by_columns and row):
         raise CacheError(f"{where} must be {dtype} (S, {', '.join(map(str, row))}), got {header.dtype} {header.shape}")
     if not header.nbytes:

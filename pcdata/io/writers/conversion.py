@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CacheError, ConfigError, PcdataError, add_note, write_fault
+from pcdata.errors import CacheError, PcdataError, add_note, write_fault
 from pcdata.files.whole_folders import complete_or_nothing, is_free
 from pcdata.io.sources.apart import check_apart
 from pcdata.io.sources.capture_source import checked_ids, episodes_of, skipped_of, unread_of
