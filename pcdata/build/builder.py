@@ -23,8 +23,7 @@ from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.scratch import Note
 from pcdata.files.urls import is_in_process, is_url, path_of
-from pcdata.io.sources.apart import check_apart
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of, skipped_of
+from pcdata.io.sources.capture_source import CaptureSource, check_apart, checked_ids, episodes_of, skipped_of
 from pcdata.progress import Progress
 from pcdata.structures import PointCloud
 from pcdata.validation.step_losses import judge_step_losses

@@ -43,11 +43,7 @@ class Building(ABC):
         self.target = target
         self.kept_at = kept_at
         self.path = path
-
-    @property
-    def dataset(self) -> Path:
-        """The folder, on this machine, of what becomes the dataset."""
-        return self.path / "dataset"
+        self.dataset = path / "dataset"  # what becomes the dataset
 
     # -- the name that the dataset gets ----------------------------------------------------------------------------
 
@@ -216,5 +212,9 @@ def mark_name(shard: int) -> str:
 
 def shards_recorded(names: Iterable[str], plan: Plan) -> list[int]:
     """Return the shards of a plan that files of a folder of records are of, by their names there."""
-    numbers = [name.partition(".")[0] for name in names if name.endswith(".json")]
-    return sorted(int(one) for one in numbers if one.isdecimal() and int(one) < plan.num_shards)
+    found = []
+    for name in sorted(names):
+        number, _, suffix = name.partition(".")
+        if suffix == "json" and number.isdecimal() and int(number) < plan.num_shards:
+            found.append(int(number))
+    return found

@@ -65,8 +65,10 @@ class BuildingFolder(Building):
 
     def put_into_place(self, plan: Plan, records: Mapping[int, ShardRecord], replaced: object, note: Note) -> None:
         put_into_place(self.dataset, self.target, replaced, check_only_dataset, note)
-        with shielded():
-            keep_for_retry(self, records.values())
+        is_kept = any(record.quarantined for record in records.values())
+        if is_kept or self.kept_for_retry.exists():
+            with shielded():
+                keep_for_retry(self, records.values())
         self.remove()
 
     # -- who works on it -------------------------------------------------------------------------------------------
@@ -153,7 +155,7 @@ class BuildingFolder(Building):
     def finished(self, plan: Plan) -> dict[int, ShardRecord]:
         found: dict[int, ShardRecord] = {}
         try:
-            names = sorted(os.listdir(self.path / RECORDS))
+            names = os.listdir(self.path / RECORDS)
         except OSError:  # the last process has put it into place
             return found
         for shard in shards_recorded(names, plan):

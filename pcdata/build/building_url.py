@@ -99,7 +99,7 @@ class BuildingUrl(Building):
     @contextmanager
     def opened(self, plan: Plan, what: str, *, restart: bool, note: Note) -> Iterator[None]:
         with scratch_beside(self._scratch, note=note) as scratch:
-            self.path = scratch
+            self.path, self.dataset = scratch, scratch / "dataset"
             self._settle(plan, what, restart, note)
             try:
                 yield

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pcdata.build.card_answers import UNKNOWN
 from pcdata.build.card_facts import CardFacts
-from pcdata.build.escaped_text import as_markdown
 from pcdata.build.origins import OTHERS, counted
 from pcdata.validation.step_losses import PERCENTILES
 from pcdata.yaml_nodes import yaml_text
@@ -213,3 +213,29 @@ def _fenced(text: str, language: str) -> str:
     longest = max((len(run) for run in re.findall("`+", text)), default=0)
     fence = "`" * max(3, longest + 1)
     return f"{fence}{language}\n{text}{fence}"
+
+
+# -- text of any origin: it shows as it is, and can become no heading, link, image, tag or table ---------------------
+
+# Every sign that Markdown or HTML could read, where it could: as an entity it is text in both.
+_SIGNS = re.compile(
+    r"[&<>`*\[\]|\\~$#!{}@]|(?<![0-9A-Za-z])_|_(?![0-9A-Za-z])|:(?=//)|(?<=www)\.|^[-+=]|^[0-9]+(?=[.)]\s)",
+    re.IGNORECASE,
+)
+_LONGEST = 300
+
+
+def as_markdown(text: object) -> str:
+    """Return a text in one line of Markdown that shows it, signs that cannot be seen as ``U+200B``."""
+    shown = str(text)
+    if not shown.isprintable():
+        shown = "".join(map(_visible, shown))
+    shown = shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
+    return _SIGNS.sub(lambda found: "".join(f"&#{ord(sign)};" for sign in found[0]), shown.strip()) or "(empty)"
+
+
+def _visible(sign: str) -> str:
+    if sign in "\t\n\r":
+        return " "
+    # Controls, marks that turn the direction of writing, lone surrogates: nobody sees what they do.
+    return f"(U+{ord(sign):04X})" if unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp", "Co", "Cn") else sign

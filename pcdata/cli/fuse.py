@@ -45,7 +45,7 @@ def add_to(commands: Any) -> None:
 def _fuse(arguments: argparse.Namespace) -> None:
     out = _checked_target(arguments)  # before the work, not after
     from pcdata.io import write_ply, write_volume
-    from pcdata.io.sources.apart import check_apart
+    from pcdata.io.sources.capture_source import check_apart
     from pcdata.structures import TSDFVolume
 
     volume = TSDFVolume(

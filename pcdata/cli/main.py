@@ -110,7 +110,7 @@ def _refuse_replacing(arguments: argparse.Namespace) -> None:
         place = getattr(arguments, written, None)
         for read in ("path", "source"):
             if isinstance(place, str) and place != "-" and isinstance(path := getattr(arguments, read, None), str):
-                from pcdata.io.sources.apart import check_apart
+                from pcdata.io.sources.capture_source import check_apart
 
                 check_apart(f"--{written}", place, path)
 

@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.datasets.cached import CachedCloudDataset
-from pcdata.datasets.near_duplicates import FEWEST, SIZE, Surface, candidates, descriptor, duplicate_distance
+from pcdata.datasets.near_duplicates import (
+    FEWEST,
+    SIZE,
+    Surface,
+    candidates,
+    descriptor,
+    duplicate_distance,
+    thinned_rows,
+    thinning,
+)
 from pcdata.datasets.splits import Splits
 from pcdata.errors import ConfigError
 from pcdata.progress import Progress
@@ -78,9 +87,11 @@ def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress:
         descriptors[row] = descriptor(points.astype(np.float64))
         if progress is not None:
             progress(row + 1, len(ids), sample_id)
+    draw = np.random.default_rng(0)
+    thinnings = [thinning(_points(dataset, row), draw) for row in thinned_rows(counts, draw).tolist()]
     leaks, compared = [], 0
     kept: tuple[int, Surface] | None = None  # a cloud is compared with several others in a row
-    for row, other in candidates(descriptors, counts, parts):
+    for row, other in candidates(descriptors, counts, parts, np.array(thinnings).reshape(-1, SIZE)):
         compared += 1
         points = _points(dataset, other)
         if kept is None or kept[0] != row:

@@ -8,7 +8,10 @@ no duplicate: what one view shows and the other does not lies apart.
 Comparing all pairs is out of reach, so a descriptor that none of that changes much finds the candidates: quantiles of
 the distance from the centroid, the standard deviations along the principal axes, and quantiles of how far points are
 from the median along each of these (shape distributions after Osada et al., ACM Transactions on Graphics 21(4), 2002,
-of the distances to a point and to three planes instead of between points).
+of the distances to a point and to three planes instead of between points). Its numbers rise and fall together, and how
+much a thinned out copy differs in each is a matter of the clouds at hand. So halves of some of them say how it differs,
+and descriptors are compared along the directions in which clouds differ most from one another and copies least (linear
+discriminant analysis: Fisher, The use of multiple measurements in taxonomic problems, 1936).
 """
 
 from __future__ import annotations
@@ -29,11 +32,16 @@ _AXIAL = np.linspace(0.0, 1.0, 12)[1:-1]
 _NUM_RADIAL = len(_RADIAL) + 3
 SIZE = _NUM_RADIAL + 3 * len(_AXIAL)  # numbers of a descriptor
 
-_CANDIDATES = 8  # nearest descriptors that are looked at
-# How far descriptors of duplicates are apart, as shares of the size: quantiles of n points that were drawn from one
-# surface differ by about 1 / sqrt(n). Measured on clouds thinned out to a half and a quarter, 95 of 100 lie within.
-_ALIKE_RADIAL, _LEAST_RADIAL = 1.0, 0.01
-_ALIKE_AXIAL, _LEAST_AXIAL = 2.6, 0.03
+# Directions that descriptors are compared along, and nearest ones that are looked at: along those of all numbers, and
+# along those of the numbers without axes, since axes of nearly equal spreads change places in a copy.
+_SPACES = ((SIZE, 30, 16, 1.0), (_NUM_RADIAL, 12, 4, 0.7))
+# How far descriptors of copies are apart where the noise of n points is 1 / sqrt(n), and how much more where n is
+# small: measured on clouds thinned out to a half and a quarter.
+_APART, _OF_FEW = 1.3, 16.7
+_LEAST_SPREAD = 1e-3  # of the size
+_HALVES = 400  # of clouds that tell how copies differ
+_RIDGE, _LEAST_NOISE = 1e-3, 1e-4  # what keeps the analysis stable: of the variance of each number, and of any
+_BLOCK = 1 << 22  # distances at a time
 _NEARLY_ALL = 0.98  # of the points
 _NOISE_M = 0.003  # metres: three standard deviations of the noise of a depth camera close by
 _NOISE = 0.01  # of the size of a cloud that is in no metres
@@ -51,15 +59,33 @@ _FIT = 8  # neighbors that a local plane is fitted to
 
 def descriptor(points: Points) -> NDArray[np.float32]:  # (SIZE,)
     """Return what is alike for near duplicates; all zero where there are too few points."""
-    if len(points) < FEWEST:
-        return np.zeros(SIZE, np.float32)
+    return _described(points) if len(points) >= FEWEST else np.zeros(SIZE, np.float32)
+
+
+def thinning(points: Points, draw: np.random.Generator) -> NDArray[np.float32]:  # (SIZE,)
+    """Return how the descriptor of a random half of a cloud differs, for points whose noise is 1."""
+    half = points[draw.permutation(len(points))[: len(points) // 2]]
+    return np.asarray((_described(half) - _described(points)) * np.sqrt(len(points)), np.float32)
+
+
+def thinned_rows(counts: NDArray[np.int64], draw: np.random.Generator) -> NDArray[np.int64]:
+    """Return which clouds :func:`thinning` should be asked of, some several times where they are few."""
+    filled = np.flatnonzero(counts >= FEWEST)
+    if 0 < len(filled) < _HALVES:
+        return np.sort(np.resize(filled, _HALVES))
+    return np.sort(draw.permutation(filled)[:_HALVES])
+
+
+def _described(points: Points) -> NDArray[np.float32]:
     centered = points - points.mean(0)
     variances, axes = np.linalg.eigh(centered.T @ centered / len(points))
     spread = np.sqrt(np.clip(variances, 0.0, None))
-    distances = _quantiles(np.linalg.norm(centered, axis=1), _RADIAL)
+    size = float(np.linalg.norm(spread))  # the root of the mean squared distance from the centroid
+    lengths = np.concatenate([_quantiles(np.linalg.norm(centered, axis=1), _RADIAL), spread])
     along = centered @ axes
     away = _quantiles(np.abs(along - np.median(along, axis=0)), _AXIAL) / np.maximum(spread, 1e-12)
-    return np.concatenate([distances, spread, away.T.ravel()]).astype(np.float32)
+    lengths = np.log(np.maximum(lengths, max(_LEAST_SPREAD * size, 1e-12)))
+    return np.concatenate([lengths, away.T.ravel()]).astype(np.float32)
 
 
 def _quantiles(values: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,31 +101,65 @@ def candidates(
     descriptors: NDArray[np.float32],  # (N, SIZE)
     counts: NDArray[np.int64],  # (N,) points
     parts: Sequence[NDArray[np.int64]],  # rows of each part
+    thinnings: NDArray[np.float32],  # (M, SIZE)
 ) -> Iterator[tuple[int, int]]:
     """Yield pairs of rows of different parts that could be near duplicates, those of the smaller part in turn."""
-    from scipy.spatial import cKDTree
-
-    filled = [part[descriptors[part].any(axis=1)] for part in parts]
-    radial, axial = descriptors[:, :_NUM_RADIAL], descriptors[:, _NUM_RADIAL:]
-    size = np.linalg.norm(radial[:, -3:], axis=1)  # the root of the mean squared distance from the centroid
-    trees = [cKDTree(radial[part]) if len(part) else None for part in filled]
+    filled = [part[counts[part] >= FEWEST] for part in parts]
+    known = np.concatenate(filled)
+    if not len(known):
+        return
+    spaces = [
+        (
+            _compared(descriptors[:, :size].astype(np.float64), known, thinnings[:, :size].astype(np.float64), most),
+            *rest,
+        )
+        for size, most, *rest in _SPACES
+    ]
     order = sorted(range(len(filled)), key=lambda number: len(filled[number]))
     for small, large in itertools.combinations(order, 2):
-        tree, asked = trees[large], filled[small]
-        if tree is None or not len(asked):
+        asked, others = filled[small], filled[large]
+        if not len(others):
             continue
-        count = min(_CANDIDATES, len(filled[large]))
-        distances, found = tree.query(radial[asked], k=[*range(1, count + 1)])
-        others = filled[large][found]
-        noise = 1.0 / np.sqrt(np.minimum(counts[asked][:, None], counts[others]))
-        apart = distances / np.sqrt(_NUM_RADIAL) / size[asked][:, None]
-        is_near = apart <= np.maximum(_LEAST_RADIAL, _ALIKE_RADIAL * noise)
-        for row, column in zip(*np.nonzero(is_near)):
-            first, second = int(asked[row]), int(others[row, column])
-            differences = (axial[first] - axial[second]).reshape(3, -1)
-            limit = max(_LEAST_AXIAL, _ALIKE_AXIAL * noise[row, column])
-            if np.sqrt((differences**2).mean(1)).max() <= limit:
-                yield first, second
+        step = max(1, _BLOCK // len(others))
+        for rows in (asked[first : first + step] for first in range(0, len(asked), step)):
+            pairs = set[tuple[int, int]]()
+            for values, count, share in spaces:
+                pairs |= _near(values, counts, rows, others, int(count), share)
+            yield from sorted(pairs)
+
+
+def _compared(
+    values: NDArray[np.float64], known: NDArray[np.int64], thinnings: NDArray[np.float64], most: int
+) -> NDArray[np.float64]:
+    """Return descriptors along the directions that tell clouds from copies best, where copies differ by 1."""
+    from scipy.linalg import eigh
+
+    within = thinnings.T @ thinnings / len(thinnings)
+    within[np.diag_indices_from(within)] *= 1 + _RIDGE
+    within[np.diag_indices_from(within)] += _LEAST_NOISE
+    centered = values[known] - values[known].mean(0)
+    directions = eigh(centered.T @ centered / len(known), within)[1][:, ::-1][:, :most]
+    return np.asarray((values - values[known].mean(0)) @ directions / np.sqrt(most))
+
+
+def _near(
+    values: NDArray[np.float64],  # (N, D)
+    counts: NDArray[np.int64],  # (N,)
+    rows: NDArray[np.int64],
+    others: NDArray[np.int64],
+    count: int,
+    share: float,
+) -> set[tuple[int, int]]:
+    """Return the pairs of the nearest rows that are no further apart than copies are, times a share."""
+    one, two = values[rows], values[others]
+    squared = (one**2).sum(1)[:, None] + (two**2).sum(1) - 2 * one @ two.T
+    count = min(count, len(others))
+    nearest = np.argpartition(squared, count - 1, axis=1)[:, :count]
+    near = others[nearest]
+    fewer = np.minimum(counts[rows][:, None], counts[near])
+    limit = share**2 * (_APART**2 * (1 / counts[rows][:, None] + 1 / counts[near]) + (_OF_FEW / fewer) ** 2)
+    row, column = np.nonzero(np.take_along_axis(squared, nearest, 1) <= limit)
+    return {*zip(rows[row].tolist(), near[row, column].tolist())}
 
 
 def duplicate_distance(first: Points, second: Surface) -> float | None:
@@ -115,13 +175,14 @@ def duplicate_distance(first: Points, second: Surface) -> float | None:
         motion = start
         for step in range(_STEPS):
             moved = _applied(motion, few)
-            near, along = second.offsets(moved)
+            near, middle, normal = second.nearest(moved)
+            along = np.minimum(np.abs(((middle - moved) * normal).sum(1)), near)
             share = float(((near <= second.reach) & (along <= 3 * second.noise)).mean())
             if share < _ON_THE_WAY.get(step, 0.0):
                 break
             if share >= _NEARLY_ALL:
                 return _settled(motion, sparse, few, second)
-            motion = second.toward(moved, near) @ motion
+            motion = second.toward(moved, near, middle, normal) @ motion
     return None
 
 
@@ -176,7 +237,8 @@ class Surface:
         size = float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
         self.noise = max(_NOISE_M if in_metres else _NOISE * size, _OF_SPACING * self.spacing)
         self.reach = max(_BESIDE * self.spacing, self.noise)
-        self._planes: tuple[Points, Points] | None = None
+        self._is_fitted = np.zeros(len(points), bool)  # of which points the local plane is known
+        self._middle, self._normal = np.empty_like(points), np.empty_like(points)
 
     def radius_of(self, points: Points, count: float) -> NDArray[np.float64]:
         """Return how far around each of its points so many others lie: the nearest are counted, more are reckoned."""
@@ -184,14 +246,14 @@ class Surface:
         distance = self._tree.query(points, k=[nearest + 1])[0][:, 0]  # the nearest is the point itself
         return np.asarray(distance * np.sqrt(count / nearest))  # on a surface their number grows with the area
 
-    def _nearest(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
+    def nearest(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
         """Return of every point the distance to the nearest one, a point of the local plane there, and its normal."""
         distance, near = self._tree.query(points)
-        if len(self.points) > _MOST:
-            return (distance, *self._fitted(near))
-        if self._planes is None:
-            self._planes = self._fitted(np.arange(len(self.points)))
-        return distance, self._planes[0][near], self._planes[1][near]
+        fresh = np.unique(near[~self._is_fitted[near]])
+        if len(fresh):
+            self._middle[fresh], self._normal[fresh] = self._fitted(fresh)
+            self._is_fitted[fresh] = True
+        return distance, self._middle[near], self._normal[near]
 
     def _fitted(self, rows: NDArray[np.int64]) -> tuple[Points, Points]:
         own = self.points[self._tree.query(self.points[rows], k=[*range(1, _FIT + 1)])[1]]
@@ -201,7 +263,7 @@ class Surface:
 
     def offsets(self, points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return of every point the distance to the nearest one, and along the normal there to the local plane."""
-        distance, middle, normal = self._nearest(points)
+        distance, middle, normal = self.nearest(points)
         along = np.abs(((middle - points) * normal).sum(1))
         return distance, np.minimum(along, distance)  # at an edge a copy is on the point, if not on the plane
 
@@ -211,13 +273,15 @@ class Surface:
         on_it = (along <= self.noise) & (distance <= self.reach)
         return float(np.sqrt((along**2).mean())) if on_it.mean() >= _NEARLY_ALL else None
 
-    def toward(self, points: Points, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motion (4, 4) that brings points onto the surface: one step, from point to plane.
+    def toward(
+        self, points: Points, distance: NDArray[np.float64], plane: Points, normal: Points
+    ) -> NDArray[np.float64]:
+        """Return the motion (4, 4) that brings points onto the surface, as :meth:`nearest` told: one step.
 
         Source: Chen and Medioni, Object modelling by registration of multiple range images, 1992.
         """
         near = distance <= max(self.reach, float(np.quantile(distance, 0.8)))
-        _, plane, normal = self._nearest(points[near])
+        plane, normal = plane[near], normal[near]
         middle = points.mean(0)
         rows = np.hstack([np.cross(points[near] - middle, normal), normal])
         turn = np.linalg.lstsq(rows, ((plane - points[near]) * normal).sum(1), rcond=1e-6)[0]

@@ -27,8 +27,7 @@ from pcdata.exports.targets import target_named
 from pcdata.files.inputs import recording
 from pcdata.files.scratch import scratch_beside
 from pcdata.files.whole_folders import complete_or_nothing, is_free, rename_to_free, restore_retired
-from pcdata.io.sources.apart import check_apart
-from pcdata.io.sources.capture_source import REFUSALS, CaptureSource, episodes_of, inputs_of
+from pcdata.io.sources.capture_source import REFUSALS, CaptureSource, check_apart, episodes_of, inputs_of
 from pcdata.progress import Progress
 from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
 

@@ -11,7 +11,7 @@ import yaml
 
 from pcdata import PointCloud, build_dataset, split_dataset
 from pcdata.build import config_from_yaml, write_card
-from pcdata.build.escaped_text import as_markdown
+from pcdata.build.card_text import as_markdown
 from pcdata.build.origins import commonest
 from pcdata.cli.main import main
 from pcdata.errors import ConfigError

@@ -10,7 +10,15 @@ from pcdata import PointCloud, split_dataset
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli.main import main
 from pcdata.datasets.leak_check import check_leaks
-from pcdata.datasets.near_duplicates import SIZE, Surface, candidates, descriptor, duplicate_distance
+from pcdata.datasets.near_duplicates import (
+    SIZE,
+    Surface,
+    candidates,
+    descriptor,
+    duplicate_distance,
+    thinned_rows,
+    thinning,
+)
 from pcdata.geometry import rigid
 from pcdata.synthetic import SyntheticSource
 
@@ -65,7 +73,9 @@ def test_copies_are_found_by_their_descriptors_and_by_their_points(views, name):
         copy = COPIES[name](points, np.random.default_rng(number))
         descriptors = np.stack([descriptor(points), descriptor(copy)])
         counts = np.array([len(points), len(copy)])
-        assert [*candidates(descriptors, counts, [np.array([0]), np.array([1])])] == [(0, 1)]
+        generator = np.random.default_rng(number)
+        halves = np.stack([thinning(one, generator) for one in (points, copy) for _ in range(100)])
+        assert [*candidates(descriptors, counts, [np.array([0]), np.array([1])], halves)] == [(0, 1)]
         found = distance(points, copy)
         assert found is not None
         assert found <= 0.0015
@@ -106,7 +116,26 @@ def test_clouds_that_are_in_no_metres_are_judged_by_their_size(views):
 
 def test_clouds_of_too_few_points_are_no_candidates():
     assert not descriptor(np.zeros((3, 3))).any()
-    assert [*candidates(np.zeros((4, SIZE), np.float32), np.zeros(4, int), [np.array([0, 1]), np.array([2, 3])])] == []
+    none, parts = np.zeros((4, SIZE), np.float32), [np.array([0, 1]), np.array([2, 3])]
+    assert [*candidates(none, np.zeros(4, int), parts, np.zeros((0, SIZE), np.float32))] == []
+    assert len(thinned_rows(np.array([3, 99]), np.random.default_rng(0))) == 0
+    assert {*thinned_rows(np.array([3, 100, 5000]), np.random.default_rng(0)).tolist()} == {1, 2}
+
+
+def test_halves_and_quarters_are_found_among_many_clouds_that_are_alike():
+    draw = np.random.default_rng(4)
+    angles = draw.uniform(0, 2 * np.pi, (400, 1024))
+    radii = 0.3 + draw.normal(0, 0.02, (400, 1))  # rings whose radius, height and wave differ a little
+    heights = draw.normal(0.1, 0.01, (400, 1)) * draw.random((400, 1024))
+    waves = radii + draw.normal(0, 0.02, (400, 1)) * np.cos(3 * angles)
+    clouds = [*np.stack([waves * np.cos(angles), 0.8 * waves * np.sin(angles), heights], 2)]
+    copies = [draw.permutation(cloud)[: 512 if row % 2 else 256] for row, cloud in enumerate(clouds[:40])]
+    every = [*clouds, *copies]
+    counts, parts = np.array([len(cloud) for cloud in every]), [np.arange(400), np.arange(400, 440)]
+    halves = np.stack([thinning(every[row], draw) for row in thinned_rows(counts, draw)])
+    pairs = {*candidates(np.stack([descriptor(cloud) for cloud in every]), counts, parts, halves)}
+    assert sum((400 + row, row) in pairs for row in range(40)) >= 38
+    assert len(pairs) < 40 * 20
 
 
 class Copied:

@@ -1,12 +1,11 @@
-"""The captures that a dataset lacks, by id, with why: in ``dataset.json`` while they are few, else as arrays of texts.
+"""The captures that a dataset lacks, by id, with why: in ``dataset.json`` while they are few, else as arrays.
 
-A million of them would make ``dataset.json`` larger than any JSON that is read. So more than :data:`MOST_IN_JSON` lie
-in ``index/`` as texts end to end with row pointers, of which nothing is looked at before somebody asks.
+A million of them would make ``dataset.json`` larger than any JSON that is read. So more than ``MOST_IN_JSON`` of the
+manifest lie in ``index/`` as texts end to end with row pointers, of which nothing is looked at before somebody asks.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,10 @@ import numpy as np
 
 from pcdata.errors import CacheError
 from pcdata.files.npy import npy_bytes
+from pcdata.io.store.manifest import KINDS
 from pcdata.io.store.sample_index import FOLDER, mapped_array, written
 from pcdata.io.store.text_table import TextTable
 
-MOST_IN_JSON = 1000
-KINDS = ("skipped", "quarantined")
 _PARTS = {"ids": "|u1", "id_ends": "<i8", "reasons": "|u1", "reason_ends": "<i8"}
 FILES = tuple(f"{kind}_{part}.npy" for kind in KINDS for part in _PARTS)
 
@@ -29,7 +27,7 @@ class LeftOut(Mapping[str, str]):
 
     Args:
         folder: of the dataset.
-        kind: of :data:`KINDS`.
+        kind: ``skipped`` or ``quarantined``.
         told: what :func:`write_left_out` returned.
     """
 
@@ -94,19 +92,6 @@ def write_left_out(folder: Path, kind: str, left: Mapping[str, str]) -> dict[str
     for part, dtype in _PARTS.items():
         content = npy_bytes(np.ascontiguousarray(arrays[part], dtype))
         told[part] = written(folder / FOLDER / f"{kind}_{part}.npy", content)
-    return told
-
-
-def read_left_out(folder: str | os.PathLike[str], kind: str, told: Any) -> Mapping[str, str]:
-    """Return what ``dataset.json`` says of captures that were left out: itself, or what lies in arrays.
-
-    Raises:
-        CacheError: it is neither.
-    """
-    if not isinstance(told, dict):
-        raise CacheError(f"{kind} must be a dict, got {told!r:.100}")
-    if any(not isinstance(value, str) for value in told.values()):
-        return LeftOut(Path(os.path.abspath(folder)), kind, told)
     return told
 
 

@@ -17,7 +17,6 @@ from pcdata.files.scratch import retired_of
 from pcdata.files.urls import url_hint
 from pcdata.files.whole_folders import DATASET
 from pcdata.io.store.cloud_record import parse_info
-from pcdata.io.store.left_out import KINDS, MOST_IN_JSON, read_left_out, write_left_out
 from pcdata.io.store.sample_index import Sample, SampleIndex, written
 from pcdata.io.store.shards import SIGNALS_FOLDER, hashes_below, read_tables
 from pcdata.io.store.stores import STORES, Compression
@@ -29,6 +28,7 @@ FILE_NAME = DATASET
 
 _CHECKSUM = "checksum"
 _MAX_BYTES = 256 * 2**20  # a million episodes
+KINDS, MOST_IN_JSON = ("skipped", "quarantined"), 1000  # of captures that are left out; more lie in arrays
 _DEFINED = ("transforms", "layouts", "combinators")  # what a file of one's own may define
 
 
@@ -87,6 +87,8 @@ class Manifest:
         content["index"] = self.index.write(folder, read_tables(folder))
         for kind in KINDS:
             if len(content[kind]) > MOST_IN_JSON:
+                from pcdata.io.store.left_out import write_left_out
+
                 content[kind] = write_left_out(folder, kind, content[kind])
         text = json.dumps({**content, _CHECKSUM: checksum_of(content)}, indent=1, allow_nan=False) + "\n"
         if len(text) > _MAX_BYTES:
@@ -148,7 +150,11 @@ class Manifest:
                 if isinstance(content.get(name), list):
                     listed[name] = tuple(content.pop(name))
             for kind in KINDS:
-                content[kind] = read_left_out(folder, kind, content.get(kind, {}))
+                told = content.get(kind)
+                if isinstance(told, dict) and not {*map(type, told.values())} <= {str}:
+                    from pcdata.io.store.left_out import LeftOut  # of many: most datasets have none
+
+                    content[kind] = LeftOut(Path(os.path.abspath(folder)), kind, told)
             if "episodes" in content:
                 listed["episodes"] = tuple(
                     episodes_from_json("the dataset", content.pop("episodes"), len(samples), error=CacheError)
@@ -191,6 +197,8 @@ def _check(manifest: Manifest) -> None:
         ("identity", str),
         ("pipeline", dict),
         ("versions", dict),
+        ("skipped", Mapping),
+        ("quarantined", Mapping),
         ("model", dict),
         ("source", dict),
         ("signals", dict),

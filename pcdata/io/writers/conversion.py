@@ -9,8 +9,7 @@ from typing import Any
 
 from pcdata.errors import CacheError, PcdataError, add_note, write_fault
 from pcdata.files.whole_folders import complete_or_nothing, is_free
-from pcdata.io.sources.apart import check_apart
-from pcdata.io.sources.capture_source import checked_ids, episodes_of, skipped_of, unread_of
+from pcdata.io.sources.capture_source import check_apart, checked_ids, episodes_of, skipped_of, unread_of
 from pcdata.io.sources.combine import SubsetSource
 from pcdata.io.sources.open_source import open_source
 from pcdata.io.writers.registry import writer_named

@@ -10,7 +10,7 @@ from pcdata import open_source
 from pcdata.cli.main import main
 from pcdata.errors import CacheError, ConfigError
 from pcdata.files.scratch import hidden_folder
-from pcdata.io.sources.apart import check_apart
+from pcdata.io.sources.capture_source import check_apart
 from tests.captures import folder_capture
 from tests.exports.samples import tree
 

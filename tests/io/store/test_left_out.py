@@ -1,4 +1,4 @@
-"""The captures that a dataset lacks: few of them in dataset.json, many as arrays, which are checked when they are read."""
+"""The captures that a dataset lacks: few of them in dataset.json, many as arrays, which are checked when asked."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 from pcdata.errors import CacheError
 from pcdata.files.npy import npy_bytes
 from pcdata.io.store import manifest as manifest_of
-from pcdata.io.store.left_out import MOST_IN_JSON
-from pcdata.io.store.manifest import FILE_NAME, Manifest, checksum_of
+from pcdata.io.store.manifest import FILE_NAME, MOST_IN_JSON, Manifest, checksum_of
 from pcdata.io.store.sample_index import Sample
 from pcdata.io.store.shards import seal_shard, shard_folder
 
