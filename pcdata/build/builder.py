@@ -188,7 +188,8 @@ def checked_request(
     """
     _check_arguments(config, source)
     _check_ways(workers, timeout, engine, part, finalize)
-    most_bad(max_bad, len(source.ids))
+    if max_bad is not None:
+        most_bad(max_bad, len(source.ids))
     if retry_quarantined and (restart or finalize or part is not None):
         raise ConfigError(
             "build_dataset: retry_quarantined goes on with a whole build: without restart, finalize, part"

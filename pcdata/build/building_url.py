@@ -91,7 +91,7 @@ class BuildingUrl(Building):
         return before
 
     def put_into_place(self, plan: Plan, records: Mapping[int, ShardRecord], replaced: object, note: Note) -> None:
-        self._placing.run(self.dataset, plan.identity, records, replaced, self.path, note)
+        self._placing.run(self.dataset, plan.identity, records, replaced, note)
         self.remove()
 
     # -- who works on it -------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ it has begun, and what of an old dataset is to be deleted. Without ``dataset.jso
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -43,13 +44,7 @@ class PlacingAtUrl:
         self.kept_at = kept_at
 
     def run(
-        self,
-        dataset: Path,
-        identity: str,
-        records: Mapping[int, ShardRecord],
-        replaced: object,
-        scratch: Path,
-        note: Note,
+        self, dataset: Path, identity: str, records: Mapping[int, ShardRecord], replaced: object, note: Note
     ) -> None:
         """Let the store hold the dataset at its URL.
 
@@ -58,7 +53,6 @@ class PlacingAtUrl:
             identity: of the build.
             records: of all its shards, which are in the unfinished build.
             replaced: what :meth:`state` was before.
-            scratch: a folder that small files may be fetched to.
             note: told where another process did it.
 
         Raises:
@@ -76,7 +70,7 @@ class PlacingAtUrl:
         if self.identity() == identity and self.state() != replaced:
             note("another process put the dataset into place")
         else:
-            gone = self._begin({*sizes, DATASET}, replaced, scratch)
+            gone = self._begin({*sizes, DATASET}, replaced)
             self.target.remove([DATASET])
             try:
                 self.target.copy(self.kept_at, {name: there for name, (there, _) in shards.items()})
@@ -94,7 +88,7 @@ class PlacingAtUrl:
                 )
             self.target.put({DATASET: files[DATASET]})
 
-    def _begin(self, names: set[str], replaced: object, scratch: Path) -> list[str]:
+    def _begin(self, names: set[str], replaced: object) -> list[str]:
         """Say that the dataset is being put under its name; return which files of an old one are in its way."""
         placing = self.begun()
         if placing is None:
@@ -105,7 +99,8 @@ class PlacingAtUrl:
                     "choose another URL"
                 )
             if sizes:
-                told_foreign(self.target, foreign_names(sizes, scratch / "old", self.manifest(scratch / "old")))
+                with tempfile.TemporaryDirectory(prefix="pcdata-") as folder:
+                    told_foreign(self.target, foreign_names(sizes, Path(folder), self.manifest(Path(folder))))
             placing = sorted({*sizes} - names)
             self.kept_at.write(PLACING, json_bytes({"gone": placing}))
         return [name for name in placing if name not in names]

@@ -109,11 +109,8 @@ def candidates(
     if not len(known):
         return
     spaces = [
-        (
-            _compared(descriptors[:, :size].astype(np.float64), known, thinnings[:, :size].astype(np.float64), most),
-            *rest,
-        )
-        for size, most, *rest in _SPACES
+        (_compared(descriptors[:, :size], known, thinnings[:, :size], most), count, share)
+        for size, most, count, share in _SPACES
     ]
     order = sorted(range(len(filled)), key=lambda number: len(filled[number]))
     for small, large in itertools.combinations(order, 2):
@@ -124,16 +121,17 @@ def candidates(
         for rows in (asked[first : first + step] for first in range(0, len(asked), step)):
             pairs = set[tuple[int, int]]()
             for values, count, share in spaces:
-                pairs |= _near(values, counts, rows, others, int(count), share)
+                pairs |= _near(values, counts, rows, others, count, share)
             yield from sorted(pairs)
 
 
 def _compared(
-    values: NDArray[np.float64], known: NDArray[np.int64], thinnings: NDArray[np.float64], most: int
+    values: NDArray[Any], known: NDArray[np.int64], thinnings: NDArray[Any], most: int
 ) -> NDArray[np.float64]:
     """Return descriptors along the directions that tell clouds from copies best, where copies differ by 1."""
     from scipy.linalg import eigh
 
+    values, thinnings = values.astype(np.float64), thinnings.astype(np.float64)
     within = thinnings.T @ thinnings / len(thinnings)
     within[np.diag_indices_from(within)] *= 1 + _RIDGE
     within[np.diag_indices_from(within)] += _LEAST_NOISE

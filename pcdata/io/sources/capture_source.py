@@ -211,6 +211,9 @@ def _places_of(source: Any) -> tuple[list[str | os.PathLike[str]], str]:
         matches = glob.glob(str(path)) if glob.has_magic(str(path)) and not path.exists() else []
         return [*matches] or [source], Path(os.path.abspath(path)).as_posix() if matches else ""
     source = getattr(source, "source", source)  # of a dataset that processes captures as they are read
-    places = [getattr(one, name, None) for one in all_within(source) for name in ("path", "folder")]
-    pattern = getattr(source, "opened", {}).get("path", "")
-    return [place for place in places if isinstance(place, (str, os.PathLike))], str(pattern)
+    places = []
+    for one in all_within(source):
+        for name in ("path", "folder"):
+            if isinstance(place := getattr(one, name, None), (str, os.PathLike)):
+                places.append(place)
+    return places, str(getattr(source, "opened", {}).get("path", ""))
