@@ -80,6 +80,27 @@ def _dataset(folder: Path) -> Any:
     return [dataset[index] for index in range(len(dataset))]
 
 
+def _store(kind: str, pattern: str) -> tuple[str, Callable[[Path], Any]]:
+    """Read what the store alone finds, which no hash of the dataset protects."""
+
+    def read(folder: Path) -> Any:
+        from pcdata.io.store.stores import STORES
+
+        store = STORES[kind](folder / "ds" / "shards" / "00000")
+        try:
+            return [(dict(store.read(key).arrays), store.read(key).info_text()) for key in ("a", "b")]
+        finally:
+            store.close()
+
+    return f"ds/shards/00000/{pattern}", read
+
+
+def _stream(folder: Path) -> Any:
+    from pcdata.datasets import StreamedCloudDataset
+
+    return [*StreamedCloudDataset(folder / "ds", augment=None)]
+
+
 def _foreign(pattern: str, *names: str) -> tuple[str, Callable[[Path], Any]]:
     """Read the first of the names that the file has."""
 
@@ -142,6 +163,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "color_jpg": _image("color", "*.jpg"),
     "color_png": _image("color", "*.png"),
     "confidence_png": _image("confidence", "*.png"),
+    "dataset_index": ("ds/index/*.npy", _dataset),
     "depth_npy": _depth("*.npy"),
     "depth_png": _depth("*.png"),
     "depth_tiff": _depth("*.tiff"),
@@ -161,6 +183,8 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "pcd_binary_compressed": _cloud("pcd"),
     "pickle": ("*.pkl", _pickle),
     "pipeline_yaml": ("p.yaml", _pipeline),
+    "packed_dataset": ("ds/shards/00000/clouds.packed", _dataset),
+    "packed_store": _store("packed", "clouds.packed"),
     "ply_ascii": _cloud("ply"),
     "ply_binary": _cloud("ply"),
     "ply_binary_big_endian": _cloud("ply"),
@@ -170,8 +194,12 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "robomimic_hdf5": _recording("*.hdf5"),
     "robot_poses_csv": _robot("*.csv"),
     "robot_poses_yaml": _robot("*.yaml"),
+    "shard_table": ("ds/shards/00000/files.tsv", _dataset),
     "timestamps_json": _capture("cap/timestamps.json"),
     "tsdf_npz": ("v.npz", _volume),
+    "webdataset_dataset": ("ds/shards/00000/*.tar", _dataset),
+    "webdataset_store": _store("webdataset", "*.tar"),
+    "webdataset_stream": ("ds/shards/00000/*.tar", _stream),
     "zarr_foreign": _foreign("a.zarr/data/pc/*", "data/pc"),
 }
 

@@ -117,7 +117,15 @@ def _write_datasets(folder: Path) -> None:
             made = _new(folder, {"npz": "npz_dataset", "hdf5": "h5_dataset", "pt": "pt_dataset"}[kind], packing)
             text = f"depth: [Deproject]\noutput: {{format: {kind}, compression: {packing}}}\n"
             build_dataset(config_from_yaml(text), _TwoCaptures(), made / "ds")
-    shutil.copytree(folder / "npz_dataset" / "none", folder / "manifest" / "npz")
+    for kind in ("packed", "webdataset"):  # read by the dataset, which hashes them, and by the store alone
+        for compact in (False, True):
+            made = _new(folder, f"{kind}_dataset", "compact" if compact else "plain")
+            text = f"depth: [Deproject]\noutput: {{format: {kind}, compact: {str(compact).lower()}}}\n"
+            build_dataset(config_from_yaml(text), _TwoCaptures(), made / "ds")
+        shutil.copytree(folder / f"{kind}_dataset", folder / f"{kind}_store")
+    shutil.copytree(folder / "webdataset_dataset", folder / "webdataset_stream")
+    for reader in ("manifest", "dataset_index", "shard_table"):
+        shutil.copytree(folder / "npz_dataset" / "none", folder / reader / "npz")
 
 
 def _write_foreign(folder: Path, clouds: np.ndarray) -> None:

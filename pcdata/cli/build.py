@@ -16,6 +16,7 @@ from pcdata.cli.progress_bar import ProgressBar
 if TYPE_CHECKING:
     from pcdata.build import BuildConfig
 
+_SHOWN = 20  # of what lies beside the captures and is not read
 QUARANTINED = 3  # exit code: the dataset is there, but some captures are not in it
 _INDEX = ("SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX")  # of Slurm's array jobs, and of Kubernetes' indexed ones
 
@@ -123,6 +124,7 @@ def _build(arguments: argparse.Namespace) -> int:
     from pcdata.build import build_dataset, plan_of
     from pcdata.errors import ConfigError
     from pcdata.files.urls import is_in_process
+    from pcdata.io.sources.capture_source import unread_of
     from pcdata.report.build_text import build_text, plan_text
 
     config = _config(arguments)
@@ -145,6 +147,8 @@ def _build(arguments: argparse.Namespace) -> int:
         "retry_quarantined": arguments.retry_quarantined,
         "workers": _workers(arguments, 1 if is_in_process(arguments.out) else plan_of(config, source).num_shards),
     }
+    for line in unread_of(source)[:_SHOWN]:
+        print(f"not read: {line}", file=sys.stderr)
     if arguments.dry_run:
         print(plan_text(config, source, arguments.out, **asked))
         return 0

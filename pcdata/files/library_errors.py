@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pcdata.errors import CaptureError, PcdataError, add_note
+from pcdata.files.opening import told_at
 
 
 @contextmanager
@@ -29,5 +30,5 @@ def read_by_library(where: str, path: Path, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # Arrow's and FFmpeg's errors are of many types, some of them of Python's own
         raise CaptureError(
-            f"{where}: {path}: not a readable {what}: {type(error).__name__}: {str(error)[:300]}"
+            f"{told_at(where, path)}: not a readable {what}: {type(error).__name__}: {str(error)[:300]}"
         ) from error

@@ -66,7 +66,7 @@ def open_input(
     except FileNotFoundError as cause:
         raise error(_missing(where, file)) from cause
     except (OSError, ValueError) as cause:  # ValueError: a NUL in the name
-        raise error(f"{where}: {file}: cannot be opened: {cause}") from cause
+        raise error(f"{told_at(where, file)}: cannot be opened: {cause}") from cause
     stream = os.fdopen(descriptor, "rb")
     try:
         status = os.fstat(descriptor)
@@ -74,26 +74,26 @@ def open_input(
         if inside is not None:
             _check_inside(where, file, status, inside, error)
         if status.st_size == 0:
-            raise error(f"{where}: {file}: the file is empty (0 bytes); was the copy or download interrupted?")
+            raise error(f"{told_at(where, file)}: the file is empty (0 bytes); was the copy or download interrupted?")
         if status.st_size > max_bytes:
             raise error(
-                f"{where}: {file}: has {status.st_size} bytes, more than the limit of {max_bytes} for this kind"
+                f"{told_at(where, file)}: has {status.st_size} bytes, more than the limit of {max_bytes} for this kind"
             )
         if status.st_size >= _SPARSE_FROM and _stored_bytes(descriptor, status.st_size) * _MOST_HOLES < status.st_size:
             raise error(
-                f"{where}: {file}: claims {status.st_size} bytes but is nearly all holes (a sparse file); was the copy "
-                "or download interrupted?"
+                f"{told_at(where, file)}: claims {status.st_size} bytes but is nearly all holes (a sparse file); was "
+                "the copy or download interrupted?"
             )
     except BaseException as cause:
         stream.close()
         if isinstance(cause, OSError) and not isinstance(cause, PcdataError):
-            raise error(f"{where}: {file}: cannot be examined: {cause}") from cause
+            raise error(f"{told_at(where, file)}: cannot be examined: {cause}") from cause
         raise
     try:
         note_input(file, stream)
     except OSError as cause:
         stream.close()
-        raise error(f"{where}: {file}: cannot be read: {cause}") from cause
+        raise error(f"{told_at(where, file)}: cannot be read: {cause}") from cause
     return stream
 
 
@@ -126,9 +126,9 @@ def read_bytes(
     except (OSError, MemoryError) as cause:
         if isinstance(cause, PcdataError):
             raise
-        raise error(f"{where}: {path}: cannot be read: {str(cause) or type(cause).__name__}") from cause
+        raise error(f"{told_at(where, path)}: cannot be read: {str(cause) or type(cause).__name__}") from cause
     if len(content) != size:
-        raise error(f"{where}: {path}: changed its size while it was read; is it still being written?")
+        raise error(f"{told_at(where, path)}: changed its size while it was read; is it still being written?")
     return content
 
 
@@ -145,7 +145,7 @@ def read_text(
     try:
         return read_bytes(where, path, max_bytes=max_bytes, inside=inside, error=error).decode("utf-8-sig")
     except UnicodeDecodeError as cause:
-        raise error(f"{where}: {path}: must be UTF-8 text, but it is not: {cause}") from cause
+        raise error(f"{told_at(where, path)}: must be UTF-8 text, but it is not: {cause}") from cause
 
 
 def map_npy(
@@ -169,7 +169,7 @@ def map_npy(
             if header.dtype.kind not in "biufc":
                 raise CacheError(f"it must hold plain numbers, got {header.dtype}")
         except CacheError as cause:
-            raise error(f"{where}: {path}: not a readable .npy file of numbers: {cause}") from cause
+            raise error(f"{told_at(where, path)}: not a readable .npy file of numbers: {cause}") from cause
         if not header.nbytes:
             return np.empty(header.shape, header.dtype)
         order: Literal["C", "F"] = "F" if header.by_columns else "C"
@@ -177,7 +177,7 @@ def map_npy(
             content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
             return np.ndarray(header.shape, header.dtype, content, header.begin, order=order)
         except (OSError, ValueError, TypeError) as cause:  # it has become shorter, or its file system maps none
-            raise error(f"{where}: {path}: cannot be read: {cause}") from cause
+            raise error(f"{told_at(where, path)}: cannot be read: {cause}") from cause
 
 
 def check_inside(
@@ -192,7 +192,7 @@ def check_inside(
     except OSError as cause:
         if isinstance(cause, PcdataError):
             raise
-        raise error(f"{where}: {path}: cannot be examined: {cause}") from cause
+        raise error(f"{told_at(where, path)}: cannot be examined: {cause}") from cause
 
 
 @contextmanager
@@ -208,7 +208,7 @@ def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataErr
     if not target.parent.is_dir():
         if hint := url_hint(path):
             raise error(f"{where}: {hint}")
-        raise error(f"{where}: {path}: the folder {target.parent} does not exist; create it first")
+        raise error(f"{told_at(where, path)}: the folder {target.parent} does not exist; create it first")
     try:
         with suppress(FileNotFoundError):
             _check_kind(where, Path(path), os.stat(target), error)  # a rename would put a file where a device was
@@ -219,7 +219,7 @@ def replacing(where: str, path: str | os.PathLike[str], *, error: type[PcdataErr
     except OSError as cause:
         if isinstance(cause, PcdataError):
             raise
-        raise error(f"{where}: {path}: cannot be written: {write_fault(cause)}") from cause
+        raise error(f"{told_at(where, path)}: cannot be written: {write_fault(cause)}") from cause
 
 
 # Absent on Windows, where none of these kinds of files has a name in the file system.
@@ -236,21 +236,26 @@ _KINDS = (
 )
 
 
+def told_at(where: str, path: str | os.PathLike[str]) -> str:
+    """Return how a message about a file begins: who asks, and the path, unless who asks named it."""
+    return where if where.endswith(str(path)) else f"{where}: {path}"
+
+
 def _missing(where: str, file: Path) -> str:
     if file.is_symlink():
         return (
-            f"{where}: {file}: is a link to {os.readlink(file)}, which is not there; fetch its content, or correct the "
-            "link"
+            f"{told_at(where, file)}: is a link to {os.readlink(file)}, which is not there; fetch its content, or "
+            "correct the link"
         )
     if ":" in str(file) and (hint := url_hint(file)):
         return f"{where}: {hint}"
-    return f"{where}: {file}: no such file; check the path (relative to {Path.cwd()})"
+    return f"{told_at(where, file)}: no such file; check the path (relative to {Path.cwd()})"
 
 
 def _check_kind(where: str, file: Path, status: os.stat_result, error: type[PcdataError]) -> None:
     if not stat.S_ISREG(status.st_mode):
         kind = next((words for test, words in _KINDS if test(status.st_mode)), "no regular file")
-        raise error(f"{where}: {file}: must be a file, but it is {kind}")
+        raise error(f"{told_at(where, file)}: must be a file, but it is {kind}")
 
 
 def _check_inside(
@@ -264,11 +269,11 @@ def _check_inside(
     folders = [Path(os.path.realpath(folder)) for folder in inside]
     if not any(real.is_relative_to(folder) for folder in folders):
         raise error(
-            f"{where}: {file}: leads out of {folders[0]}, to {real}; files outside are not read unless you name the "
-            f"folder that links may lead to: links_to={str(real.parent)!r}"
+            f"{told_at(where, file)}: leads out of {folders[0]}, to {real}; files outside are not read unless you "
+            f"name the folder that links may lead to: links_to={str(real.parent)!r}"
         )
     if opened is not None and not os.path.samestat(os.stat(real), opened):
-        raise error(f"{where}: {file}: was exchanged while it was opened")
+        raise error(f"{told_at(where, file)}: was exchanged while it was opened")
 
 
 def _stored_bytes(descriptor: int, size: int) -> int:

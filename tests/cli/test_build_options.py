@@ -196,3 +196,13 @@ def test_workers_are_the_cores_where_there_are_several_shards():
     assert _workers(Words, 1) == 1
     Words.workers = 5
     assert _workers(Words, 1) == 5
+
+
+def test_what_lies_beside_the_captures_and_is_not_read_is_told(capsys, config, captures, tmp_path):
+    (captures / "other").mkdir()
+    (captures / "other" / "000.png").touch()
+    call = ["build", config, "--source", captures, "--out", tmp_path / "out"]
+    for line in ([*call, "--dry-run"], call):
+        code, _, err = run(capsys, *line)
+        assert code == 0
+        assert re.search("^not read: .*other", err, re.MULTILINE)

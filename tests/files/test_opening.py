@@ -193,3 +193,19 @@ def test_a_npy_header_of_an_impossible_length_is_told(tmp_path, length):
     (tmp_path / "a.npy").write_bytes(content)
     with pytest.raises(CaptureError, match=r"not a readable \.npy"):
         files.map_npy("here", tmp_path / "a.npy", max_bytes=1 << 20)
+
+
+def test_a_path_that_who_asks_has_named_is_not_told_twice(tmp_path):
+    from pcdata.io import read_color, read_depth
+
+    (tmp_path / "d.npy").write_bytes(b"garbage")
+    (tmp_path / "c.png").write_bytes(b"")
+    for read in (
+        lambda: read_depth(tmp_path / "d.npy", metres_per_unit=0.001),
+        lambda: read_depth(tmp_path / "none.npy", metres_per_unit=0.001),
+        lambda: read_depth(tmp_path / "c.png", metres_per_unit=0.001),
+        lambda: read_color(tmp_path / "c.png"),
+    ):
+        with pytest.raises(CaptureError) as caught:
+            read()
+        assert str(caught.value).count(str(tmp_path)) == 1

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, UnitError, locates_path
-from pcdata.files.opening import map_npy, open_input, read_bytes
+from pcdata.files.opening import map_npy, open_input, read_bytes, told_at
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
 from pcdata.io.images.exr import exr_size, read_exr_channel
@@ -142,13 +142,13 @@ def image_size(where: str, path: Path) -> tuple[int, int]:
     if suffix == ".npy":
         shape = map_npy(where, path, max_bytes=_MAX_BYTES).shape
         if len(shape) < 2:
-            raise CaptureError(f"{where}: {path}: must be one image (H, W), got shape {shape}")
+            raise CaptureError(f"{told_at(where, path)}: must be one image (H, W), got shape {shape}")
         return int(shape[0]), int(shape[1])
     if _FORMATS.get(suffix) == _TIFF:
         try:
             return tiff_size(read_bytes(where, path, max_bytes=_MAX_BYTES))
         except StructureError as error:
-            raise CaptureError(f"{where}: {path}: no readable image: {error}") from error
+            raise CaptureError(f"{told_at(where, path)}: no readable image: {error}") from error
     with open_input(where, path, max_bytes=_MAX_BYTES) as stream:
         if suffix == ".exr":
             return exr_size(where, stream.read(_EXR_HEADER))
@@ -156,7 +156,9 @@ def image_size(where: str, path: Path) -> tuple[int, int]:
             with Image.open(stream, formats=("PNG", "JPEG")) as image:
                 return image.height, image.width
         except _PARSERS as error:
-            raise CaptureError(f"{where}: {path}: no readable image: {str(error) or type(error).__name__}") from error
+            raise CaptureError(
+                f"{told_at(where, path)}: no readable image: {str(error) or type(error).__name__}"
+            ) from error
 
 
 def _read_npy(where: str, path: Path) -> NDArray[Any]:
