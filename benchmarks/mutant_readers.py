@@ -80,6 +80,15 @@ def _dataset(folder: Path) -> Any:
     return [dataset[index] for index in range(len(dataset))]
 
 
+def _told(cloud: Any) -> Any:
+    """Return what a cloud holds; its facts may be read only when they are asked."""
+    return cloud.points, cloud.colors, cloud.source_index, repr(cloud.meta), cloud.frame_id, cloud.sample_ids
+
+
+def _joined_dataset(folder: Path) -> Any:
+    return [*map(_told, _dataset(folder))]
+
+
 def _store(kind: str, pattern: str) -> tuple[str, Callable[[Path], Any]]:
     """Read what the store alone finds, which no hash of the dataset protects."""
 
@@ -98,7 +107,7 @@ def _store(kind: str, pattern: str) -> tuple[str, Callable[[Path], Any]]:
 def _stream(folder: Path) -> Any:
     from pcdata.datasets import StreamedCloudDataset
 
-    return [*StreamedCloudDataset(folder / "ds", augment=None)]
+    return [*map(_told, StreamedCloudDataset(folder / "ds", augment=None))]
 
 
 def _foreign(pattern: str, *names: str) -> tuple[str, Callable[[Path], Any]]:
@@ -183,7 +192,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "pcd_binary_compressed": _cloud("pcd"),
     "pickle": ("*.pkl", _pickle),
     "pipeline_yaml": ("p.yaml", _pipeline),
-    "packed_dataset": ("ds/shards/00000/clouds.packed", _dataset),
+    "packed_dataset": ("ds/shards/00000/clouds.packed", _joined_dataset),
     "packed_store": _store("packed", "clouds.packed"),
     "ply_ascii": _cloud("ply"),
     "ply_binary": _cloud("ply"),
@@ -197,7 +206,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "shard_table": ("ds/shards/00000/files.tsv", _dataset),
     "timestamps_json": _capture("cap/timestamps.json"),
     "tsdf_npz": ("v.npz", _volume),
-    "webdataset_dataset": ("ds/shards/00000/*.tar", _dataset),
+    "webdataset_dataset": ("ds/shards/00000/*.tar", _joined_dataset),
     "webdataset_store": _store("webdataset", "*.tar"),
     "webdataset_stream": ("ds/shards/00000/*.tar", _stream),
     "zarr_foreign": _foreign("a.zarr/data/pc/*", "data/pc"),

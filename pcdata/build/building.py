@@ -39,6 +39,8 @@ class Building(ABC):
         path: a folder of this machine for what the end of a build needs.
     """
 
+    place = "folder"  # what the target is, in messages
+
     def __init__(self, target: Any, kept_at: Any, path: Path) -> None:
         self.target = target
         self.kept_at = kept_at
@@ -124,8 +126,8 @@ class Building(ABC):
         """Return the error of a build that is refused for another that is unfinished."""
         return CacheError(
             f"{self.target}: an unfinished build with {num_finished} finished shards is there ({self.kept_at}), which "
-            f"differs in its {', '.join(different)}; finish it with its own settings, choose another place, or start "
-            "over, which deletes it: --restart"
+            f"differs in its {', '.join(different)}; finish it with its own settings, choose another {self.place}, or "
+            "start over, which deletes it: --restart"
         )
 
     @abstractmethod

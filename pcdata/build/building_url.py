@@ -49,6 +49,7 @@ class BuildingUrl(Building):
         url: of the dataset.
     """
 
+    place = "URL"
     target: WritableUrl
     kept_at: WritableUrl
 
