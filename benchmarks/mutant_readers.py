@@ -82,7 +82,7 @@ def _dataset(folder: Path) -> Any:
 
 def _told(cloud: Any) -> Any:
     """Return what a cloud holds; its facts may be read only when they are asked."""
-    return cloud.points, cloud.colors, cloud.source_index, repr(cloud.meta), cloud.frame_id, cloud.sample_ids
+    return cloud.points, cloud.colors, cloud.source_index, repr(cloud.meta), cloud.frame_id
 
 
 def _joined_dataset(folder: Path) -> Any:

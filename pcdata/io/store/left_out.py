@@ -14,12 +14,11 @@ import numpy as np
 
 from pcdata.errors import CacheError
 from pcdata.files.npy import npy_bytes
-from pcdata.io.store.manifest import KINDS
 from pcdata.io.store.sample_index import FOLDER, mapped_array, written
 from pcdata.io.store.text_table import TextTable
 
 _PARTS = {"ids": "|u1", "id_ends": "<i8", "reasons": "|u1", "reason_ends": "<i8"}
-FILES = tuple(f"{kind}_{part}.npy" for kind in KINDS for part in _PARTS)
+FILES = tuple(f"{kind}_{part}.npy" for kind in ("skipped", "quarantined") for part in _PARTS)
 
 
 class LeftOut(Mapping[str, str]):
