@@ -23,6 +23,7 @@ from pcdata.datasets.near_duplicates import (
 from pcdata.datasets.splits import Splits
 from pcdata.errors import ConfigError
 from pcdata.progress import Progress
+from pcdata.rng import seeded
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress:
         descriptors[row] = descriptor(points.astype(np.float64))
         if progress is not None:
             progress(row + 1, len(ids), sample_id)
-    draw = np.random.default_rng(0)
+    draw = seeded(0)
     thinnings = [thinning(_points(dataset, row), draw) for row in thinned_rows(counts, draw).tolist()]
     leaks, compared = [], 0
     kept: tuple[int, Surface] | None = None  # a cloud is compared with several others in a row

@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 Points = NDArray[np.float64]  # (N, 3)
@@ -62,18 +63,18 @@ def descriptor(points: Points) -> NDArray[np.float32]:  # (SIZE,)
     return _described(points) if len(points) >= FEWEST else np.zeros(SIZE, np.float32)
 
 
-def thinning(points: Points, draw: np.random.Generator) -> NDArray[np.float32]:  # (SIZE,)
+def thinning(points: Points, draw: torch.Generator) -> NDArray[np.float32]:  # (SIZE,)
     """Return how the descriptor of a random half of a cloud differs, for points whose noise is 1."""
-    half = points[draw.permutation(len(points))[: len(points) // 2]]
+    half = points[torch.randperm(len(points), generator=draw).numpy()[: len(points) // 2]]
     return np.asarray((_described(half) - _described(points)) * np.sqrt(len(points)), np.float32)
 
 
-def thinned_rows(counts: NDArray[np.int64], draw: np.random.Generator) -> NDArray[np.int64]:
+def thinned_rows(counts: NDArray[np.int64], draw: torch.Generator) -> NDArray[np.int64]:
     """Return which clouds :func:`thinning` should be asked of, some several times where they are few."""
     filled = np.flatnonzero(counts >= FEWEST)
     if 0 < len(filled) < _HALVES:
         return np.sort(np.resize(filled, _HALVES))
-    return np.sort(draw.permutation(filled)[:_HALVES])
+    return np.sort(filled[torch.randperm(len(filled), generator=draw).numpy()[:_HALVES]])
 
 
 def _described(points: Points) -> NDArray[np.float32]:
