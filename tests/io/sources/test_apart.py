@@ -116,7 +116,7 @@ def test_beside_the_root_of_a_disk_nothing_is_hidden():
     ("line", "told"),
     [
         (["build", "c.yaml", "--wrokers", "1"], "did you mean '--workers'"),
-        (["card", "set", "--licence", "mit"], "did you mean '--license'"),
+        (["card", "set", "--lisense", "mit"], "did you mean '--license'"),
         (["calib", "overlap", "rig", "--figrue=x.png"], "did you mean '--figure'"),
     ],
     ids=str,
