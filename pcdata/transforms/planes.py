@@ -54,6 +54,8 @@ class RemovePlane(RemoveTransform):
         distance: inliers are closer to the plane than this.
         num_hypotheses: planes tried through three points each.
         seed: of the hypotheses: the same cloud always gives the same plane.
+        which: the plane with the most inliers, or the one that things stand on.
+        cut: drop a slab of ``distance`` on both sides, or what the plane's own bend and noise explain.
         probability: stop trying once a better plane is this unlikely to be missed; None = try all.
         up: the normal's rough direction in `frame`; None = any, facing the sensor or the origin of the frame.
         frame: the frame that `up` is given in; given with it.
