@@ -104,12 +104,6 @@ def _store(kind: str, pattern: str) -> tuple[str, Callable[[Path], Any]]:
     return f"ds/shards/00000/{pattern}", read
 
 
-def _stream(folder: Path) -> Any:
-    from pcdata.datasets import StreamedCloudDataset
-
-    return [*map(_told, StreamedCloudDataset(folder / "ds", augment=None))]
-
-
 def _foreign(pattern: str, *names: str) -> tuple[str, Callable[[Path], Any]]:
     """Read the first of the names that the file has."""
 
@@ -208,7 +202,6 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "tsdf_npz": ("v.npz", _volume),
     "webdataset_dataset": ("ds/shards/00000/*.tar", _joined_dataset),
     "webdataset_store": _store("webdataset", "*.tar"),
-    "webdataset_stream": ("ds/shards/00000/*.tar", _stream),
     "zarr_foreign": _foreign("a.zarr/data/pc/*", "data/pc"),
 }
 

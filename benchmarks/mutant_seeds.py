@@ -123,7 +123,6 @@ def _write_datasets(folder: Path) -> None:
             text = f"depth: [Deproject]\noutput: {{format: {kind}, compact: {str(compact).lower()}}}\n"
             build_dataset(config_from_yaml(text), _TwoCaptures(), made / "ds")
         shutil.copytree(folder / f"{kind}_dataset", folder / f"{kind}_store")
-    shutil.copytree(folder / "webdataset_dataset", folder / "webdataset_stream")
     for reader in ("manifest", "dataset_index", "shard_table"):
         shutil.copytree(folder / "npz_dataset" / "none", folder / reader / "npz")
 
