@@ -10,6 +10,9 @@ What the rates stand beside:
 
 - ``memcpy``: a loop in one process that copies the same bytes, sample by sample in the same order, out of one array
   into one batch that is used again.
+- ``a number`` and ``memcpy in workers``: what no loader by torch's DataLoader can pass. Its workers hand over a number
+  and nothing else; or copy the bytes as ``memcpy`` does, into memory that is there already and that they share, and
+  hand over which part of it they filled.
 - ``torch's ceiling``: a Dataset whose ``__getitems__`` gives one tensor that is in shared memory already, so that
   nothing is read, copied or allocated; ``fresh tensor``: a new tensor of that size for every batch, which torch moves
   to shared memory.
@@ -39,7 +42,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, IterableDataset, default_collate
+from torch.utils.data import DataLoader, Dataset, IterableDataset, default_collate, get_worker_info
 
 from pcdata import CachedCloudDataset, PointCloud, StreamedCloudDataset, collate_fixed, collate_packed
 from pcdata.build import build_dataset, config_from_yaml
@@ -124,6 +127,31 @@ class _Ready(Dataset):
         return self.batch.clone() if self.fresh else self.batch
 
 
+class _Copied(Dataset):
+    """The number of a slot that a worker has copied a batch into, or of none, where nothing is copied."""
+
+    slots = 4  # of a worker: more than are on their way
+
+    def __init__(self, samples: np.ndarray | None, size: int, workers: int) -> None:
+        self.samples, self.size, self.filled = samples, size, 0
+        if samples is not None:
+            self.memory = torch.zeros(max(1, workers), self.slots, BATCH, POINTS, 6).share_memory_()
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitems__(self, indices: Sequence[int]) -> int:
+        if self.samples is None:
+            return 0
+        worker = get_worker_info()
+        slot = self.filled % self.slots
+        batch = self.memory[0 if worker is None else worker.id, slot].numpy()
+        for place, index in enumerate(indices):
+            batch[place] = self.samples[index]
+        self.filled += 1
+        return slot
+
+
 def _as_it_is(batch: Any) -> Any:
     return batch
 
@@ -181,9 +209,8 @@ class _Passes(IterableDataset):
             yield from self.data
 
 
-def copied(clouds: _Clouds) -> _Loaded:
+def copied(samples: np.ndarray) -> _Loaded:
     """The loop of memcpy, of bytes that lie in memory."""
-    samples = np.stack([np.concatenate([cloud.points, cloud.colors], axis=1) for cloud in map(clouds.load, clouds.ids)])
     batch = np.empty((BATCH, POINTS, 6), np.float32)
 
     def begin(number: int) -> Iterator[Any]:
@@ -319,6 +346,7 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UserWarning)  # a second pass in one epoch: the order is of many passes
     clouds = _Clouds(arguments.samples)
+    samples = np.stack([_arrays(clouds, sample_id) for sample_id in clouds.ids])
     passes = max(1, 64 * BATCH * arguments.repeats // arguments.samples)
 
     def loaded(data: Dataset, collate: Callable[..., Any]) -> _Loaded:
@@ -327,7 +355,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as named:
         folder = Path(named)
         ways: dict[str, Any] = {
-            "memcpy": copied(clouds),
+            "memcpy": copied(samples),
+            "a number": loaded(_Copied(None, len(clouds), arguments.workers), _as_it_is),
+            "memcpy in workers": loaded(_Copied(samples, len(clouds), arguments.workers), _as_it_is),
             "torch's ceiling": loaded(_Ready(arguments.samples, fresh=False), _as_it_is),
             "fresh tensor": loaded(_Ready(arguments.samples, fresh=True), _as_it_is),
             "npz and default_collate": loaded(_PlainFiles(folder / "plain", clouds), default_collate),
@@ -350,7 +380,9 @@ def main() -> None:
         rates: dict[str, list[float]] = {name: [] for name in ways}
         for number in range(arguments.repeats + 1):  # the first stretch begins workers and fills caches
             for name, way in list(ways.items()):
-                is_ours = name in ("memcpy", "torch's ceiling") or name.startswith(("packed", "webdataset"))
+                is_ours = name in ("memcpy", "a number", "memcpy in workers", "torch's ceiling") or name.startswith(
+                    ("packed", "webdataset")
+                )
                 count = arguments.batches if is_ours else max(8, arguments.batches // 8)
                 try:
                     found = rate(way, count, 4 * arguments.workers)

@@ -23,6 +23,7 @@ from torch import Generator, Tensor
 from pcdata.errors import DeviceError, DTypeError, ShapeError
 
 _GOLDEN = 0x9E3779B97F4A7C15
+_FIRST_WORDS = 8  # of every stream, computed at once
 _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
@@ -88,6 +89,7 @@ class Streams:
         """Begin streams of these keys, of 63 bits."""
         self._keys = np.asarray(keys, dtype=np.int64).view(np.uint64)
         self.place = 0  # the number of the next word
+        self._ahead: NDArray[np.uint64] = np.empty((len(self._keys), 0), np.uint64)  # the first words
 
     @classmethod
     def of(cls, generator: GeneratorLike, num_clouds: int) -> Streams:
@@ -154,6 +156,13 @@ class Streams:
     def _next(self, count: int) -> NDArray[np.uint64]:
         """Return (B, count) words, those of :func:`words`."""
         begin, self.place = self.place, self.place + count
+        if self.place <= _FIRST_WORDS:  # most steps draw one or two
+            if not self._ahead.size:
+                self._ahead = self._words(0, _FIRST_WORDS)
+            return self._ahead[:, begin : self.place]
+        return self._words(begin, count)
+
+    def _words(self, begin: int, count: int) -> NDArray[np.uint64]:
         number = np.arange(begin + 1, begin + 1 + count, dtype=np.uint64) * np.uint64(_GOLDEN)
         mixed = self._keys[:, None] + number
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(_FIRST)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -238,8 +239,8 @@ class CachedCloudDataset(SampleDataset):
         else:
             clouds = self._forms.cloud(record)
         # One cloud each, since none has fewer.
-        counts = np.diff(clouds.ptr.numpy())
-        return clouds if np.array_equal(counts, self.manifest.index.num_points[rows]) else None
+        ptr, wanted = clouds.ptr.numpy(), self.manifest.index.num_points[rows]
+        return clouds if len(ptr) == len(wanted) + 1 and (ptr[1:] - ptr[:-1] == wanted).all() else None
 
     def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         if not runs_on_batches(self.transform):
@@ -256,12 +257,17 @@ class CachedCloudDataset(SampleDataset):
                 batches.append(self._transformed(clouds, own))
         return Unbatched(batches)
 
+    @functools.cached_property
+    def _largest(self) -> int:
+        """The points of the largest sample."""
+        return int(self.manifest.index.num_points.max(initial=0))
+
     def _parts(self, numbers: NDArray[np.int64], each: int = 1) -> Iterator[slice]:
         """Cut samples, ``each`` of which belong together, into parts that the memory of a processor can hold."""
-        counts = self.manifest.index.num_points[self._rows_of(numbers)]
-        if int(counts.sum()) <= _MOST_POINTS:
+        if len(numbers) * self._largest <= _MOST_POINTS:
             yield slice(0, len(numbers))
             return
+        counts = self.manifest.index.num_points[self._rows_of(numbers)]
         begin = points = 0
         for place, own in enumerate(counts.reshape(-1, each).sum(axis=1).tolist()):
             if points and points + own > _MOST_POINTS:

@@ -10,6 +10,7 @@ from typing import Any
 from pcdata.contracts.numbers import whole_number
 from pcdata.datasets.window_batch import WindowBatch, window_batch
 from pcdata.errors import ConfigError, DTypeError, ShapeError
+from pcdata.functional.rows import listed_counts
 from pcdata.registry import Registry
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.unbatched import Unbatched
@@ -84,7 +85,7 @@ def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
     """
     _check("collate_fixed", clouds)
     batches = clouds.batches if isinstance(clouds, Unbatched) else clouds
-    counts = {count for batch in batches for count in batch.counts.tolist()}
+    counts = {*itertools.chain.from_iterable(listed_counts(batch.ptr) for batch in batches)}
     if len(counts) > 1:
         raise ShapeError(
             f"collate_fixed: clouds must have one count, got {min(counts)} to {max(counts)} points; end the pipeline "

@@ -30,6 +30,7 @@ class FirstTouch:
     def _forget(self) -> None:
         self._mine: dict[int, tuple[int, ...]] = {}  # what this process has seen of the files
         self._known = np.zeros(self._index.num_shards, bool)  # the shards that it has seen
+        self._knows_all = False
         self._closed = 0
 
     def has_all(self, numbers: NDArray[np.int64], closed: int) -> bool:
@@ -41,8 +42,15 @@ class FirstTouch:
         """
         if closed != self._closed:
             self._known[:] = False
+            self._knows_all = False
             self._closed = closed
-        return bool(self._known[self._index.shards[numbers]].all() and self._seen.numpy()[numbers].all())
+        if not self._seen.numpy()[numbers].all():
+            return False
+        if not self._knows_all:
+            if not self._known[self._index.shards[numbers]].all():
+                return False
+            self._knows_all = bool(self._known.all())
+        return True
 
     def fresh(self, numbers: NDArray[np.int64], files: Mapping[int, tuple[int, ...]]) -> list[int]:
         """Return those of some records that nobody has compared yet; ``files`` tells the files of their shards."""

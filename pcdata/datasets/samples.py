@@ -186,8 +186,10 @@ class SampleDataset(Dataset[PointCloud]):
             places = np.array(given, dtype=np.int64)
         except OverflowError:  # no sample has so large a number: see below
             places = np.full(len(given), -1)
-        if len(places) and (places.min() < 0 or places.max() >= len(self)):
+        if len(places) and places.view(np.uint64).max() >= len(self):  # as which the negative ones are large
             places = np.array([self._place(index) for index in given], dtype=np.int64)
+        if self.repeats == 1:
+            return _Asked(places, places, again, again)
         copies, numbers = np.divmod(places, max(1, len(self.ids)))
         return _Asked(places, numbers, copies + again * self.repeats, again)
 

@@ -8,13 +8,11 @@ taken in row order.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
@@ -28,6 +26,11 @@ _FEW_CLOUDS = 64
 def counts_from_ptr(ptr: Tensor) -> Tensor:
     """Return the (B,) number of rows of every cloud."""
     return ptr[1:] - ptr[:-1]
+
+
+def listed_counts(ptr: Tensor) -> list[int]:
+    """Return the number of rows of every cloud as a list."""
+    return [stop - start for start, stop in pairwise(ptr.tolist())]
 
 
 def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None = None) -> Tensor:
@@ -69,20 +72,6 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = Fa
     if in_place:
         return {name: field[: len(index)].copy_(field[index]) for name, field in fields.items()}
     return {name: field[index] for name, field in fields.items()}
-
-
-@inner
-def copy_blocks(
-    into: Tensor,  # (bytes,) uint8
-    begins: NDArray[np.int64],  # (...) where each block goes, in bytes; no two overlap
-    addresses: NDArray[np.int64],  # (...) of what is copied: of arrays in memory, or mapped files, that somebody holds
-    sizes: NDArray[np.int64],  # (...) bytes
-) -> None:
-    """Copy blocks of bytes from where they lie in memory."""
-    held = into.numpy()
-    for begin, address, size in zip(begins.ravel().tolist(), addresses.ravel().tolist(), sizes.ravel().tolist()):
-        if size:
-            held[begin : begin + size] = (ctypes.c_uint8 * size).from_address(address)
 
 
 @inner

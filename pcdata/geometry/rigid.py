@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,11 +18,19 @@ def from_rotation_translation(rotation: Tensor, translation: Tensor) -> Tensor:
     if translation.shape[:-1] != shape:
         # Not torch.broadcast_shapes: its first call loads sympy, which takes most of a second.
         shape = torch.broadcast_tensors(rotation[..., 0, 0], translation[..., 0])[0].shape
+    if _is_plain(rotation) and _is_plain(translation):
+        filled = np.zeros((*shape, 4, 4))  # in a third of the time
+        filled[..., :3, :3], filled[..., :3, 3], filled[..., 3, 3] = rotation.numpy(), translation.numpy(), 1.0
+        return torch.from_numpy(filled)
     matrix = torch.zeros((*shape, 4, 4), dtype=torch.float64, device=rotation.device)
     matrix[..., :3, :3] = rotation
     matrix[..., :3, 3] = translation
     matrix[..., 3, 3] = 1.0
     return matrix
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return tensor.is_cpu and tensor.dtype is torch.float64 and type(tensor) is Tensor and not tensor.requires_grad
 
 
 def scaling(factors: Tensor) -> Tensor:

@@ -160,6 +160,8 @@ class CloudBatch(Structure):
 
     def _facts_of(self, clouds: slice) -> dict[str, Any]:
         """Return what some of the clouds know."""
+        if clouds.indices(self.num_clouds) == (0, self.num_clouds, 1):
+            return {name: vars(self)[name] for name in _FACTS}
         signals = self.recorded_signals
         if signals:
             signals = {name: signal.rows(clouds) for name, signal in signals.items()}
@@ -173,23 +175,30 @@ class CloudBatch(Structure):
             "recorded_signals": signals,
         }
 
-    def _facts_moved(self, matrix: Tensor, frame_id: str | None, unit: str | None) -> dict[str, Any]:
-        """Return what the clouds know after a motion by (B, 4, 4): the way back to the source absorbs its inverse."""
-        if self.recorded_signals:  # they stay as recorded: how the clouds moved is in source_from_cloud
-            refuse_mirror(type(self).__name__, self.recorded_signals, matrix)
-        viewpoint = self.viewpoint
-        if viewpoint is not None:
-            one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=viewpoint.device)
-            viewpoint = KINDS[Kind.POSITION].move(viewpoint, one_row_each, matrix)
-        source_from_cloud = self.source_from_cloud @ torch.linalg.inv(matrix)
+    def _facts_moved(self, matrices: Sequence[Tensor], frame_id: str | None, unit: str | None) -> dict[str, Any]:
+        """Return what the clouds know after motions by (B, 4, 4): the way back to the source absorbs their inverses."""
+        viewpoint, layout, source_from_cloud = self.viewpoint, self.layout, self.source_from_cloud
+        inverses = torch.linalg.inv(matrices[0] if len(matrices) == 1 else torch.cat(list(matrices)))
+        for matrix, inverse in zip(matrices, inverses.split(len(source_from_cloud))):
+            if self.recorded_signals:  # they stay as recorded: how the clouds moved is in source_from_cloud
+                refuse_mirror(type(self).__name__, self.recorded_signals, matrix)
+            if viewpoint is not None:
+                one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=viewpoint.device)
+                viewpoint = KINDS[Kind.POSITION].move(viewpoint, one_row_each, matrix)
+            source_from_cloud = source_from_cloud @ inverse
+            if layout is not None and not rigid.is_rigid(source_from_cloud):
+                layout = None
         known = {"frame_id": frame_id if frame_id is not None else self.frame_id, "unit": unit or self.unit}
         check_names(type(self).__name__, **known)
         return {
             **known,
-            "layout": self.layout if self.layout is not None and rigid.is_rigid(source_from_cloud) else None,
+            "layout": layout,
             "viewpoint": viewpoint,
             "source_from_cloud": source_from_cloud,
         }
+
+
+_FACTS = ("layout", "viewpoint", "source_from_cloud", "frames", "meta", "history", "recorded_signals")
 
 
 def check_names(where: str, frame_id: str, unit: str) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.rows import cloud_of_rows, join_rows, pad_rows, pick_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_rows, pick_rows, ptr_from_counts
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
 from pcdata.structures.cloud_checks import check_cloud
@@ -281,19 +281,20 @@ class PointCloud(CloudBatch):
         check_affine("PointCloud.transformed", matrix)
         matrix = matrix.to(dtype=torch.float64, device=self.device)
         rows = moved(self.fields(), self.kinds, self.ptr, matrix)
-        return self._with_rows(rows, **self._facts_moved(matrix, frame_id, unit))
+        return self._with_rows(rows, **self._facts_moved([matrix], frame_id, unit))
 
-    def with_facts_moved(self, matrix: Tensor) -> PointCloud:
-        """Do what :meth:`transformed` does, but leave the points as they are: the caller moves them.
+    def with_facts_moved(self, matrices: Sequence[Tensor]) -> PointCloud:
+        """Do what :meth:`transformed` does, by one matrix after another, but leave the points: the caller moves them.
 
         Args:
-            matrix: new_from_old, (B, 4, 4) float64.
+            matrices: new_from_old, (B, 4, 4) float64 each.
         """
-        matrix = matrix.to(dtype=torch.float64, device=self.device)
+        matrices = [matrix.to(dtype=torch.float64, device=self.device) for matrix in matrices]
         fields = self.fields()
         points = fields.pop("points")
-        rows = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
-        return self._with_rows({"points": points, **rows}, **self._facts_moved(matrix, None, None))
+        for matrix in matrices:
+            fields = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
+        return self._with_rows({"points": points, **fields}, **self._facts_moved(matrices, None, None))
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""
@@ -367,7 +368,7 @@ class PointCloud(CloudBatch):
         Raises:
             ShapeError: a cloud is longer than ``num_points``.
         """
-        counts = self.counts.tolist()
+        counts = listed_counts(self.ptr)
         if self.num_points == 0 or {*counts} != {counts[0] if num_points is None else num_points}:
             return self.cat_padded([self], num_points)
         shape = len(counts), counts[0]
@@ -386,7 +387,7 @@ class PointCloud(CloudBatch):
             if len(clouds) == 1:
                 return clouds[0].padded(num_points)
         parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
-        counts = [[stop - start for start, stop in itertools.pairwise(cloud.ptr.tolist())] for cloud in clouds]
+        counts = [listed_counts(cloud.ptr) for cloud in clouds]
         flat = list(itertools.chain.from_iterable(counts))
         width = max(flat) if num_points is None else num_points
         if max(flat) > width:

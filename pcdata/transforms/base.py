@@ -353,9 +353,9 @@ class Transform(nn.Module):
             TooFewPointsError: a cloud has lost its last point, or never had one.
         """
         keeps = before is not None and len(before) == len(after)
-        earlier: list[int | None] = [*before] if before is not None and keeps else [None] * len(after)
-        for b, (had, count) in enumerate(zip(earlier, after)):
-            if count or had == 0:
+        for b in [b for b, count in enumerate(after) if not count] if 0 in after else ():
+            had = before[b] if before is not None and keeps else None
+            if had == 0:
                 continue
             if had is not None:
                 raise TooFewPointsError(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pcdata.errors import PcdataError
 from pcdata.functional.noise import PointStep, move_points
-from pcdata.functional.rows import pick_rows
+from pcdata.functional.rows import listed_counts, pick_rows
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.structures.kinds import attributes
@@ -63,26 +63,33 @@ def run_motions(
 
 
 def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool) -> PointCloud:
-    points, ptr, layout = cloud.points, cloud.ptr, cloud.layout
+    points, ptr = cloud.points, cloud.ptr
     done: list[PointStep] = []
     kept: tuple[Tensor, Tensor] | None = None
-    for step in steps:
+    decided, counts = [], listed_counts(ptr)
+    for step in steps:  # none changes the frame or the unit, or looks at the points
         step.check_input(cloud)
         drawn = streams.here()
         params = step.make_params(cloud, streams)
+        decided.append((params, drawn, step.told_rows(cloud, params)))
         if isinstance(step, SpatialTransform):
-            moved = cloud.with_facts_moved(params["matrix"])
-            layout = layout and moved.layout
             done.append(params["matrix"])
         elif isinstance(step, RandomJitter):
-            moved, layout = cloud, None
             done.append(step.point_step(params))
         else:
             kept = params["index"], params["ptr"]
-            moved = derived(cloud, ptr=params["ptr"])
-        cloud = step.recorded(cloud, moved, params, drawn)
+    motions = [one for one in done if isinstance(one, Tensor)]
+    if motions:
+        cloud = cloud.with_facts_moved(motions)
+    layout = cloud.layout if len(motions) == len(done) else None  # noise leaves no point on its pixel
+    for step, (params, drawn, told) in zip(steps, decided, strict=True):
+        after = listed_counts(params["ptr"]) if "ptr" in params else counts
+        cloud = step.recorded_counts(cloud, counts, after, params, drawn=drawn, rows=told)
+        counts = after
     # Nothing is refused from here on: memory may change.
     rows = cloud.fields()
+    if kept is not None:
+        cloud = derived(cloud, ptr=kept[1])
     if done:
         rows["points"] = move_points(points, ptr, done, kept, in_place=in_place)
     if kept is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Annotated, Literal
 
 import torch
@@ -68,11 +70,16 @@ class RandomRotation(SpatialTransform):
             rotation = rigid.rotation_from_quaternion(quaternion)
         else:
             from_, to = self.degrees if isinstance(self.degrees, tuple) else (-self.degrees, self.degrees)
-            low, high = torch.deg2rad(torch.tensor([from_, to], dtype=torch.float64, device="cpu"))
-            angle = streams.uniform(low.item(), high.item())
-            axis = torch.nn.functional.normalize(torch.tensor(self.axis, dtype=torch.float64, device="cpu"), dim=0)
-            rotation = rigid.rotation_about_axis(axis.expand(len(angle), 3), angle)
+            rotation = rigid.rotation_about_axis(
+                _direction(self.axis), streams.uniform(math.radians(from_), math.radians(to))
+            )
         return {"matrix": _about(self.about, data, rotation)}
+
+
+@functools.lru_cache(maxsize=64)
+def _direction(axis: tuple[float, float, float]) -> Tensor:
+    """Return an axis of unit length, (1, 3); not to be changed."""
+    return torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64, device="cpu"), dim=0)[None]
 
 
 class RandomTranslation(SpatialTransform):
@@ -170,7 +177,7 @@ class RandomFlip(SpatialTransform):
 def _about(point: About, data: PointCloud, linear: Tensor) -> Tensor:
     """Return (B, 4, 4) that apply (B, 3, 3) about the origin, about each cloud's mean, or about a point."""
     if point == "origin":
-        return rigid.from_rotation_translation(linear, linear.new_zeros(3))
+        return rigid.from_rotation_translation(linear, linear.new_zeros((len(linear), 3)))
     if point == "centroid":
         center = segment_mean(data.points, data.ptr).to(linear.device)
     else:

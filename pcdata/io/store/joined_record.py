@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ def joined_record(
     arrays = {**arrays, "ptr": joined_ptr}
     read: Sequence[Any]
     if isinstance(owns, StoredTexts):
-        if bool((clouds == 1).all()) and _has_no_texts(arrays, common):
+        if bool((clouds == 1).all()) and signals_are_arrays(arrays, common):
             if not all(_lengths(one).min() for one in (owns, histories)):
                 return None
             return Record(arrays, {**common, "meta": StoredMeta(owns), "history": StoredSteps(histories)})
@@ -119,9 +119,14 @@ def joined_record(
     return Record(arrays, merged_info(common, own))
 
 
-def _has_no_texts(arrays: Mapping[str, NDArray[Any]], common: Mapping[str, Any]) -> bool:
-    """Whether all signals are arrays."""
-    return sum(name.startswith(SIGNALS) for name in arrays) == len(common.get("signals", ()))
+def signals_are_arrays(names: Iterable[str], common: Mapping[str, Any]) -> bool:
+    """Whether all signals of a record with such arrays are among them, and none is a text."""
+    return sum(name.startswith(SIGNALS) for name in names) == len(common.get("signals", ()))
+
+
+def is_per_point(name: str) -> bool:
+    """Whether an array of a record has a row for each point; the others, but for ``ptr``, have one for each cloud."""
+    return name in FIELDS or name.startswith(EXTRA)
 
 
 def _lengths(texts: StoredTexts) -> NDArray[np.int64]:
@@ -135,7 +140,7 @@ def _belong_together(
     for name, counts in rows.items():
         if name == "ptr":
             continue
-        wanted = points if name in FIELDS or name.startswith(EXTRA) else clouds
+        wanted = points if is_per_point(name) else clouds
         if not np.array_equal(counts, wanted):
             return False
     return True

@@ -12,12 +12,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.rows import copy_blocks
+from pcdata.functional.stored_rows import (
+    CLOUDS,
+    OTHERS,
+    Role,
+    StoredForm,
+    StoredGroups,
+    find_records,
+    gather_records,
+    parts_of,
+)
 from pcdata.io.store.cloud_record import DERIVED, Record, Room
-from pcdata.io.store.joined_record import joined_record
-from pcdata.io.store.packed_file import ALIGNED, PackedFile, PackedGroup
+from pcdata.io.store.joined_record import is_per_point, joined_record, signals_are_arrays
+from pcdata.io.store.packed_file import PackedColumn, PackedFile, PackedGroup
 from pcdata.io.store.store import INFO
-from pcdata.structures.read_later import StoredTexts
+from pcdata.structures.read_later import StoredMeta, StoredSteps, StoredTexts
 
 HISTORY = f"{INFO}.history"  # apart from the other facts: it is long, and seldom read
 
@@ -32,6 +41,7 @@ class PackedBatches:
         self._which = _Grown(np.int64, 2)  # (G, 2) its form, and its number among those of the form
         self._forms: dict[Any, _Form] = {}
         self._pointers = _Grown(np.int64)  # those of all columns whose records differ in their rows
+        self._groups = StoredGroups(self._firsts.tensor, self._which.tensor, self._pointers.tensor)
 
     def places_in(self, file: PackedFile) -> int:
         """Return the place of a file's first record; the others follow."""
@@ -63,71 +73,85 @@ class PackedBatches:
                 ]
             ]
         )
-        form.varies |= bool(pointers)
         self._firsts.add([self._num_records])
         self._which.add([[form.number, place]])
         self._num_records += group.size
+        form.update()
+        self._groups = StoredGroups(self._firsts.tensor, self._which.tensor, self._pointers.tensor)
 
     def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
         """Return the record of all clouds in a row; None where facts differ, or arrays in name, dtype or row."""
-        groups = np.searchsorted(self._firsts.rows, places, "right") - 1
-        which = self._which.rows[groups]
-        numbers = which[:, 0]
-        if (numbers != numbers[0]).any():
+        forms = list(self._forms.values())
+        form = forms[0] if len(forms) == 1 else forms[self._form_of(int(places[0]))]
+        groups, stored = self._groups, form.stored
+        table = find_records(torch.from_numpy(places), groups, stored)
+        found = parts_of(table, len(form.names), len(places))
+        if found.kind == OTHERS:
             return None
-        form = list(self._forms.values())[int(numbers[0])]
-        begins, first, counts = self._rows_of(form, which[:, 1], places - self._firsts.rows[groups])
-        sizes = counts * form.row_bytes
-        totals = sizes.sum(axis=0)
-        starts = np.concatenate([np.zeros(1, np.int64), (totals + -totals % ALIGNED).cumsum()])
-        memory = None if room is None else room(int(starts[-1]))
+        starts = found.starts.tolist()
+        memory = None if room is None else room(starts[-1])
         if memory is None:
-            memory = torch.empty(int(starts[-1]), dtype=torch.uint8, device="cpu")
-        copy_blocks(memory, starts[:-1] + sizes.cumsum(axis=0) - sizes, begins + first * form.row_bytes, sizes)
-        arrays = form.arrays(memory, starts, counts.sum(axis=0).tolist())
-        rows = dict(zip(form.names, counts.T))
-        texts = [StoredTexts(arrays.pop(name), rows.pop(name).cumsum()) for name in (INFO, HISTORY)]
-        record = joined_record(arrays, rows, form.facts, *texts)
+            memory = torch.empty(starts[-1], dtype=torch.uint8, device="cpu")
+        gather_records(memory, stored, table)
+        totals = found.ends[:, -1].tolist()
+        if found.kind == CLOUDS:
+            totals[found.pointers] = len(places) + 1
+        arrays = form.arrays(memory, starts, totals)
+        owns, histories = (
+            StoredTexts(arrays.pop(name), found.ends[form.names.index(name)]) for name in (INFO, HISTORY)
+        )
+        if found.kind == CLOUDS:
+            facts = {**form.facts, "meta": StoredMeta(owns), "history": StoredSteps(histories)}
+            return Record(arrays, facts, form)
+        rows = dict(zip(form.names, np.diff(found.ends, prepend=0)))
+        record = joined_record(arrays, {name: rows[name] for name in arrays}, form.facts, owns, histories)
         return record if record is None else Record(record.arrays, record.info, form)
 
-    def _rows_of(
-        self, form: _Form, groups: NDArray[np.int64], records: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Return where the columns of each record's group begin, its first row and its number of rows: (R, C)."""
-        tables = form.tables.rows[groups]
-        begins, counts, pointers = tables[..., 0], tables[..., 1], tables[..., 2]
-        first = counts * records[:, None]
-        if form.varies:
-            differ = pointers >= 0
-            at = np.where(differ, pointers + records[:, None], 0)
-            table = self._pointers.rows
-            from_table = table[at]
-            first = np.where(differ, from_table, first)
-            counts = np.where(differ, table[at + 1] - from_table, counts)
-        return begins, first, counts
+    def _form_of(self, place: int) -> int:
+        """Return the number of the form of a record."""
+        return int(self._which.rows[np.searchsorted(self._firsts.rows, place, "right") - 1, 0])
 
 
 class _Form:
     """What groups have in common whose records can be read as one."""
 
-    def __init__(self, number: int, facts: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
-        self.number = number
+    def __init__(self, number: int, facts: Mapping[str, Any], columns: Mapping[str, PackedColumn]) -> None:
         self.facts = facts
+        self.number = number
         self.names = tuple(columns)
-        self.varies = False  # whether records of some group differ in the rows of a column
         # (G, C, 3) of each column of each group: its address, the rows of every record, and where pointers to the rows
         # of each begin among those of all, -1 = it needs none.
         self.tables = _Grown(np.int64, len(columns), 3)
         self._kinds = [(one.values.dtype, one.values.shape[1:]) for one in columns.values()]
-        self.row_bytes = np.array([kind.itemsize * math.prod(row) for kind, row in self._kinds], dtype=np.int64)
+        row_bytes = [kind.itemsize * math.prod(row) for kind, row in self._kinds]
+        self._row_bytes = torch.tensor(row_bytes, dtype=torch.int64, device="cpu")
+        self._roles = torch.tensor(_roles(columns, facts), dtype=torch.int64, device="cpu")
+        self.update()
 
-    def arrays(self, memory: Tensor, starts: NDArray[np.int64], totals: list[int]) -> dict[str, NDArray[Any]]:
+    def update(self) -> None:
+        """Look at the tables anew, which a group was added to."""
+        self.stored = StoredForm(self.number, self.tables.tensor, self._row_bytes, self._roles)
+
+    def arrays(self, memory: Tensor, starts: list[int], totals: list[int]) -> dict[str, NDArray[Any]]:
         """Return the array of each column in memory, where they begin at some bytes."""
         held = memory.numpy()
         return {
             name: np.ndarray((total, *row), kind, held, start)
-            for name, (kind, row), start, total in zip(self.names, self._kinds, starts.tolist(), totals)
+            for name, (kind, row), start, total in zip(self.names, self._kinds, starts, totals)
         }
+
+
+def _roles(columns: Mapping[str, PackedColumn], facts: Mapping[str, Any]) -> list[Role]:
+    """Return what the rows of each column belong to; ANY where records of these columns are no clouds, or have texts.
+
+    Of such records :func:`joined_record` looks at the parts one by one.
+    """
+    ptr = columns.get("ptr")
+    is_cloud = ptr is not None and ptr.values.dtype == np.int64 and ptr.values.ndim == 1 and "points" in columns
+    if not (is_cloud and signals_are_arrays(columns, facts)):
+        return [Role.ANY] * len(columns)
+    named = {"ptr": Role.POINTERS, INFO: Role.TEXT, HISTORY: Role.TEXT}
+    return [named.get(name, Role.PER_POINT if is_per_point(name) else Role.PER_CLOUD) for name in columns]
 
 
 class _Grown:
@@ -136,6 +160,7 @@ class _Grown:
     def __init__(self, dtype: Any, *row: int) -> None:
         self._held: NDArray[Any] = np.empty((64, *row), dtype)
         self._size = 0
+        self.tensor = torch.from_numpy(self._held[:0])  # of the same memory as `rows`
 
     @property
     def rows(self) -> NDArray[Any]:
@@ -150,4 +175,5 @@ class _Grown:
             self._held = grown
         self._held[first:size] = rows
         self._size = size
+        self.tensor = torch.from_numpy(self.rows)
         return first

@@ -12,7 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -236,12 +236,12 @@ class Shards:
     def let_go(self, numbers: Sequence[int]) -> None:
         """Forget records that were held."""
 
-    @contextmanager
-    def held(self, numbers: NDArray[np.int64]) -> Iterator[None]:
+    def held(self, numbers: NDArray[np.int64]) -> AbstractContextManager[None]:
         """Hold some records while they are asked for several times."""
-        if not self.reads_ahead:
-            yield
-            return
+        return self._holding(numbers) if self.reads_ahead else nullcontext()
+
+    @contextmanager
+    def _holding(self, numbers: NDArray[np.int64]) -> Iterator[None]:
         own = numbers.tolist()
         self.hold(own)
         try:

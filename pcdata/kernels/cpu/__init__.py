@@ -12,6 +12,7 @@ from pcdata.kernels.cpu import rendering as cpu_rendering
 from pcdata.kernels.cpu import rows as cpu_rows
 from pcdata.kernels.cpu import sampling as cpu_sampling
 from pcdata.kernels.cpu import selection as cpu_selection
+from pcdata.kernels.cpu import stored_rows as cpu_stored_rows
 from pcdata.kernels.cpu.native import unavailable
 
 __all__ = [
@@ -25,5 +26,6 @@ __all__ = [
     "cpu_rows",
     "cpu_sampling",
     "cpu_selection",
+    "cpu_stored_rows",
     "unavailable",
 ]

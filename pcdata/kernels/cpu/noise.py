@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import pcdata.functional.noise  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.noise import PointStep
-from pcdata.kernels.cpu.native import call, numbers, room, room_for
+from pcdata.kernels.cpu.native import call, room, room_for
 
 
 @kernel("move_points", "cpu")
@@ -44,21 +44,20 @@ def _run(
     moved: Tensor,
 ) -> None:
     clouds = len(ptr) - 1
-    matrices = torch.zeros((len(steps), clouds, 4, 4), dtype=torch.float64, device="cpu")
-    seeds = torch.zeros((len(steps), clouds), dtype=torch.int64, device="cpu")
-    sigmas, clips = [], []
+    matrices, seeds = np.zeros((len(steps), clouds, 4, 4)), np.zeros((len(steps), clouds), np.int64)
+    noises, sigmas, clips = np.zeros(len(steps), np.int64), np.zeros(len(steps)), np.full(len(steps), np.inf)
     for number, step in enumerate(steps):
         if isinstance(step, Tensor):
-            matrices[number], sigma, clip = step, 0.0, None
+            matrices[number] = step.numpy(force=True)
         else:
-            seeds[number], sigma, clip = step
-        sigmas.append(sigma)
-        clips.append(math.inf if clip is None else clip)
+            noises[number], sigmas[number] = 1, step[1]
+            seeds[number] = step[0].numpy(force=True)
+            if step[2] is not None:
+                clips[number] = step[2]
     call(
         "pc_move_points",
-        *(points, ptr.contiguous(), clouds, len(steps)),
-        *(numbers(not isinstance(step, Tensor) for step in steps), matrices, seeds),
-        *(torch.tensor(values, dtype=torch.float64, device="cpu") for values in (sigmas, clips)),
+        *(points, None, ptr.contiguous(), clouds, len(steps)),
+        *map(torch.from_numpy, (noises, matrices, seeds, sigmas, clips)),
         *(*kept, moved),
     )
 

@@ -11,15 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import pcdata.functional.rows
 import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.kernels.cpu.native import address, addresses, call, numbers, room, room_for
+from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
 
 _ROWS_PER_PIECE = 16384  # as in rows.cpp
 _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
@@ -78,15 +76,6 @@ def _are_plain(fields: Sequence[Tensor], num_rows: int) -> bool:
         if not strided or field.shape[0] != num_rows or field.is_conj() or field.is_neg():
             return False
     return True
-
-
-@kernel("copy_blocks", "cpu")
-def copy_blocks(
-    into: Tensor, begins: NDArray[np.int64], addresses: NDArray[np.int64], sizes: NDArray[np.int64]
-) -> None:
-    """Copy all in one call."""
-    blocks = (np.ascontiguousarray(one).reshape(-1) for one in (addresses, sizes, begins + address(into)))
-    call("pc_copy_blocks", sizes.size, *map(torch.from_numpy, blocks))
 
 
 @kernel("join_rows", "cpu")

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x639E33E381B18B3
+INTERFACE_NUMBER = 0x1E4C4122838B6F6
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -25,11 +25,13 @@ pc_take_rows: int64* index, int64 num_picked, int64 rows, int64 num_fields, int6
     picked, int64* possible
 pc_place_rows: int64 num_parts, int64* counts, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64*
     fillers, int64* blocks
-pc_copy_blocks: int64 num_blocks, int64* sources, int64* sizes, int64* destinations
+pc_find_records: int64* places, int64 num_records, int64* firsts, int64* which, int64 num_groups, int64 form, int64*
+    tables, int64* pointers, int64 num_columns, int64* row_bytes, int64* roles, int64* table
+pc_gather_records: int64 num_records, int64 num_columns, int64* row_bytes, int64* roles, int64* table, uint8* into
 pc_transform_points: float* points, int64* ptr, int64 num_clouds, double* matrices, float* moved
 pc_transform_directions: float* directions, int64* ptr, int64 num_clouds, double* linear, float* turned
-pc_move_points: float* points, int64* ptr, int64 num_clouds, int64 num_steps, int64* is_noise, double* matrices, int64*
-    seeds, double* sigma, double* clip, uint8* kept, int64* kept_ptr, float* moved
+pc_move_points: float* points, int64* sources, int64* ptr, int64 num_clouds, int64 num_steps, int64* is_noise, double*
+    matrices, int64* seeds, double* sigma, double* clip, uint8* kept, int64* kept_ptr, float* moved
 pc_random_rows: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, uint8* mask
 pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
 pc_box_mask: float* points, int64* ptr, int64 num_clouds, float* lower, float* upper, uint8* inside

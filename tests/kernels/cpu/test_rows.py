@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -190,12 +189,3 @@ def test_rows_are_kept_in_their_own_memory_as_in_other(count, share):
             kept = body(own, mask, in_place=in_place)
             assert all(torch.equal(kept[name], wanted[name]) for name in fields)
         assert all(kept[name].data_ptr() == own[name].data_ptr() for name in fields if len(kept[name]))
-
-
-def test_blocks_are_copied_from_where_they_lie():
-    source = torch.arange(100, dtype=torch.uint8)
-    begins, starts, sizes = (np.array(row) for row in ([[0, 9], [20, 3]], [[3, 40], [30, 0]], [[3, 11], [4, 0]]))
-    for body in (INNER["copy_blocks"].kernels["cpu"], INNER["copy_blocks"].reference):
-        into = torch.zeros(24, dtype=torch.uint8)
-        body(into, begins, starts + source.data_ptr(), sizes)
-        assert into.tolist() == [3, 4, 5, *[0] * 6, *range(40, 51), *range(30, 34)]

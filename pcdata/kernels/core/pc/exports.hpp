@@ -95,9 +95,23 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
                                 const int64_t* starts, int64_t num_fields, const int64_t* sources,
                                 const int64_t* row_bytes, const int64_t* fillers, const int64_t* blocks);
 
-// Copy blocks of sizes (blocks,) bytes from addresses to addresses; no two may overlap.
-PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
-                                 const int64_t* sizes, const int64_t* destinations);
+// Find records (num_records,) by their places. Group g has the records from place firsts[g] on, and which (groups, 2):
+// its form, and its number among those of the form. tables (groups of the form, columns, 3) say of a column of a group
+// its address, how many rows every record has, and where among `pointers` those to the rows of each begin, -1 = as many
+// in all. roles (columns,): 0 any rows, 1 a row for each point, 2 one for each cloud, 3 row pointers, 4 a text.
+// table, int64: what was found, 0 = a record of another form, and nothing else is written, 1 = rows, 2 = one cloud
+// each; the column of row pointers, or -1; starts (columns + 1,): the bytes where each column begins once its records
+// are copied, multiples of 64; ends (columns, records): the rows up to and with each; and of the rows of each their
+// sources (columns, records), addresses, and sizes (columns, records), bytes.
+PC_EXPORT int32_t pc_find_records(const pc_context* context, const int64_t* places, int64_t num_records,
+                                  const int64_t* firsts, const int64_t* which, int64_t num_groups, int64_t form,
+                                  const int64_t* tables, const int64_t* pointers, int64_t num_columns,
+                                  const int64_t* row_bytes, const int64_t* roles, int64_t* table);
+
+// Copy what was found to starts[columns] bytes. Of one cloud each, the row pointers are those of all.
+PC_EXPORT int32_t pc_gather_records(const pc_context* context, int64_t num_records, int64_t num_columns,
+                                    const int64_t* row_bytes, const int64_t* roles, const int64_t* table,
+                                    uint8_t* into);
 
 // moved (N, 3) = matrix (clouds, 4, 4) of each point's cloud @ point, in float64, rounded once.
 PC_EXPORT int32_t pc_transform_points(const pc_context* context, const float* points, const int64_t* ptr,
@@ -109,14 +123,15 @@ PC_EXPORT int32_t pc_transform_directions(const pc_context* context, const float
                                           int64_t num_clouds, const double* linear, float* turned);
 
 // moved (M, 3) = the points (N, 3) after num_steps steps, rounded to float after each; points and moved may be the
-// same. Step s is a motion by matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum
-// with normal numbers of the seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size. Of the points
-// only those where the mask kept (N,) is true are written, one after another, those of each cloud to kept_ptr (clouds +
-// 1,); both may be null: then all are.
-PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 int64_t num_steps, const int64_t* is_noise, const double* matrices,
-                                 const int64_t* seeds, const double* sigma, const double* clip, const uint8_t* kept,
-                                 const int64_t* kept_ptr, float* moved);
+// same. Where sources (clouds,) is not null, the points of each cloud lie at its address instead. Step s is a motion by
+// matrices (steps, clouds, 4, 4) in float64, or, where is_noise (steps,) is not 0, the sum with normal numbers of the
+// seeds (steps, clouds), times sigma (steps,), at most clip (steps,) in size. Of the points only those where the mask
+// kept (N,) is true are written, one after another, those of each cloud to kept_ptr (clouds + 1,); both may be null:
+// then all are.
+PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* sources,
+                                 const int64_t* ptr, int64_t num_clouds, int64_t num_steps, const int64_t* is_noise,
+                                 const double* matrices, const int64_t* seeds, const double* sigma, const double* clip,
+                                 const uint8_t* kept, const int64_t* kept_ptr, float* moved);
 
 // mask (sum of counts,): of each cloud's counts (clouds,) rows the wanted (clouds,) become 1 that its seed chooses, the
 // others 0.

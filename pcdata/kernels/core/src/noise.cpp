@@ -99,29 +99,35 @@ struct Steps {
 }  // namespace
 }  // namespace pc::noise
 
-PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 int64_t num_steps, const int64_t* is_noise, const double* matrices,
-                                 const int64_t* seeds, const double* sigma, const double* clip, const uint8_t* kept,
-                                 const int64_t* kept_ptr, float* moved) {
+PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points, const int64_t* sources,
+                                 const int64_t* ptr, int64_t num_clouds, int64_t num_steps, const int64_t* is_noise,
+                                 const double* matrices, const int64_t* seeds, const double* sigma, const double* clip,
+                                 const uint8_t* kept, const int64_t* kept_ptr, float* moved) {
   using namespace pc;
   using namespace pc::noise;
   return guarded([&] {
     const Steps steps{num_steps, num_clouds, is_noise, matrices, seeds, sigma, clip};
+    // The rows from `row` on, which are of a cloud.
+    const auto rows_at = [&](int64_t cloud, int64_t row) {
+      if (sources == nullptr) return points + 3 * row;
+      return reinterpret_cast<const float*>(sources[cloud]) + 3 * (row - ptr[cloud]);
+    };
     if (kept != nullptr) {
       // In the same memory a cloud is written where those before it were.
       const pc_context alone{1, context->poll};
-      parallel_for(points == moved ? alone : *context, num_clouds, 1, [&](int64_t first, int64_t last, int64_t) {
-        for (int64_t cloud = first; cloud < last; ++cloud) {
-          float* to = moved + 3 * kept_ptr[cloud];
-          for (int64_t row = ptr[cloud], number = 0; row < ptr[cloud + 1]; row += kBlock, ++number) {
-            const int64_t count = std::min<int64_t>(kBlock, ptr[cloud + 1] - row);
-            Block block;
-            block.load(points + 3 * row, count);
-            steps.run(block, cloud, number);
-            to += 3 * block.store_kept(to, kept + row, count);
-          }
-        }
-      });
+      parallel_for(sources == nullptr && points == moved ? alone : *context, num_clouds, 1,
+                   [&](int64_t first, int64_t last, int64_t) {
+                     for (int64_t cloud = first; cloud < last; ++cloud) {
+                       float* to = moved + 3 * kept_ptr[cloud];
+                       for (int64_t row = ptr[cloud], number = 0; row < ptr[cloud + 1]; row += kBlock, ++number) {
+                         const int64_t count = std::min<int64_t>(kBlock, ptr[cloud + 1] - row);
+                         Block block;
+                         block.load(rows_at(cloud, row), count);
+                         steps.run(block, cloud, number);
+                         to += 3 * block.store_kept(to, kept + row, count);
+                       }
+                     }
+                   });
       return;
     }
     // A piece is a part of the rows of all clouds; blocks begin at a cloud's first row, so that noise keeps its pairs.
@@ -134,7 +140,7 @@ PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points,
         for (; row < std::min(last, end); row += kBlock) {
           const int64_t count = std::min<int64_t>(kBlock, end - row);
           Block block;
-          block.load(points + 3 * row, count);
+          block.load(rows_at(cloud, row), count);
           steps.run(block, cloud, (row - begin) / kBlock);
           block.store(moved + 3 * row, count);
         }

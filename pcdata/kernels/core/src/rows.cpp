@@ -155,17 +155,3 @@ PC_EXPORT int32_t pc_place_rows(const pc_context* context, int64_t num_parts, co
     });
   });
 }
-
-PC_EXPORT int32_t pc_copy_blocks(const pc_context* context, int64_t num_blocks, const int64_t* sources,
-                                 const int64_t* sizes, const int64_t* destinations) {
-  using namespace pc;
-  constexpr int64_t kBlocksPerPiece = 8;
-  return guarded([&] {
-    parallel_for(*context, num_blocks, kBlocksPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      for (int64_t block = first; block < last; ++block)
-        if (sizes[block] > 0)
-          std::memcpy(reinterpret_cast<char*>(destinations[block]), reinterpret_cast<const char*>(sources[block]),
-                      static_cast<size_t>(sizes[block]));
-    });
-  });
-}
