@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pcdata.datasets.batch_transport import batch_memory
 from pcdata.datasets.first_touch import FirstTouch
@@ -226,33 +227,44 @@ class CachedCloudDataset(SampleDataset):
         locate(error, path=path)
         return error
 
-    def _load_at_once(self, numbers: NDArray[np.int64]) -> PointCloud | None:
-        """Return the clouds of some samples as one batch; None where that of one by one would be another."""
-        rows = self._rows_of(numbers)
+    def _load_at_once(
+        self, numbers: NDArray[np.int64], *, leave_points: bool = False
+    ) -> tuple[PointCloud | None, Tensor | None]:
+        """Return the clouds of some samples as one batch; None where that of one by one would be another.
+
+        And where their points lie, if they were left there: ``leave_points`` allows it.
+        """
+        rows, sources = self._rows_of(numbers), None
         with self._shards.held(rows):
-            record = self._shards.read_joined(rows, batch_memory) if self._compared(rows) else None
+            record = None
+            if self._compared(rows):
+                record = self._shards.read_joined(rows, batch_memory, leave_points=leave_points)
         if record is None:
             single = [self._load(number) for number in numbers.tolist()]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
-                return None
+                return None, None
             clouds = PointCloud.cat(single)
         else:
             clouds = self._forms.cloud(record)
+            sources = None if record.sources is None else torch.from_numpy(record.sources)
         # One cloud each, since none has fewer.
         ptr, wanted = clouds.ptr.numpy(), self.manifest.index.num_points[rows]
-        return clouds if len(ptr) == len(wanted) + 1 and (ptr[1:] - ptr[:-1] == wanted).all() else None
+        fits = len(ptr) == len(wanted) + 1 and bool((ptr[1:] - ptr[:-1] == wanted).all())
+        return (clouds, sources) if fits else (None, None)
 
     def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         if not runs_on_batches(self.transform):
             return None
         batches = []
+        chain = self.transform if type(self.transform) is Compose and len(self.transform) else None
+        leave_points = chain is not None and chain.begins_with_motions
         for part in self._parts(numbers):
-            clouds = self._load_at_once(numbers[part])
+            clouds, sources = self._load_at_once(numbers[part], leave_points=leave_points)
             if clouds is None:
                 return None
             own = None if streams is None else streams.part(part)
-            if type(self.transform) is Compose and len(self.transform):  # the clouds were read for this batch alone
-                batches.append(self.transform.consume(clouds, generator=own))
+            if chain is not None:  # the clouds were read for this batch alone
+                batches.append(chain.consume(clouds, generator=own, sources=sources))
             else:
                 batches.append(self._transformed(clouds, own))
         return Unbatched(batches)

@@ -161,7 +161,7 @@ class EpisodeWindows(SampleDataset):
         shown = steps[:, : self.num_obs].ravel()
         batches = []
         for part in self.dataset._parts(shown, self.num_obs):
-            clouds = self.dataset._load_at_once(shown[part])
+            clouds, _ = self.dataset._load_at_once(shown[part])
             if clouds is None:
                 return None
             windows = slice(part.start // self.num_obs, part.stop // self.num_obs)

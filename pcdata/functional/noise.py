@@ -6,7 +6,9 @@ square roots alone, which every processor rounds in the same way; no library's l
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -82,11 +84,18 @@ def move_points(
     kept: tuple[Tensor, Tensor] | None = None,
     *,
     in_place: bool = False,
+    sources: Tensor | None = None,
 ) -> Tensor:
     """Move (N, 3) float32 points by some steps, rounded to float32 after each; ``in_place`` in their own memory.
 
-    ``kept`` says which are returned: a (N,) bool mask, and the (B+1,) row pointers of those.
+    ``kept`` says which are returned: a (N,) bool mask, and the (B+1,) row pointers of those. ``sources`` (B,) int64 are
+    the addresses of each cloud's points, in memory that somebody holds; then ``points`` is room for the result alone.
     """
+    if sources is not None:
+        in_place, held = True, points.numpy()
+        for address, (start, stop) in zip(sources.tolist(), pairwise(ptr.tolist())):
+            if stop > start:
+                held[start:stop].reshape(-1)[:] = (ctypes.c_float * (3 * (stop - start))).from_address(address)
     before = points
     for step in steps:
         if isinstance(step, Tensor):

@@ -8,10 +8,11 @@ from itertools import zip_longest
 from os import PathLike
 from typing import Any
 
-from torch import Generator, nn
+from torch import Generator, Tensor, nn
 
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
+from pcdata.functional.noise import move_points
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Data, Transform, num_clouds, sha256_of
@@ -20,7 +21,7 @@ from pcdata.transforms.chain_rules import check_chain, warn_of_order
 from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
-from pcdata.transforms.fused_motions import motions_from, run_motions
+from pcdata.transforms.fused_motions import motions_from, moves_blindly, run_motions
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -91,11 +92,22 @@ class Compose(Transform):
         """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
         return self._run(data, generator)
 
-    def consume(self, data: PointCloud, *, generator: GeneratorLike | None = None) -> Any:
-        """Run every step on clouds that nobody else holds: their memory may be used for the result."""
-        return self._run(data, generator, is_own=not data.points.requires_grad)
+    def consume(
+        self, data: PointCloud, *, generator: GeneratorLike | None = None, sources: Tensor | None = None
+    ) -> Any:
+        """Run every step on clouds that nobody else holds: their memory may be used for the result.
 
-    def _run(self, data: Data, generator: GeneratorLike | None, *, is_own: bool = False) -> Any:
+        Args:
+            data: the clouds.
+            generator: as of any step.
+            sources: (B,) int64 addresses where the points of each cloud lie, in memory that somebody holds; the clouds
+                have only room for them. None = they have them.
+        """
+        return self._run(data, generator, is_own=not data.points.requires_grad, sources=sources)
+
+    def _run(
+        self, data: Data, generator: GeneratorLike | None, *, is_own: bool = False, sources: Tensor | None = None
+    ) -> Any:
         position, generator = self._enter(data, generator)
         steps = list(self.steps)
         beginning = self._beginning
@@ -111,15 +123,24 @@ class Compose(Transform):
             if together > 1 - is_own and isinstance(data, PointCloud):
                 assert generator is not None
                 generator = Streams.of(generator, num_clouds(data))
-                cloud = run_motions(steps[position : position + together], data, generator, in_place=is_own)
+                own = steps[position : position + together]
+                cloud = run_motions(own, data, generator, in_place=is_own, sources=sources)
                 if cloud is not None:
-                    data, position = cloud, position + together
+                    data, position, sources = cloud, position + together, None
                     continue
+            if sources is not None and isinstance(data, PointCloud):
+                move_points(data.points, data.ptr, (), sources=sources)
+                sources = None
             # What a step gives may share its memory with what it got, or with its params.
             is_own = False
             data, generator = _step(steps[position], data, generator)
             position += 1
         return data
+
+    @property
+    def begins_with_motions(self) -> bool:
+        """Whether clouds are moved, or jittered, before anybody looks at their points: see :meth:`consume`."""
+        return moves_blindly(list(self.steps)[self._captures :])
 
     def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
         """Yield ``(step, data)`` after every step, for looking inside."""

@@ -39,6 +39,11 @@ def motions_from(steps: Sequence[Transform], position: int) -> int:
     return count
 
 
+def moves_blindly(steps: Sequence[Transform]) -> bool:
+    """Whether the first of some steps moves points, or adds noise, in a way that :func:`run_motions` takes."""
+    return bool(steps) and motions_from(steps[:1], 0) == 1 and _is_blind(steps[0])
+
+
 def _is_blind(step: Transform) -> bool:
     """Whether a step moves points, or adds noise, without having looked at them."""
     # Exact types: a subclass may do something else.
@@ -48,21 +53,29 @@ def _is_blind(step: Transform) -> bool:
 
 
 def run_motions(
-    steps: Sequence[Transform], cloud: PointCloud, streams: Streams, *, in_place: bool = False
+    steps: Sequence[Transform],
+    cloud: PointCloud,
+    streams: Streams,
+    *,
+    in_place: bool = False,
+    sources: Tensor | None = None,
 ) -> PointCloud | None:
     """Run steps that :func:`motions_from` found; None where they must be run one by one, with the same draws.
 
-    ``in_place``: the rows are nobody else's, and their memory takes the result.
+    ``in_place``: the rows are nobody else's, and their memory takes the result. ``sources`` are the addresses where the
+    points of each cloud lie, which the cloud does not hold yet.
     """
     before = streams.place
     try:
-        return _run(steps, cloud, streams, in_place)
+        return _run(steps, cloud, streams, in_place, sources)
     except PcdataError:
         streams.place = before
         return None  # the step that refuses says why
 
 
-def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool) -> PointCloud:
+def _run(
+    steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool, sources: Tensor | None
+) -> PointCloud:
     points, ptr = cloud.points, cloud.ptr
     done: list[PointStep] = []
     kept: tuple[Tensor, Tensor] | None = None
@@ -90,9 +103,9 @@ def _run(steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_pla
     rows = cloud.fields()
     if kept is not None:
         cloud = derived(cloud, ptr=kept[1])
-    if done:
-        rows["points"] = move_points(points, ptr, done, kept, in_place=in_place)
+    if done or sources is not None:
+        rows["points"] = move_points(points, ptr, done, kept, in_place=in_place, sources=sources)
     if kept is not None:
-        others = {name: value for name, value in rows.items() if name != "points" or not done}
+        others = {name: value for name, value in rows.items() if name != "points" or not (done or sources is not None)}
         rows |= pick_rows(others, kept[0], in_place=in_place)
     return derived(cloud, **attributes(rows), layout=layout)

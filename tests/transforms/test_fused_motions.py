@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pcdata.contracts.dispatch import INNER
 from pcdata.errors import PoseError
 from pcdata.rng import Streams
+from pcdata.structures.structure import derived
 from pcdata.transforms import (
     Compose,
     RandomFlip,
@@ -51,6 +53,32 @@ def test_clouds_of_ones_own_come_out_the_same_in_their_memory(steps):
     assert_same(made, wanted)
     assert made.history == wanted.history
     assert made.points.data_ptr() == memory or len(steps) == len(CHAIN)
+
+
+@pytest.mark.parametrize("steps", [[RandomRotation(), RandomJitter()], CHAIN[:6], CHAIN[5:6], CHAIN], ids=len)
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+def test_points_are_moved_from_where_each_cloud_has_them(steps, backend, monkeypatch):
+    if backend == "torch":
+        monkeypatch.setattr(INNER["move_points"], "kernels", {})
+    chain, cloud = Compose(steps), cloud_in_base((70, 0, 333, 1))
+    wanted = chain(cloud, generator=Streams([1, 2, 3, 4]))
+    parts = [part.points.clone() for part in reversed(cloud.unbatch())][::-1]  # elsewhere, and in another order
+    sources = torch.tensor([part.data_ptr() for part in parts])
+    empty = derived(cloud, points=torch.full_like(cloud.points, torch.nan))
+    made = chain.consume(empty, generator=Streams([1, 2, 3, 4]), sources=sources)
+    assert_same(made, wanted)
+    assert made.history == wanted.history
+
+
+def test_points_that_were_left_are_there_for_steps_that_run_alone():
+    chain, cloud = Compose([RandomRotation(), RandomScale()]), cloud_in_base((20, 5))
+    wanted = chain(cloud, generator=Streams([1, 2]))
+    parts = [part.points.clone() for part in cloud.unbatch()]
+    empty = derived(cloud, points=torch.full_like(cloud.points, torch.nan))
+    chain.steps[0].register_forward_hook(lambda *_: None)  # somebody watches it
+    assert not chain.begins_with_motions
+    made = chain.consume(empty, generator=Streams([1, 2]), sources=torch.tensor([part.data_ptr() for part in parts]))
+    assert_same(made, wanted)
 
 
 def test_only_steps_that_do_not_look_at_the_points_run_together():

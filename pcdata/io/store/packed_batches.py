@@ -79,8 +79,11 @@ class PackedBatches:
         form.update()
         self._groups = StoredGroups(self._firsts.tensor, self._which.tensor, self._pointers.tensor)
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
-        """Return the record of all clouds in a row; None where facts differ, or arrays in name, dtype or row."""
+    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+        """Return the record of all clouds in a row; None where facts differ, or arrays in name, dtype or row.
+
+        With ``leave_points`` float32 points stay where they lie, if each record is one cloud.
+        """
         forms = list(self._forms.values())
         form = forms[0] if len(forms) == 1 else forms[self._form_of(int(places[0]))]
         groups, stored = self._groups, form.stored
@@ -92,6 +95,10 @@ class PackedBatches:
         memory = None if room is None else room(starts[-1])
         if memory is None:
             memory = torch.empty(starts[-1], dtype=torch.uint8, device="cpu")
+        sources = None
+        if leave_points and found.kind == CLOUDS and form.points is not None:
+            sources = found.sources[form.points]
+            found.sizes[form.points] = 0  # nothing is copied
         gather_records(memory, stored, table)
         totals = found.ends[:, -1].tolist()
         if found.kind == CLOUDS:
@@ -102,7 +109,7 @@ class PackedBatches:
         )
         if found.kind == CLOUDS:
             facts = {**form.facts, "meta": StoredMeta(owns), "history": StoredSteps(histories)}
-            return Record(arrays, facts, form)
+            return Record(arrays, facts, form, sources)
         rows = dict(zip(form.names, np.diff(found.ends, prepend=0)))
         record = joined_record(arrays, {name: rows[name] for name in arrays}, form.facts, owns, histories)
         return record if record is None else Record(record.arrays, record.info, form)
@@ -123,6 +130,9 @@ class _Form:
         # of each begin among those of all, -1 = it needs none.
         self.tables = _Grown(np.int64, len(columns), 3)
         self._kinds = [(one.values.dtype, one.values.shape[1:]) for one in columns.values()]
+        # The column of points that can be moved where they lie.
+        are_plain = "points" in columns and self._kinds[self.names.index("points")] == (np.dtype(np.float32), (3,))
+        self.points = self.names.index("points") if are_plain else None
         row_bytes = [kind.itemsize * math.prod(row) for kind, row in self._kinds]
         self._row_bytes = torch.tensor(row_bytes, dtype=torch.int64, device="cpu")
         self._roles = torch.tensor(_roles(columns, facts), dtype=torch.int64, device="cpu")

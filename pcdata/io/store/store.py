@@ -40,10 +40,11 @@ class BatchReader(Protocol):
         """
         ...
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
+    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
         """Return the record of all clouds of some places in a row; None where these records can have none.
 
-        ``room`` gives memory for the arrays; a reader may leave it unasked.
+        ``room`` gives memory for the arrays; a reader may leave it unasked. With ``leave_points`` it may leave the
+        points where they lie, and say where: see :class:`Record`.
 
         Raises:
             CacheError: as for :meth:`Store.read`.

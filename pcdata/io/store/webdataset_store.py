@@ -232,8 +232,8 @@ class _Reader:
         self._records += [(store, key) for key in keys]
         return np.arange(first, len(self._records))
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None) -> Record | None:
-        """Return the record of all clouds."""
+    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+        """Return the record of all clouds, points and all."""
         parts: list[_Parts] = []
         records = [self._records[place] for place in places.tolist()]
         for store, key in records:

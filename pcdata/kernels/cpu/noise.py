@@ -22,22 +22,25 @@ def move_points(
     kept: tuple[Tensor, Tensor] | None = None,
     *,
     in_place: bool = False,
+    sources: Tensor | None = None,
 ) -> Tensor:
     """Take every point through all steps while it is in the cache."""
     fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and len(ptr) > 1 and int(ptr[-1]) == len(points)
+    in_place = in_place or sources is not None
     if not fits or not steps or int(ptr[0]) != 0 or (in_place and not points.is_contiguous()):
-        return INNER["move_points"].reference(points, ptr, steps, kept, in_place=in_place)
+        return INNER["move_points"].reference(points, ptr, steps, kept, in_place=in_place, sources=sources)
     mask, kept_ptr = (None, None) if kept is None else kept
     count = len(points) if kept_ptr is None else int(kept_ptr[-1])
     moved = points if kept_ptr is None else points[:count]
     if not in_place:
         (moved,) = room_for(((count, 3), points.dtype))
-    _run(points.contiguous(), ptr, steps, (mask, kept_ptr), moved)
+    _run(points.contiguous(), sources, ptr, steps, (mask, kept_ptr), moved)
     return moved
 
 
 def _run(
     points: Tensor,
+    sources: Tensor | None,
     ptr: Tensor,
     steps: Sequence[PointStep],
     kept: tuple[Tensor | None, Tensor | None],
@@ -56,7 +59,7 @@ def _run(
                 clips[number] = step[2]
     call(
         "pc_move_points",
-        *(points, None, ptr.contiguous(), clouds, len(steps)),
+        *(points, sources, ptr.contiguous(), clouds, len(steps)),
         *map(torch.from_numpy, (noises, matrices, seeds, sigmas, clips)),
         *(*kept, moved),
     )
