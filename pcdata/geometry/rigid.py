@@ -78,7 +78,8 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
     eye = torch.eye(4, dtype=torch.float64, device=flat.device)
     error = (rotation @ rotation.mT - eye[:3, :3]).abs().amax((1, 2))
     mirrored, off = torch.linalg.det(rotation) < 0, (last - eye[3]).abs().amax(1)
-    wrong = ~(error <= tolerance) | mirrored | ~(off <= 1e-6)  # of a pose with NaN the comparisons are false
+    finite = flat.isfinite().flatten(1).all(1)  # a translation enters into none of the comparisons
+    wrong = ~finite | (error > tolerance) | mirrored | (off > 1e-6)
     for index in wrong.nonzero().squeeze(1).tolist():
         name = f"{where}: pose {index}" if len(flat) > 1 else f"{where}: the pose"
         matrix = flat[index]
