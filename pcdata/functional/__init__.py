@@ -22,6 +22,7 @@ from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.interpolation import interpolate_features
 from pcdata.functional.metrics import chamfer_distance, f_score, hausdorff_distance
+from pcdata.functional.neighbor_index import NeighborIndex
 from pcdata.functional.neighborhoods import SHAPE_FEATURES, neighborhood_covariance, shape_features
 from pcdata.functional.neighbors import ball_query, knn, radius_neighbors
 from pcdata.functional.normals import estimate_normals, orient_normals
@@ -61,6 +62,7 @@ __all__ = [
     "DepthAverage",
     "GraspChecks",
     "ImageGrid",
+    "NeighborIndex",
     "PairedMotion",
     "ParallelJaw",
     "RegisteredDepth",

@@ -12,6 +12,8 @@ where a distance is 0.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -23,6 +25,9 @@ from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, rooted, squared_distance
 from pcdata.functional.rows import ptr_from_counts
+
+# What finds the nearest rows of stated points: nearest_rows, with its points.
+Find = Callable[..., tuple[Tensor, Tensor]]
 
 # Neighbors of a query that radius_neighbors asks for at first, and places in a table that it fills at once.
 _FIRST, _PLACES = 32, 1 << 22
@@ -116,7 +121,7 @@ def knn(
         ConfigError: k is less than 1, or exclude_self with other queries.
     """
     assert ptr is not None  # @op fills it
-    return _neighbors("knn", points, ptr, k, queries, queries_ptr, None, exclude_self, grid, backend)
+    return nearest("knn", finder(points, ptr, grid, backend), points, k, queries, queries_ptr, None, exclude_self)
 
 
 @op(
@@ -163,9 +168,8 @@ def ball_query(
             queries.
     """
     assert ptr is not None  # @op fills it
-    found = _neighbors(
-        "ball_query", points, ptr, max_neighbors, queries, queries_ptr, radius, exclude_self, grid, backend
-    )
+    find = finder(points, ptr, grid, backend)
+    found = nearest("ball_query", find, points, max_neighbors, queries, queries_ptr, radius, exclude_self)
     return *found, (found[0] < len(points)).sum(1)
 
 
@@ -209,7 +213,30 @@ def radius_neighbors(
         ConfigError: the radius is not a positive length, or exclude_self with other queries.
     """
     assert ptr is not None  # @op fills it
-    _require_own_queries("radius_neighbors", exclude_self, queries)
+    find = finder(points, ptr, grid, backend)
+    return all_within("radius_neighbors", find, points, ptr, queries, queries_ptr, radius, exclude_self)
+
+
+# -- shared by the functions above and by the index ------------------------------------------------------------------
+
+
+def finder(points: Tensor, ptr: Tensor, grid: ImageGrid | None, backend: str) -> Find:
+    """Return what finds the nearest rows of these points."""
+    return functools.partial(nearest_rows, points.detach(), ptr, grid=grid, backend=backend)
+
+
+def all_within(
+    where: str,
+    find: Find,
+    points: Tensor,
+    ptr: Tensor,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    radius: float | Tensor,
+    exclude_self: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what :func:`radius_neighbors` does, by whatever finds the nearest among the points."""
+    _require_own_queries(where, exclude_self, queries)
     asked, asked_ptr = (points, ptr) if queries is None or queries_ptr is None else (queries, queries_ptr)
     open_ = torch.arange(len(asked), dtype=torch.int64, device=points.device)
     largest = int((ptr[1:] - ptr[:-1]).max())
@@ -222,15 +249,8 @@ def radius_neighbors(
             if not everyone or queries is not None:
                 bounds = torch.searchsorted(query, asked_ptr.contiguous())
                 own = {"queries": asked[query].detach(), "queries_ptr": bounds}
-            index, distance = search(
-                points,
-                ptr,
-                width,
-                own,
-                radius if isinstance(radius, float) else radius[query],
-                grid if everyone else None,
-                backend,
-            )
+            limit = radius if isinstance(radius, float) else radius[query]
+            index, distance = search(find if everyone else _without_grid(find), points, width, own, limit)
             found = index < len(points)
             more = found[:, -1] & (width < largest)
             full.append(query[more])
@@ -247,21 +267,20 @@ def radius_neighbors(
     return index, distance, ptr_from_counts(torch.bincount(query, minlength=len(asked)))
 
 
-def _neighbors(
+def nearest(
     where: str,
+    find: Find,
     points: Tensor,
-    ptr: Tensor,
     k: int,
     queries: Tensor | None,
     queries_ptr: Tensor | None,
     radius: float | Tensor | None,
     exclude_self: bool,
-    grid: ImageGrid | None,
-    backend: str,
 ) -> tuple[Tensor, Tensor]:
+    """Return what :func:`knn` does, within a radius if there is one, by whatever finds the nearest among the points."""
     _require_own_queries(where, exclude_self, queries)
     own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
-    index, distance = search(points, ptr, k + exclude_self, own, radius, grid, backend)
+    index, distance = search(find, points, k + exclude_self, own, radius)
     if exclude_self:
         itself = index == torch.arange(len(points), dtype=torch.int64, device=points.device)[:, None]
         itself[:, -1] |= ~itself.any(1)  # more repeats than were asked for: the last one is too many
@@ -273,22 +292,22 @@ def _neighbors(
     return index, distance
 
 
+def _without_grid(find: Find) -> Find:
+    """The grid says where the points lie, not where other queries do."""
+    if isinstance(find, functools.partial) and "grid" in find.keywords:
+        return functools.partial(find, grid=None)
+    return find
+
+
 def search(
-    points: Tensor,
-    ptr: Tensor,
-    k: int,
-    own: dict[str, Any],
-    radius: float | Tensor | None,
-    grid: ImageGrid | None,
-    backend: str,
+    find: Find, points: Tensor, k: int, own: dict[str, Any], radius: float | Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Search from the points, or from ``own`` queries; a radius per query is cut out of the largest."""
     points = points.detach()
     if not isinstance(radius, Tensor):
-        found: tuple[Tensor, Tensor] = nearest_rows(points, ptr, k, **own, radius=radius, grid=grid, backend=backend)
-        return found
+        return find(k, **own, radius=radius)
     widest = float(radius.max()) if len(radius) else None
-    index, distance = nearest_rows(points, ptr, k, **own, radius=widest, grid=grid, backend=backend)
+    index, distance = find(k, **own, radius=widest)
     if not len(points):
         return index, distance
     queries = own.get("queries", points)

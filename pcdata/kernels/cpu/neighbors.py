@@ -12,6 +12,7 @@ from torch import Tensor
 
 # The operations must be registered before their kernels.
 import pcdata.functional.clusters
+import pcdata.functional.neighbor_index
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
@@ -21,6 +22,9 @@ from pcdata.kernels.cpu.native import call, room
 
 # The core keeps rows, and numbers of neighbors, in 31 bits.
 _MAX_ROWS = 2**31 - 1
+
+# Of equal points an index keeps so many: thousands in one place (zeros of missing depth) would all be looked at.
+_COPIES = 128
 
 
 @kernel("nearest_rows", "cpu")
@@ -42,6 +46,57 @@ def nearest_rows(
         found: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
         return found
     return _neighbors(points, ptr, k, radius, queries, queries_ptr, grid)
+
+
+@kernel("sorted_rows", "cpu")
+def sorted_rows(points: Tensor, ptr: Tensor) -> dict[str, Tensor]:
+    """Sort points of three columns into leaves with boxes over them, as the search builds them for one call."""
+    if points.shape[1] != 3 or len(points) > _MAX_ROWS:
+        return {}
+    leaves, boxes = 0, 0
+    for count in torch.diff(ptr).tolist():
+        nodes = -(-count // 16)
+        leaves += nodes
+        while nodes:
+            nodes = -(-nodes // 16)
+            boxes += nodes
+            nodes = nodes if nodes > 1 else 0
+    made = {
+        "leaves": room((leaves, 64), torch.float32),
+        "leaf_ptr": room(len(ptr), torch.int64),
+        "boxes": room((boxes, 96), torch.float32),
+        "kept": room(1, torch.int64),
+    }
+    call("pc_index_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _COPIES, *made.values())
+    return made
+
+
+@kernel("nearest_in", "cpu")
+def nearest_in(
+    points: Tensor,
+    ptr: Tensor,
+    prepared: dict[str, Tensor],
+    k: int,
+    *,
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    radius: float | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Search what is sorted; where equal points were left out that now count, sort anew."""
+    is_whole = bool(prepared) and int(prepared["kept"]) == len(points)
+    if not prepared or k > (_MAX_ROWS if is_whole else _COPIES):
+        return nearest_rows(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius)
+    if queries is None and not is_whole:
+        queries, queries_ptr = points, ptr
+    num_queries = len(points)
+    if queries is not None:
+        assert queries_ptr is not None
+        queries, queries_ptr = _rows(queries, queries_ptr)
+        num_queries = len(queries)
+    index, distance = room((num_queries, k), torch.int64), room((num_queries, k), torch.float32)
+    tree = prepared["leaves"], prepared["leaf_ptr"], len(ptr) - 1, prepared["boxes"], len(points)
+    call("pc_indexed_neighbors", *tree, queries, queries_ptr, k, _limit(radius), index, distance)
+    return index, distance
 
 
 @kernel("chamfer_distance", "cpu")

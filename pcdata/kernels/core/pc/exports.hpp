@@ -215,6 +215,18 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
 PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* points, const int64_t* ptr,
                                     int64_t num_clouds, int64_t width, const float* queries, const int64_t* queries_ptr,
                                     int64_t k, double limit, int64_t* index, float* distance);
+// Points sorted into leaves (sum of ceil(n / 16), 64) with leaf_ptr (num_clouds + 1,), and boxes over them, 96 floats
+// for every sixteen leaves, boxes of sixteen and so on of each cloud: both aligned to 64 bytes. Of consecutive equal
+// points the lowest `copies` rows stay: kept (1,) of all.
+PC_EXPORT int32_t pc_index_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                  int64_t num_clouds, int64_t copies, float* leaves, int64_t* leaf_ptr, float* boxes,
+                                  int64_t* kept);
+
+// As pc_neighbors, of points that were indexed with copies >= k, or all kept; queries null: the points, all kept.
+PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
+                                       int64_t num_clouds, const float* boxes, int64_t num_points, const float* queries,
+                                       const int64_t* queries_ptr, int64_t k, double limit, int64_t* index,
+                                       float* distance);
 
 // squared (Q,) float: from every query to the nearest point of its cloud.
 PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,

@@ -55,6 +55,18 @@ void find_neighbors(const pc_context& context, float limit, const Clouds& clouds
     search.run(clouds, grid);
 }
 
+template <class Nearest>
+void find_in_index(const pc_context& context, float limit, const Leaves& leaves, Boxes* boxes, const Clouds* queries,
+                   const WriteNeighbors& task) {
+  ScratchFrame scratch;
+  const CloudTree* trees = lay_out_trees(scratch, leaves, boxes);
+  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limit, task);
+  if (queries != nullptr)
+    search.run(scratch, trees, *queries);
+  else
+    search.by_tree(leaves, trees, leaves, nullptr);
+}
+
 }  // namespace
 }  // namespace pc::neighbors
 
@@ -71,6 +83,44 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
     const auto find = k <= NearestKeys::kMax ? find_neighbors<NearestKeys> : find_neighbors<NearestMany>;
     find(*context, static_cast<float>(limit), clouds, queries == nullptr ? nullptr : &from,
          pixel == nullptr ? nullptr : &grid, task);
+  });
+}
+
+PC_EXPORT int32_t pc_index_points(const pc_context* context, const float* points, const int64_t* ptr,
+                                  int64_t num_clouds, int64_t copies, float* leaves, int64_t* leaf_ptr, float* boxes,
+                                  int64_t* kept) {
+  using namespace pc;
+  using namespace pc::neighbors;
+  return guarded([&] {
+    ScratchFrame scratch;
+    LeafBuilder builder(*context, scratch, points, ptr, num_clouds);
+    const int64_t* unused;
+    const Leaves found = builder.without_copies(copies, unused);
+    Leaf* leaf = reinterpret_cast<Leaf*>(leaves);
+    std::copy_n(found.leaf, found.count(), leaf);
+    std::copy_n(found.leaf_ptr, num_clouds + 1, leaf_ptr);
+    const Leaves own{leaf, leaf_ptr, num_clouds};
+    fill_trees(*context, lay_out_trees(scratch, own, reinterpret_cast<Boxes*>(boxes)), num_clouds);
+    *kept = 0;
+    for (int64_t i = 0; i < own.count(); ++i)
+      *kept += std::count_if(leaf[i].row, leaf[i].row + kLeafSize, [](uint32_t row) { return row != kNoId; });
+  });
+}
+
+PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
+                                       int64_t num_clouds, const float* boxes, int64_t num_points, const float* queries,
+                                       const int64_t* queries_ptr, int64_t k, double limit, int64_t* index,
+                                       float* distance) {
+  using namespace pc;
+  using namespace pc::neighbors;
+  return guarded([&] {
+    // Searching reads leaves and boxes alone.
+    const Leaves own{reinterpret_cast<Leaf*>(const_cast<float*>(leaves)), leaf_ptr, num_clouds};
+    const Clouds from{queries, queries_ptr, num_clouds};
+    const WriteNeighbors task{k, num_points, index, distance, nullptr};
+    const auto find = k <= NearestKeys::kMax ? find_in_index<NearestKeys> : find_in_index<NearestMany>;
+    find(*context, static_cast<float>(limit), own, reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
+         queries == nullptr ? nullptr : &from, task);
   });
 }
 

@@ -38,15 +38,29 @@ class BatchSearch {
   void run(const Clouds& clouds, const Clouds& queries) {
     ScratchFrame scratch;
     LeafBuilder points(context_, scratch, clouds.points, clouds.ptr, clouds.num_clouds);
-    LeafBuilder groups(context_, scratch, queries.points, queries.ptr, queries.num_clouds);
     const int64_t* unused;
-    const Leaves leaves = points.without_copies(k_, unused);
-    const CloudTree* trees = build_trees(context_, scratch, leaves);
+    run(scratch, build_trees(context_, scratch, points.without_copies(k_, unused)), queries);
+  }
+
+  // Queries of their own, in trees that are built.
+  void run(ScratchFrame& scratch, const CloudTree* trees, const Clouds& queries) {
+    LeafBuilder groups(context_, scratch, queries.points, queries.ptr, queries.num_clouds);
     for_groups(groups.all(), [&](const Leaf& leaf, int64_t, int64_t cloud, TreeSearch& search, Worker& worker) {
       const QueryGroup group(leaf);
       worker.nearest.start(k_, group.limits(limit_));
       if (trees[cloud].num_leaves > 0)
         search.run(trees[cloud], group, search.leaf_near(trees[cloud], group), worker.nearest);
+      worker.nearest.finish();
+      worker.task(search, group, worker.nearest, leaf.row);
+    });
+  }
+
+  // Queries are the points themselves: group g of them begins in leaf home[g]; null = it is leaf g.
+  void by_tree(const Leaves& leaves, const CloudTree* trees, const Leaves& groups, const int64_t* home) {
+    for_groups(groups, [&](const Leaf& leaf, int64_t g, int64_t cloud, TreeSearch& search, Worker& worker) {
+      const QueryGroup group(leaf);
+      worker.nearest.start(k_, group.limits(limit_));
+      search.run(trees[cloud], group, (home == nullptr ? g : home[g]) - leaves.leaf_ptr[cloud], worker.nearest);
       worker.nearest.finish();
       worker.task(search, group, worker.nearest, leaf.row);
     });
@@ -79,14 +93,7 @@ class BatchSearch {
     LeafBuilder builder(context_, scratch, clouds.points, clouds.ptr, clouds.num_clouds);
     const int64_t* home;
     const Leaves leaves = builder.without_copies(k_, home);
-    const CloudTree* trees = build_trees(context_, scratch, leaves);
-    for_groups(builder.all(), [&](const Leaf& leaf, int64_t g, int64_t cloud, TreeSearch& search, Worker& worker) {
-      const QueryGroup group(leaf);
-      worker.nearest.start(k_, group.limits(limit_));
-      search.run(trees[cloud], group, home[g] - leaves.leaf_ptr[cloud], worker.nearest);
-      worker.nearest.finish();
-      worker.task(search, group, worker.nearest, leaf.row);
-    });
+    by_tree(leaves, build_trees(context_, scratch, leaves), builder.all(), home);
   }
 
   // A window starts with about twice as many pixels as neighbors are wanted and grows by a few rings, each of which

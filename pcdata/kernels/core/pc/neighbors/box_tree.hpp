@@ -31,29 +31,41 @@ inline void set_box(Boxes& boxes, int64_t slot, const float low[3], const float 
   }
 }
 
-// Put boxes over leaves, all clouds.
-inline CloudTree* build_trees(const pc_context& context, ScratchFrame& scratch, const Leaves& leaves) {
-  CloudTree* trees = scratch.take<CloudTree>(leaves.num_clouds);
+// body(level, nodes, blocks) for every level of the tree over so many leaves.
+template <class Body>
+void for_levels(int64_t num_leaves, Body&& body) {
+  int64_t nodes = num_leaves;
+  for (int level = 0; nodes > 0; ++level) {
+    const int64_t blocks = (nodes + kFanOut - 1) / kFanOut;
+    body(level, nodes, blocks);
+    nodes = blocks > 1 ? blocks : 0;
+  }
+}
+
+// How many Boxes the trees of all clouds take.
+inline int64_t count_boxes(const Leaves& leaves) {
   int64_t total = 0;
-  const auto for_levels = [&](int64_t cloud, auto&& body) {
-    int64_t nodes = leaves.leaf_ptr[cloud + 1] - leaves.leaf_ptr[cloud];
-    for (int level = 0; nodes > 0; ++level) {
-      const int64_t blocks = (nodes + kFanOut - 1) / kFanOut;
-      body(level, nodes, blocks);
-      nodes = blocks > 1 ? blocks : 0;
-    }
-  };
-  for (int64_t b = 0; b < leaves.num_clouds; ++b) for_levels(b, [&](int, int64_t, int64_t blocks) { total += blocks; });
-  Boxes* boxes = scratch.take<Boxes>(total);
-  int64_t used = 0;
+  for (int64_t b = 0; b < leaves.num_clouds; ++b)
+    for_levels(leaves.leaf_ptr[b + 1] - leaves.leaf_ptr[b], [&](int, int64_t, int64_t blocks) { total += blocks; });
+  return total;
+}
+
+// The trees of all clouds, whose boxes follow one another in memory: cloud by cloud, from the leaves up.
+inline CloudTree* lay_out_trees(ScratchFrame& scratch, const Leaves& leaves, Boxes* boxes) {
+  CloudTree* trees = scratch.take<CloudTree>(leaves.num_clouds);
   for (int64_t b = 0; b < leaves.num_clouds; ++b) {
     trees[b] = {leaves.leaf + leaves.leaf_ptr[b], leaves.leaf_ptr[b + 1] - leaves.leaf_ptr[b], 0, {}};
-    for_levels(b, [&](int level, int64_t, int64_t blocks) {
-      trees[b].level[level] = boxes + used;
+    for_levels(trees[b].num_leaves, [&](int level, int64_t, int64_t blocks) {
+      trees[b].level[level] = boxes;
       trees[b].num_levels = level + 1;
-      used += blocks;
+      boxes += blocks;
     });
   }
+  return trees;
+}
+
+// Set the boxes of trees that are laid out.
+inline void fill_trees(const pc_context& context, CloudTree* trees, int64_t num_clouds) {
   const float nowhere_low[3] = {kInfinity, kInfinity, kInfinity};
   const float nowhere_high[3] = {-kInfinity, -kInfinity, -kInfinity};
   constexpr int64_t kBlocksPerPiece = 64;
@@ -80,17 +92,24 @@ inline CloudTree* build_trees(const pc_context& context, ScratchFrame& scratch, 
         set_box(tree.level[level][i], slot, low, high);
       }
   };
-  if (leaves.num_clouds > 8) {  // enough clouds to keep every thread busy with whole ones
-    parallel_for(context, leaves.num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
-      for_levels(b, [&](int level, int64_t nodes, int64_t blocks) { build_level(trees[b], level, nodes, 0, blocks); });
+  if (num_clouds > 8) {  // enough clouds to keep every thread busy with whole ones
+    parallel_for(context, num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
+      for_levels(trees[b].num_leaves,
+                 [&](int level, int64_t nodes, int64_t blocks) { build_level(trees[b], level, nodes, 0, blocks); });
     });
-    return trees;
+    return;
   }
-  for (int64_t b = 0; b < leaves.num_clouds; ++b)
-    for_levels(b, [&](int level, int64_t nodes, int64_t blocks) {
+  for (int64_t b = 0; b < num_clouds; ++b)
+    for_levels(trees[b].num_leaves, [&](int level, int64_t nodes, int64_t blocks) {
       parallel_for(context, blocks, kBlocksPerPiece,
                    [&](int64_t begin, int64_t end, int64_t) { build_level(trees[b], level, nodes, begin, end); });
     });
+}
+
+// Put boxes over leaves, all clouds.
+inline CloudTree* build_trees(const pc_context& context, ScratchFrame& scratch, const Leaves& leaves) {
+  CloudTree* trees = lay_out_trees(scratch, leaves, scratch.take<Boxes>(count_boxes(leaves)));
+  fill_trees(context, trees, leaves.num_clouds);
   return trees;
 }
 
