@@ -85,11 +85,11 @@ def test_what_does_not_fit_is_refused():
         index.knn(k=1, queries=torch.rand(3, 3))
     with pytest.raises(ShapeError, match="without queries"):
         index.knn(k=1, queries_ptr=ptr)
-    with pytest.raises(ConfigError, match="NeighborIndex.ball_query: max_neighbors must be at least 1"):
+    with pytest.raises(ConfigError, match=r"NeighborIndex\.ball_query: max_neighbors must be at least 1"):
         index.ball_query(radius=0.1, max_neighbors=0)
-    with pytest.raises(ConfigError, match="NeighborIndex.radius_neighbors: radius must be"):
+    with pytest.raises(ConfigError, match=r"NeighborIndex\.radius_neighbors: radius must be"):
         index.radius_neighbors(radius=-1.0)
-    with pytest.raises(DTypeError, match="NeighborIndex.knn: queries"):
+    with pytest.raises(DTypeError, match=r"NeighborIndex\.knn: queries"):
         index.knn(k=1, queries=torch.rand(3, 3).double(), queries_ptr=torch.tensor([0, 3]))
     with pytest.raises(ConfigError, match="exclude_self means nothing for queries of their own"):
         NeighborIndex(points).knn(k=1, queries=points[:3], exclude_self=True)
