@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.functional.touching.limits import CONTACT_PIXELS, Limits
-from pcdata.functional.touching.regions import PixelCamera, PlaneSums, _dot, _in_pixels, _length, plane_normal, spread
+from pcdata.functional.touching.regions import PixelCamera, PlaneSums, dot, in_pixels, length, plane_normal, spread
 
 
 class Contacts(NamedTuple):
@@ -20,7 +20,6 @@ class Contacts(NamedTuple):
     strength: Tensor  # (E,) float64, 0 to 1
 
 
-@inner
 def region_contacts(
     inverse: Tensor,  # (H, W) float64, 1/z in 1/m, 0 = no reading
     label: Tensor,  # (H, W) int64, -1 = none
@@ -43,11 +42,12 @@ def region_contacts(
         pairs.append(torch.stack([here[met], there[met]]))
     first, second = torch.cat(pairs, 1)
     fitted, side = torch.cat([first, second]).unique(return_inverse=True)
-    right, down, middle, normal, mean, found = _own_planes(inverse, label, fitted, camera, noise, limits)
+    planes = region_planes(inverse, label, fitted, camera, noise, limits, backend=backend)
+    right, down, middle, normal, mean, found = _on_rays(planes, inverse, fitted, camera)
     a, b = side[: len(first)], side[len(first) :]
     turn = normal[b] - normal[a]
-    angle = torch.where(found[a] & found[b], _length(turn), 0.0)
-    lean = _dot(turn, mean[b] - mean[a])
+    angle = torch.where(found[a] & found[b], length(turn), 0.0)
+    lean = dot(turn, mean[b] - mean[a])
     concave, convex = torch.where(lean < 0, angle, 0.0), torch.where(lean > 0, angle, 0.0)
     half_down = torch.where(second - first == 1, 0.0, 0.5).to(torch.float64)
     half_right = 0.5 - half_down
@@ -61,14 +61,26 @@ def region_contacts(
     return Contacts(first, second, torch.maximum(bent, ((gap - gap_from) / (gap_full - gap_from)).clamp(0, 1)))
 
 
-def _own_planes(
-    inverse: Tensor, label: Tensor, pixel: Tensor, camera: PixelCamera, noise: float, limits: Limits
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Fit a plane around every pixel (K,) to the points of its region: slopes, 1/z there, normal, mean point, found."""
+@inner
+def region_planes(
+    inverse: Tensor,  # (H, W) float64
+    label: Tensor,  # (H, W) int64
+    pixel: Tensor,  # (K,) int64, row * W + column
+    camera: PixelCamera,
+    noise: float,
+    limits: Limits,
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (K, 6) float64
+    """Fit planes of 1/z around pixels to every second point of rows and columns that has the pixel's own label.
+
+    Each is the slope per column and per row, the rise over the pixel's own 1/z in the middle, the mean column and row
+    of the points from there, and 1 where the points span a plane, else 0, with slopes 0 and the mean rise.
+    """
     height, width = label.shape
     row, column = pixel // width, pixel % width
     own, own_label = inverse[row, column], label[row, column]
-    reach = _in_pixels(limits.contact_reach * spread(noise), camera, own, CONTACT_PIXELS)
+    reach = in_pixels(limits.contact_reach * spread(noise), camera, own, CONTACT_PIXELS)
     sums = PlaneSums(own)
     farthest = int(reach.max()) // 2 * 2 if len(pixel) else 0
     for down in range(-farthest, farthest + 1, 2):
@@ -78,11 +90,20 @@ def _own_planes(
             y, x = y.clamp(0, height - 1), x.clamp(0, width - 1)
             weight = inside & (label[y, x] == own_label) & (reach >= max(abs(down), abs(right)))
             sums.add(weight.to(own.dtype), right, down, inverse[y, x] - own)
-    right_slope, down_slope, middle, mean_u, mean_v, found = sums.solved()
-    middle = own + middle
-    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
-    normal = plane_normal(right_slope, down_slope, middle, x, y, camera)
+    *plane, found = sums.solved()
+    return torch.stack([*plane, found.to(own.dtype)], dim=1)
+
+
+def _on_rays(
+    planes: Tensor, inverse: Tensor, pixel: Tensor, camera: PixelCamera
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return slopes, 1/z, normal and mean point of planes (K, 6), and where one was found."""
+    right, down, rise, mean_u, mean_v, found = planes.unbind(1)
+    width = inverse.shape[1]
+    middle = inverse.flatten()[pixel] + rise
+    x, y = (pixel % width - camera.cx) / camera.fx, (pixel // width - camera.cy) / camera.fy
+    normal = plane_normal(right, down, middle, x, y, camera)
     # The mean point of the fit says on which side of the contact its plane lies.
-    depth = 1 / ((middle + right_slope * mean_u) + down_slope * mean_v).clamp(min=1e-6)
+    depth = 1 / ((middle + right * mean_u) + down * mean_v).clamp(min=1e-6)
     mean = torch.stack([(x + mean_u / camera.fx) * depth, (y + mean_v / camera.fy) * depth, depth], dim=-1)
-    return right_slope, down_slope, middle, normal, mean, found
+    return right, down, middle, normal, mean, found > 0

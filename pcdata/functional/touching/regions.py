@@ -61,7 +61,7 @@ def smooth_regions(
     there = inverse > 0
     scale = spread(noise)
     rows, columns = _rays(inverse.shape, camera, inverse.device)
-    reach = _in_pixels(limits.normal_reach * scale, camera, inverse, NORMAL_PIXELS)
+    reach = in_pixels(limits.normal_reach * scale, camera, inverse, NORMAL_PIXELS)
     normals = _window_normals(inverse, there, reach, camera, noise, limits, rows, columns)
     crease = _creases(inverse, there, normals, camera, noise, limits, rows, columns, scale)
     across, along = _jumps(inverse, there, limits.jump * noise)
@@ -76,7 +76,8 @@ def _rays(shape: torch.Size, camera: PixelCamera, device: torch.device) -> tuple
     return rows[:, None], columns[None]
 
 
-def _in_pixels(length: float, camera: PixelCamera, inverse: Tensor, bounds: tuple[int, int]) -> Tensor:
+def in_pixels(length: float, camera: PixelCamera, inverse: Tensor, bounds: tuple[int, int]) -> Tensor:
+    """Return how many pixels a length covers at each depth, rounded, within bounds."""
     return (length * camera.fx * inverse + 0.5).floor().clamp(*bounds)
 
 
@@ -178,7 +179,7 @@ def _creases(
     """Return how sharp the crease at every pixel is, 0 to 1: the sharpest of four directions, smoothed."""
     depth = torch.where(there, 1 / torch.where(there, inverse, 1.0), 0.0)
     points = torch.stack([columns * depth, rows * depth, depth], dim=-1)
-    reach = _in_pixels(limits.crease_reach * scale, camera, inverse, CREASE_PIXELS)
+    reach = in_pixels(limits.crease_reach * scale, camera, inverse, CREASE_PIXELS)
     fitted = (normals != 0).any(-1)
     sharpest = torch.zeros_like(inverse)
     for right, down in ((1, 0), (0, 1), (1, 1), (1, -1)):
@@ -195,20 +196,22 @@ def _creases(
                 last = now
             before, behind = (shifted(normals, one * down, one * right) for one in (-count, count))
             way = shifted(points, count * down, count * right) - shifted(points, -count * down, -count * right)
-            apart = _length(behind - before)
+            apart = length(behind - before)
             # Normals that lean toward each other stand in a valley.
-            part = torch.where(_dot(behind - before, way) < 0, apart, limits.convex_part * apart)
+            part = torch.where(dot(behind - before, way) < 0, apart, limits.convex_part * apart)
             sharpest = torch.maximum(sharpest, torch.where(usable, part, 0.0))
     return _smoothed((sharpest / limits.full_crease).clamp(max=1), there)
 
 
-def _dot(a: Tensor, b: Tensor) -> Tensor:
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Multiply vectors (..., 3), in the order in which kernels add."""
     x, y, z = (a * b).unbind(-1)
     return (x + y) + z
 
 
-def _length(vectors: Tensor) -> Tensor:
-    return _dot(vectors, vectors).sqrt()
+def length(vectors: Tensor) -> Tensor:
+    """Return the lengths of vectors (..., 3)."""
+    return dot(vectors, vectors).sqrt()
 
 
 # A Gaussian of one pixel.

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xBF5AF31FFB8FE83
+INTERFACE_NUMBER = 0x00C726BD13BC28F
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -95,4 +95,8 @@ pc_tsdf_count_triangles: int64* keys, int64 count, int64* signs, int64* edges, i
 pc_tsdf_write_triangles: int64* keys, int64 count, int64* signs, int64* edges, int64* table, int64* corners, int64*
     starts, int64* triangles, uint8* used
 pc_tsdf_renumber: int64* entries, int64 count, int64* number
+pc_smooth_regions: double* inverse, int64 height, int64 width, double* camera, double noise, double scale, double*
+    limits, int64* label, double* normals
+pc_region_planes: double* inverse, int64* label, int64 height, int64 width, double* camera, double scale, double*
+    limits, int64* pixel, int64 count, double* planes
 """

@@ -369,3 +369,17 @@ PC_EXPORT int32_t pc_tsdf_write_triangles(const pc_context* context, const int64
 
 // Number (count,) entries anew, in place.
 PC_EXPORT int32_t pc_tsdf_renumber(const pc_context* context, int64_t* entries, int64_t count, const int64_t* number);
+
+// -- touching objects -------------------------------------------------------------------------------------------------
+
+// Inverse depth (height, width), 0 = no reading; camera (4,) is fx, fy, cx, cy; limits (18,) as Python's Limits lists
+// them, of lengths that scale with `scale` -> label (height, width) and normals (height, width, 3), as smooth_regions
+// describes them.
+PC_EXPORT int32_t pc_smooth_regions(const pc_context* context, const double* inverse, int64_t height, int64_t width,
+                                    const double* camera, double noise, double scale, const double* limits,
+                                    int64_t* label, double* normals);
+
+// planes (count, 6) around pixels (count,) of the points of their own labels, as region_planes describes them.
+PC_EXPORT int32_t pc_region_planes(const pc_context* context, const double* inverse, const int64_t* label,
+                                   int64_t height, int64_t width, const double* camera, double scale,
+                                   const double* limits, const int64_t* pixel, int64_t count, double* planes);

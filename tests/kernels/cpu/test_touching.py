@@ -1,0 +1,60 @@
+"""The kernels of touching objects give what their references give: the same regions, planes and strengths."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pcdata.functional.touching.contacts import region_contacts, region_planes
+from pcdata.functional.touching.limits import KINECT_NOISE, Limits
+from pcdata.functional.touching.regions import PixelCamera, smooth_regions
+
+
+def heap(seed: int, noise: float) -> torch.Tensor:
+    """Boxes and balls at random before nothing, with holes: (H, W) inverse depth."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, columns = torch.meshgrid(torch.arange(50.0), torch.arange(64.0), indexing="ij")
+    inverse = torch.zeros(50, 64, dtype=torch.float64)
+    for number in range(6):
+        middle = torch.rand(2, generator=generator) * torch.tensor([40.0, 54.0]) + 5
+        size = 8 + 8 * float(torch.rand(1, generator=generator))
+        v, u = rows - middle[0], columns - middle[1]
+        lean = torch.rand(2, generator=generator) * 0.02 - 0.01
+        shape = 1.1 + lean[0] * v + lean[1] * u
+        inside = torch.maximum(v.abs(), u.abs()) < size
+        if number % 2:
+            inside = v * v + u * u < size * size
+            shape = 1.1 + 0.01 * (size * size - v * v - u * u).clamp(min=0).sqrt()
+        inverse = torch.where(inside & (shape > inverse), shape.double(), inverse)
+    jitter = noise * torch.randn(inverse.shape, generator=generator, dtype=torch.float64)
+    hole = torch.rand(inverse.shape, generator=generator) < 0.03
+    return torch.where((inverse > 0) & ~hole, inverse + jitter, 0.0)
+
+
+CAMERA = PixelCamera(260.0, 250.0, 33.0, 20.0)
+
+
+@pytest.mark.parametrize("noise", [KINECT_NOISE / 2, KINECT_NOISE, 3 * KINECT_NOISE])
+@pytest.mark.parametrize("seed", range(3))
+def test_regions_and_contacts_equal_the_reference(seed, noise):
+    inverse = heap(seed, noise)
+    limits = Limits(seed_area=4e-5)
+    own = smooth_regions(inverse, CAMERA, noise, limits, backend="cpu")
+    expected = smooth_regions(inverse, CAMERA, noise, limits, backend="torch")
+    assert int(expected.label.max()) > 0  # several regions
+    assert (own.normals - expected.normals).abs().max() < 1e-12  # equal but for the last digit
+    assert torch.equal(own.label, expected.label)
+    own, expected = (
+        region_contacts(inverse, expected.label, CAMERA, noise, limits, backend=backend) for backend in ("cpu", "torch")
+    )
+    assert len(expected.first) > 0
+    assert all(map(torch.equal, own, expected))
+
+
+def test_an_image_of_one_pixel_and_one_without_readings_have_no_region():
+    for inverse in (torch.ones(1, 1, dtype=torch.float64), torch.zeros(4, 5, dtype=torch.float64)):
+        found = smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(), backend="cpu")
+        assert (found.label == -1).all()
+        assert (found.normals == 0).all()
+    none = torch.zeros(0, dtype=torch.int64)
+    assert region_planes(inverse, found.label, none, CAMERA, KINECT_NOISE, Limits(), backend="cpu").shape == (0, 6)
