@@ -65,7 +65,7 @@ def descriptor(points: Points) -> NDArray[np.float32]:  # (SIZE,)
 
 def thinning(points: Points, draw: torch.Generator) -> NDArray[np.float32]:  # (SIZE,)
     """Return how the descriptor of a random half of a cloud differs, for points whose noise is 1."""
-    half = points[torch.randperm(len(points), generator=draw).numpy()[: len(points) // 2]]
+    half = points[torch.randperm(len(points), generator=draw, device="cpu").numpy()[: len(points) // 2]]
     return np.asarray((_described(half) - _described(points)) * np.sqrt(len(points)), np.float32)
 
 
@@ -74,7 +74,7 @@ def thinned_rows(counts: NDArray[np.int64], draw: torch.Generator) -> NDArray[np
     filled = np.flatnonzero(counts >= FEWEST)
     if 0 < len(filled) < _HALVES:
         return np.sort(np.resize(filled, _HALVES))
-    return np.sort(filled[torch.randperm(len(filled), generator=draw).numpy()[:_HALVES]])
+    return np.sort(filled[torch.randperm(len(filled), generator=draw, device="cpu").numpy()[:_HALVES]])
 
 
 def _described(points: Points) -> NDArray[np.float32]:
