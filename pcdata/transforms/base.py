@@ -35,6 +35,7 @@ from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
 from pcdata.transforms.decisions import (
+    LISTS,
     PER_ROW,
     Decision,
     Decisions,
@@ -415,7 +416,8 @@ class _NotedSteps:
         for b in range(1 if self._after is None else len(self._after)):
             # Each entry may be changed where it is read, so lists are given anew.
             entry = {**self._note, "fields": _anew(self._note["fields"])}
-            entry["params"] = {name: values[b] for name, values in listed.items()}
+            told = {name: values[b] for name, values in listed.items()}
+            entry["params"] = {name: value for name, value in told.items() if value == value}  # NaN is what is not known
             if drawn is not None:
                 entry["stream"] = drawn[b]
             if self._rows is not None:
@@ -503,7 +505,7 @@ def _small(params: Params, num: int) -> dict[str, NDArray[Any]]:
     kept: dict[str, NDArray[Any]] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in PER_ROW
+        is_per_cloud = name not in PER_ROW and name not in LISTS
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
             kept[name] = value.detach().cpu().numpy()
     return kept

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -271,3 +272,14 @@ def test_what_is_known_of_the_plane_is_stored():
     largest = RemovePlane()(cloud).meta[0]["planes"][0]
     assert "noise" not in largest
     assert largest["hull"]
+
+
+def test_a_noise_that_is_not_known_is_not_in_the_history():
+    seen = in_base(rectangle(**TABLE_SIZE, noise=0.002), *BLOCKS)
+    cloud = PointCloud(points=seen.points, frame_id="base")  # from nowhere
+    step = RemovePlane(cut="measured")
+    left = step(cloud)
+    ((entry,),) = left.history
+    assert "disparity_noise" not in entry["params"]
+    assert json.loads(json.dumps(entry, allow_nan=False)) == entry
+    assert torch.equal(step.replay(cloud, [entry]).points, left.points)

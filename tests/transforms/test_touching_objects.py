@@ -113,6 +113,8 @@ def test_clouds_of_a_batch_are_parted_each_by_itself():
     batch = STEP(PointCloud.cat(clouds))
     assert torch.equal(batch.labels, torch.cat([one.labels for one in alone]))
     assert [meta["touching"] for meta in batch.meta] == [one.meta[0]["touching"] for one in alone]
+    own = [history[-1]["params"] for history in batch.history]  # two cuts of two clouds
+    assert own == [one.history[0][-1]["params"] for one in alone]
 
 
 def test_a_cloud_that_left_its_image_is_refused():
