@@ -34,6 +34,7 @@ from pcdata.contracts.dispatch import INNER, OPERATIONS, why_unavailable
 from pcdata.errors import PcdataError as Refused  # noqa: F401
 from pcdata.exports import TARGETS, export_dataset
 from pcdata.functional import tsdf  # noqa: F401
+from pcdata.functional.stored_rows import Role, StoredForm, StoredGroups, find_records, parts_of  # noqa: F401
 from pcdata.io import (  # noqa: F401
     AveragedSource,
     CaptureCamera,
@@ -227,8 +228,11 @@ def call_inner(name: str, backend: str, arguments: Sequence[Any], named: Mapping
     operation = INNER[name]
     body = operation.reference if backend == "torch" else operation.kernels[backend]
     found = body(*arguments, **named)
-    if name == "copy_blocks":  # it fills its first argument
+    if name == "gather_records":  # it fills its first argument
         return arguments[0]
+    if name == "find_records":
+        parts = parts_of(found, len(arguments[2].roles), len(arguments[0]))
+        return [torch.as_tensor(part) for part in (parts.starts, parts.ends, parts.sizes)]  # not the addresses
     if not isinstance(found, Iterator):
         return found
     columns = [torch.cat(parts) for parts in zip(*found)]  # neighbors of some queries at a time, in no fixed order

@@ -10,7 +10,20 @@ from typing import Any
 import numpy as np
 import torch
 from digest_inputs import poses, rendered, seeded, with_confidence
-from digest_names import backends_of, call, call_inner, functional, inner_names, operation_names, tsdf
+from digest_names import (
+    Role,
+    StoredForm,
+    StoredGroups,
+    backends_of,
+    call,
+    call_inner,
+    find_records,
+    functional,
+    inner_names,
+    operation_names,
+    parts_of,
+    tsdf,
+)
 from torch import Tensor
 
 Case = tuple[str, Callable[[], Any]]
@@ -260,13 +273,20 @@ def _into_box(lens: str, *, moved: bool) -> Arguments:
     return _images(lens)[0], {**box, "matrix": matrix}
 
 
-_BYTES = np.concatenate([np.arange(40, dtype=np.uint8), np.arange(100, 140, dtype=np.uint8)])
+_ROWS = np.arange(60, dtype=np.float32).reshape(20, 3)  # of five records
+_PLACES = torch.tensor([4, 0, 2])
 
 
-def _blocks() -> Arguments:
-    numbers = [[0, 9, 20], [3, 40, 30], [9, 11, 4]]  # where to, from where, how many
-    begins, starts, sizes = (np.array(row, np.int64) for row in numbers)
-    return (torch.zeros(24, dtype=torch.uint8), begins, starts + _BYTES.ctypes.data, sizes), {}
+def _groups() -> tuple[StoredGroups, StoredForm]:
+    table = torch.tensor([[[_ROWS.ctypes.data, 0, 0]]])
+    groups = StoredGroups(torch.tensor([0]), torch.tensor([[0, 0]]), torch.tensor([0, 2, 2, 6, 11, 20]))
+    return groups, StoredForm(0, table, torch.tensor([12]), torch.tensor([Role.ANY]))
+
+
+def _found_records() -> Arguments:
+    groups, form = _groups()
+    table = find_records(_PLACES, groups, form)
+    return (torch.zeros(int(parts_of(table, 1, len(_PLACES)).starts[-1]), dtype=torch.uint8), form, table), {}
 
 
 def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
@@ -290,7 +310,8 @@ def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
         "three",
         lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
     )
-    yield "copy_blocks", "two", _blocks
+    yield "find_records", "three", lambda: ((_PLACES, *_groups()), {})
+    yield "gather_records", "three", _found_records
     yield "inside_box", "random", lambda: ((points(90, 1), (0.05, 0.0, 0.0), (0.15, 0.2, 0.1)), {})
     spoilt = points(90, 1).index_fill(0, rows[:1], torch.nan)
     yield "inside_box", "not finite", lambda: ((spoilt, (0.0,) * 3, (1.0,) * 3), {})

@@ -91,6 +91,7 @@ def outlook(
         if captures_digest(source, plan.ids_of(shard), hash_captures) == record.captures and not record.is_doubtful
     ]
     done = [record for record in known if not (retry_quarantined and record.quarantined)]
+    told = records.values() if retry_quarantined else known  # mended captures are others than those quarantined
     shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
     if finalize and len(done) < plan.num_shards:
         hindrances.append(
@@ -106,7 +107,7 @@ def outlook(
         num_finished=len(done),
         num_to_do=len({*shards} - {record.shard for record in done}),
         bytes_finished=sum(sum(record.files.values()) for record in done),
-        quarantined={name: why for record in known for name, why in record.quarantined.items()},
+        quarantined={name: why for record in told for name, why in record.quarantined.items()},
         replaces=replaces,
         hindrances=hindrances,
     )

@@ -133,7 +133,7 @@ def test_a_dry_run_tells_what_the_options_change(capsys, config, captures, tmp_p
 
 def test_a_dry_run_of_a_retry_tells_what_is_kept_and_what_is_tried_again(capsys, config, captures, tmp_path):
     call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=1"]
-    file = captures / "depth" / "scan1.png"
+    file = captures / "scan1.ply"
     whole = file.read_bytes()
     file.write_bytes(whole[:40])
     assert run(capsys, *call, "--workers", 0)[0] == 3

@@ -174,9 +174,14 @@ def test_building_again_is_refused_until_overwrite_is_said(capsys, config, captu
 
 
 def test_overwrite_does_not_delete_somebody_s_files(capsys, config, captures, tmp_path):
-    code, _, err = run(capsys, "build", config, "--source", captures, "--out", captures, "--overwrite")
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "notes.txt").write_text("mine")
+    code, _, err = run(capsys, "build", config, "--source", captures, "--out", own, "--overwrite")
     assert code == 1
     assert "not a pcdata dataset" in err
+    assert (own / "notes.txt").read_text() == "mine"
+    assert run(capsys, "build", config, "--source", captures, "--out", captures, "--overwrite")[0] == 2
     assert len(list(captures.iterdir())) == 4
 
 

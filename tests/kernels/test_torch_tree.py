@@ -83,7 +83,8 @@ def test_the_tree_serves_every_search():
     assert why_unavailable("torch_tree") is None
     served = {name for name, operation in OPERATIONS.items() if operation.serves("torch_tree")}
     searches = {"knn", "ball_query", "chamfer_distance", "statistical_outlier_mask", "radius_outlier_mask"}
-    assert served == searches | {"dbscan", "estimate_normals", "f_score", "hausdorff_distance", *_SEARCHES}
+    searches |= {"dbscan", "estimate_normals", "f_score", "hausdorff_distance", "interpolate_features"}
+    assert served == searches | {*_SEARCHES}
 
 
 def test_looking_at_every_pair_takes_memory_for_a_bounded_number_of_them(monkeypatch):

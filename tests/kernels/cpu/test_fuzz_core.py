@@ -29,7 +29,9 @@ pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(w
 # Compared in ways of their own: a direction may be free, a fit may add in another order.
 OWN_CHECKS = {"estimate_normals", "ransac_plane"}
 # Sums of what knn and ball_query find, in torch.
-OWN_CHECKS |= {"f_score", "hausdorff_distance", "neighborhood_covariance"}
+OWN_CHECKS |= {"f_score", "hausdorff_distance", "interpolate_features", "neighborhood_covariance"}
+# Planes that ransac_plane's steps find, chosen among in torch.
+OWN_CHECKS |= {"segment_planes", "supporting_plane"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
 
 
