@@ -417,9 +417,7 @@ class _NotedSteps:
             # Each entry may be changed where it is read, so lists are given anew.
             entry = {**self._note, "fields": _anew(self._note["fields"])}
             told = {name: values[b] for name, values in listed.items()}
-            entry["params"] = {
-                name: value for name, value in told.items() if value == value
-            }  # NaN: not known
+            entry["params"] = {name: value for name, value in told.items() if value == value}  # NaN: not known
             if drawn is not None:
                 entry["stream"] = drawn[b]
             if self._rows is not None:
