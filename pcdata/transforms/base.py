@@ -416,8 +416,8 @@ class _NotedSteps:
         for b in range(1 if self._after is None else len(self._after)):
             # Each entry may be changed where it is read, so lists are given anew.
             entry = {**self._note, "fields": _anew(self._note["fields"])}
-            told = {name: values[b] for name, values in listed.items()}
-            entry["params"] = {name: value for name, value in told.items() if value == value}  # NaN: not known
+            # What is NaN is not known, and not told.
+            entry["params"] = {name: values[b] for name, values in listed.items() if values[b] == values[b]}
             if drawn is not None:
                 entry["stream"] = drawn[b]
             if self._rows is not None:
