@@ -88,7 +88,8 @@ def test_tasks_of_ray_give_the_same_bytes_and_lose_what_ends_its_process(tmp_pat
     build_dataset(config, calm, tmp_path / "ray", engine="ray", workers=2, progress=lambda *one: news.append(one))
     assert tree(tmp_path / "ray") == tree(tmp_path / "plain")
     assert [one[0] for one in news] == [*range(1, 11)]
-    report = build_dataset(config, Killing(tmp_path), tmp_path / "hurt", engine="ray", workers=2, timeout=20)
+    (tmp_path / "marks").mkdir()
+    report = build_dataset(config, Killing(tmp_path / "marks"), tmp_path / "hurt", engine="ray", workers=2, timeout=20)
     assert list(report.quarantined) == ["c3", "c6", "c8"]
     assert report.quarantined["c3"].startswith("ProcessEnded: ")
     assert report.quarantined["c6"] == "TimeoutError: took longer than 20 s"
