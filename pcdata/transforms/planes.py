@@ -157,35 +157,23 @@ class RemovePlane(RemoveTransform):
 
     def _found(self, data: PointCloud) -> tuple[Tensor, Tensor]:
         """Return each cloud's plane and its inliers."""
+        search: dict[str, Any] = {
+            "distance": self.distance,
+            "num_hypotheses": self.num_hypotheses,
+            "seed": self.seed,
+            "up": self.up,
+            "max_tilt": self.max_tilt,
+            "probability": self.probability,
+        }
         if self.which == "largest":
-            return ransac_plane(
-                data.points,
-                data.ptr,
-                distance=self.distance,
-                num_hypotheses=self.num_hypotheses,
-                seed=self.seed,
-                up=self.up,
-                max_tilt=self.max_tilt,
-                probability=self.probability,
-            )
+            return ransac_plane(data.points, data.ptr, **search)
         likely_up = None
         if self.up is None and data.source_frame == CAMERA_FRAME:
             likely_up = torch.linalg.solve(
                 data.source_from_cloud[:, :3, :3].cpu(),
                 torch.tensor(_LIKELY_UP, dtype=torch.float64, device="cpu").expand(data.num_clouds, 3),
             )
-        return supporting_plane(
-            data.points,
-            data.ptr,
-            distance=self.distance,
-            num_hypotheses=self.num_hypotheses,
-            seed=self.seed,
-            up=self.up,
-            max_tilt=self.max_tilt,
-            probability=self.probability,
-            likely_up=likely_up,
-            viewpoint=_viewpoints(data),
-        )
+        return supporting_plane(data.points, data.ptr, **search, likely_up=likely_up, viewpoint=_viewpoints(data))
 
     def repeat(self, data: PointCloud, decided: Decisions) -> Params:
         """The planes that the history tells, and the rows near them."""

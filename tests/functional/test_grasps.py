@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import INNER, why_unavailable
 from pcdata.errors import ConfigError, PoseError
 from pcdata.functional import ParallelJaw, check_grasps
 from pcdata.rng import seeded
@@ -58,17 +57,12 @@ def by_brute_force(points: np.ndarray, grasp: np.ndarray, opening: float, grippe
     return hits, held
 
 
-@pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize(
     "gripper",
     [PANDA, ParallelJaw(**{**vars(PANDA), "approach": "x", "closing": "y", "tip": 0.02, "palm_span": None})],
     ids=["z approaches", "x approaches"],
 )
-def test_points_in_the_gripper_are_those_of_brute_force(gripper, backend, monkeypatch):
-    if backend == "torch":
-        monkeypatch.setattr(INNER["points_in_grippers"], "kernels", {})
-    elif why_unavailable("cpu") is not None:
-        pytest.skip("the compiled core is not there")
+def test_points_in_the_gripper_are_those_of_brute_force(gripper):
     points = 0.3 * torch.rand(400, 3, generator=seeded(1))
     grasps = poses(25)
     openings = 0.02 + 0.06 * torch.rand(25, generator=seeded(2), dtype=torch.float64)

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import INNER, why_unavailable
 from pcdata.errors import ShapeError
 from pcdata.functional import dbscan, image_clusters
 from pcdata.rng import seeded
@@ -48,11 +47,8 @@ def by_walking(points: Tensor, pixel: Tensor, eps: float, reach: int) -> list[in
     return label
 
 
-@pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize("reach", [1, 2, 3])
-def test_linked_pixels_share_a_label_in_the_order_of_their_lowest_rows(reach, backend):
-    if backend == "cpu" and ("cpu" not in INNER["linked_pixels"].kernels or why_unavailable("cpu") is not None):
-        pytest.skip("the compiled core is not there")
+def test_linked_pixels_share_a_label_in_the_order_of_their_lowest_rows(reach):
     for seed in range(2):
         clouds = [scene(seed, share) for share in (0.7, 0.3, 0.0, 1.0)]
         ptr = torch.tensor([0, *(len(points) for points, _ in clouds)]).cumsum(0)
@@ -63,7 +59,6 @@ def test_linked_pixels_share_a_label_in_the_order_of_their_lowest_rows(reach, ba
             size=SIZE,
             eps=0.2,
             reach=reach,
-            backend=backend,
         )
         assert found.tolist() == [label for cloud in clouds for label in by_walking(*cloud, 0.2, reach)]
 
