@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from multiprocessing.context import get_spawning_popen
 
 import numpy as np
 import torch
@@ -71,6 +72,14 @@ class PassWatch:
             return
         for index in indices.tolist():
             self.note(index, what)
+
+    def __getstate__(self) -> dict[str, Tensor]:
+        """Workers share what was seen; any other copy (in a checkpoint, say) is of a dataset that nothing read yet.
+
+        What its workers read ahead of the loop that stops would otherwise count as read in the process that goes on.
+        """
+        goes_to_a_process = get_spawning_popen() is not None
+        return {name: of if goes_to_a_process else torch.zeros_like(of) for name, of in self.__dict__.items()}
 
     def __setstate__(self, state: dict[str, Tensor]) -> None:
         self.__dict__.update({name: shared(tensor) for name, tensor in state.items()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from collections.abc import Iterable
 
@@ -10,6 +11,7 @@ import torch
 from torch.utils.data import DataLoader, DistributedSampler
 
 from pcdata import CachedCloudDataset, CountedSampler, PointCloud, collate_packed
+from pcdata.datasets import RepeatedEpochWarning
 
 ORDER = [5, 2, 0, 7, 3, 1, 6, 4]
 
@@ -36,6 +38,14 @@ def test_an_epoch_that_was_stopped_goes_on_in_another_process_with_the_same_samp
     begun = by_id([next(first), next(first)])
     resumed = pickle.loads(pickle.dumps(dataset))  # as a checkpoint keeps it
     assert begun + by_id(loader(resumed, ORDER[4:], workers=2)) == whole
+
+
+@pytest.mark.parametrize("copied", [lambda dataset: pickle.loads(pickle.dumps(dataset)), copy.deepcopy])
+def test_what_workers_read_ahead_is_not_read_in_a_copy_that_goes_on(dataset, copied):
+    by_id(loader(dataset, ORDER))  # as two workers do while a loop is at its second batch
+    by_id(loader(copied(dataset), ORDER, workers=2))
+    with pytest.warns(RepeatedEpochWarning):
+        by_id(loader(dataset, ORDER))
 
 
 def test_samples_that_come_twice_keep_their_draws_where_the_count_goes_on(dataset):
