@@ -232,18 +232,15 @@ def nothing(objects: Any) -> None:
     """Stand in for a step that is left out."""
 
 
-NEVER = {"gap_from": 1e6, "gap_full": 2e6, "rim_gap_from": 1e6, "rim_gap_full": 2e6}
+NEVER = {"gap_from": 1e6, "gap_full": 2e6}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "full": {},
     "no hollows": {"join_hollows": nothing},
     "no occlusion joining": {"join_occluded": nothing},
-    "no small regions": {"join_small": nothing},
-    "regions and contacts alone": {"join_hollows": nothing, "join_occluded": nothing, "join_small": nothing},
+    "regions and contacts alone": {"join_hollows": nothing, "join_occluded": nothing},
     "steps alone, no creases": {"angle_from": 3.0, "angle_full": 4.0},
     "creases alone, no steps": NEVER,
-    "no tolerance at rims": {"rim": 3.0},
     "convex creases do not bound regions": {"convex_part": 0.0},
-    "no prior of contacts": {"_PRIOR_PIXELS": 0},
     "limit 0.2": {"PARTS_FROM": 0.2},
     "limit 0.5": {"PARTS_FROM": 0.5},
 }

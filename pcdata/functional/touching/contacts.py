@@ -48,17 +48,15 @@ def region_contacts(
     turn = normal[b] - normal[a]
     angle = torch.where(found[a] & found[b], length(turn), 0.0)
     lean = dot(turn, mean[b] - mean[a])
-    concave, convex = torch.where(lean < 0, angle, 0.0), torch.where(lean > 0, angle, 0.0)
+    concave = torch.where(lean < 0, angle, 0.0)
     half_down = torch.where(second - first == 1, 0.0, 0.5).to(torch.float64)
     half_right = 0.5 - half_down
     step = (middle[a] + right[a] * half_right) + down[a] * half_down
     step = step - ((middle[b] - right[b] * half_right) - down[b] * half_down)
     gap = step.abs() / noise
-    is_rim = convex > limits.rim
-    gap_from = torch.where(is_rim, limits.rim_gap_from, limits.gap_from)
-    gap_full = torch.where(is_rim, limits.rim_gap_full, limits.gap_full)
-    bent = ((concave - limits.angle_from) / (limits.angle_full - limits.angle_from)).clamp(0, 1)
-    return Contacts(first, second, torch.maximum(bent, ((gap - gap_from) / (gap_full - gap_from)).clamp(0, 1)))
+    bent = (concave - limits.angle_from) / (limits.angle_full - limits.angle_from)
+    apart = (gap - limits.gap_from) / (limits.gap_full - limits.gap_from)
+    return Contacts(first, second, torch.maximum(bent, apart).clamp(0, 1))
 
 
 @inner

@@ -16,13 +16,11 @@ import torch
 from pcdata.functional.touching.faces import Face, Scene
 from pcdata.functional.touching.limits import KINECT_NOISE
 
-# Regions whose contact is weaker than this on the mean are one object; contacts of few pixels are drawn toward it by as
-# many as this that are just as strong: six pixels do not part what one cannot tell.
+# Regions whose contact is weaker than this on the mean are one object.
 PARTS_FROM = 0.35
-_PRIOR_PIXELS = 6
-# Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature; regions of
-# less than 5.2 cm2 beside another are a part of it.
-_FACE, _HOLLOW, _SMALL, _SLIVER = 6.6e-4, 9.2e-4, 5.2e-4, 1.3e-3
+# Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature; in a bowl,
+# what is below the rim and smaller than 13 cm2 is a part of it.
+_FACE, _HOLLOW, _SLIVER = 6.6e-4, 9.2e-4, 1.3e-3
 _CONTACT_PIXELS = 5  # fewer are no contact
 # The inside of a bowl: mean sine of the rise over tangent planes, and the part that rises. Real bowls have 0.07 to 0.29
 # and boxes and cylinders seen from outside less than 0.
@@ -37,7 +35,7 @@ _MOST_FREE, _LEAST_HIDDEN, _LEAST_UNSEEN = 0.1, 0.25, 0.6
 _TOUCH_TURN, _TOUCH_APART, _TOUCH_SEEN, _TOUCH_RMS = 8.0, 0.006, 0.9, 0.004
 
 # Why regions were joined that no weak contact joined.
-REASONS = ("hollow", "occluded", "touching", "small")
+REASONS = ("hollow", "occluded", "touching")
 
 
 class Objects:
@@ -109,10 +107,7 @@ def merge_weak_contacts(objects: Objects) -> None:
     """Join the two objects with the weakest contact, until every contact is strong; contacts grow as objects do."""
     contact = {pair: (total, count) for pair, (total, count, _) in objects.contacts().items()}
     while contact:
-        strength, pair = min(
-            ((total + PARTS_FROM * _PRIOR_PIXELS) / (count + _PRIOR_PIXELS), pair)
-            for pair, (total, count) in contact.items()
-        )
+        strength, pair = min((total / count, pair) for pair, (total, count) in contact.items())
         if strength > PARTS_FROM:
             return
         kept, gone = pair
@@ -209,20 +204,3 @@ def _plane_faces(objects: Objects) -> Iterator[tuple[int, Face]]:
             face = objects.face(regions)
             if face.area >= _FACE and face.rms < _CURVED_RMS:
                 yield regions[0], face
-
-
-def join_small(objects: Objects) -> None:
-    """Join objects that are too small to be told apart to the one they touch most, the smallest first."""
-    areas = {one: objects.face(regions).area for one, regions in objects.members().items()}
-    for one in sorted(areas, key=lambda one: (areas[one], one)):
-        if areas[one] >= _SMALL:
-            continue
-        beside = [
-            (count, -other)
-            for pair, (_, count, _) in objects.contacts().items()
-            if objects.object_of[one] in pair
-            for other in pair
-            if other != objects.object_of[one]
-        ]
-        if beside and max(beside)[0] >= _CONTACT_PIXELS:
-            objects.join(one, -max(beside)[1], "small")

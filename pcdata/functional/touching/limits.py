@@ -47,10 +47,6 @@ class Limits(NamedTuple):
     # A step between both sides counts from 5 deviations and fully at 10, each the mean of a dozen points and more.
     gap_from: float = 4.7
     gap_full: float = 9.4
-    # Over an edge that is convex by 25 degrees twice as much: rims are round and are fitted badly.
-    rim: float = chord(25)
-    rim_gap_from: float = 9.4
-    rim_gap_full: float = 19.6
     # Square metres: a region's smooth inside covers 1.6 cm2; 60 pixels of a Kinect at 0.85 m.
     seed_area: float = 1.6e-4
 

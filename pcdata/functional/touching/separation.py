@@ -11,14 +11,7 @@ from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import ptr_from_counts, transform_points
 from pcdata.functional.touching.contacts import region_contacts
 from pcdata.functional.touching.faces import Scene
-from pcdata.functional.touching.joining import (
-    REASONS,
-    Objects,
-    join_hollows,
-    join_occluded,
-    join_small,
-    merge_weak_contacts,
-)
+from pcdata.functional.touching.joining import REASONS, Objects, join_hollows, join_occluded, merge_weak_contacts
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
 from pcdata.functional.touching.regions import PixelCamera, smooth_regions
 
@@ -93,7 +86,6 @@ def separate_objects(
     merge_weak_contacts(objects)
     join_hollows(objects)
     join_occluded(objects)
-    join_small(objects)
     lookup = torch.tensor([*objects.object_of, -1], dtype=torch.int64, device=points.device)
     found = lookup[regions.label.view(-1)[pixel]]
     label, names = in_order_of_rows(found)

@@ -16,7 +16,7 @@ namespace {
 // As pcdata.functional.touching.limits lays them out.
 struct Limits {
   double normal_reach, crease_reach, contact_reach, jump, gate, step, slope, full_crease, convex_part, smooth;
-  double angle_from, angle_full, gap_from, gap_full, rim, rim_gap_from, rim_gap_full, seed_area;
+  double angle_from, angle_full, gap_from, gap_full, seed_area;
 };
 struct Camera {
   double fx, fy, cx, cy;
