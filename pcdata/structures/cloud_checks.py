@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DeviceError, DTypeError, ShapeError
+from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, check_names
 from pcdata.structures.kinds import FIELDS, KINDS, Kind
 from pcdata.structures.signals import check_signals
@@ -30,6 +31,9 @@ def check_cloud(
     sizes = check_tensors("PointCloud", {**fields, **others}, specs, check_values=False)
     if ptr.device.type == "cpu":
         check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
+        check_affine("PointCloud: source_from_cloud", cloud.source_from_cloud)
+        for name, matrix in poses.items():
+            check_affine(f"PointCloud: {name}", matrix)
     _check_extra(extra, cloud.kinds, sizes["N"], ptr)
     for name in ("meta", "history"):
         if (entries := len(vars(cloud)[name])) != sizes["B"]:

@@ -276,10 +276,7 @@ class PointCloud(CloudBatch):
             ShapeError: there is not one matrix for each cloud.
             PoseError: a matrix is not affine (is it made for row vectors?), not finite, or singular.
         """
-        if tuple(matrix.shape) != (self.num_clouds, 4, 4):
-            raise ShapeError(f"PointCloud.transformed: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
-        check_affine("PointCloud.transformed", matrix)
-        matrix = matrix.to(dtype=torch.float64, device=self.device)
+        matrix = self._checked_motion("PointCloud.transformed", matrix)
         rows = moved(self.fields(), self.kinds, self.ptr, matrix)
         return self._with_rows(rows, **self._facts_moved([matrix], frame_id, unit))
 
@@ -288,13 +285,23 @@ class PointCloud(CloudBatch):
 
         Args:
             matrices: new_from_old, (B, 4, 4) float64 each.
+
+        Raises:
+            ShapeError, PoseError: as :meth:`transformed`.
         """
-        matrices = [matrix.to(dtype=torch.float64, device=self.device) for matrix in matrices]
+        matrices = [self._checked_motion("PointCloud.with_facts_moved", matrix) for matrix in matrices]
         fields = self.fields()
         points = fields.pop("points")
         for matrix in matrices:
             fields = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
         return self._with_rows({"points": points, **fields}, **self._facts_moved(matrices, None, None))
+
+    def _checked_motion(self, where: str, matrix: Tensor) -> Tensor:
+        """Require one affine matrix for each cloud; return it as coordinates are multiplied by it."""
+        if tuple(matrix.shape) != (self.num_clouds, 4, 4):
+            raise ShapeError(f"{where}: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
+        check_affine(where, matrix)
+        return matrix.to(dtype=torch.float64, device=self.device)
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""

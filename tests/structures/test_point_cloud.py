@@ -328,19 +328,36 @@ def test_the_repr_says_how_many_points_where_and_what():
     assert repr(cloud_in_base((3, 9)).padded()) == "PaddedClouds(2 x 9 in 'base' [m])"
 
 
-@pytest.mark.parametrize(
+SPOILT = pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (lambda matrix: matrix.mT, r"matrix 1 must have the last row 0 0 0 1, got .*made for row vectors"),
         (lambda matrix: matrix + torch.eye(4).double()[3] * 0.5, "matrix 0 must have the last row 0 0 0 1"),
         (lambda matrix: matrix * torch.nan, "matrix 0 has NaN or infinite values"),
+        (lambda matrix: matrix + torch.full((4, 4), torch.inf).double().triu(3), "matrix 0 has NaN or infinite values"),
         (lambda matrix: matrix * torch.tensor([1.0, 1, 0, 1]).double(), "matrix 0 is singular"),
     ],
-    ids=["transposed", "projective", "nan", "flat"],
+    ids=["transposed", "projective", "nan", "infinite", "flat"],
 )
-def test_a_matrix_that_is_not_affine_moves_no_cloud(spoil, words):
-    cloud = cloud_in_base((5, 4))
-    matrix = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+
+
+@SPOILT
+@pytest.mark.parametrize("num_clouds", [2, 40])
+def test_a_matrix_that_is_not_affine_moves_no_cloud(spoil, words, num_clouds):
+    cloud = cloud_in_base((5, 4) * (num_clouds // 2))
+    matrix = torch.eye(4, dtype=torch.float64).repeat(num_clouds, 1, 1)
     matrix[1, :3, 3] = torch.tensor([0.1, 0.2, 0.3])
     with pytest.raises(PoseError, match=rf"PointCloud.transformed: {words}"):
         cloud.transformed(spoil(matrix))
+    with pytest.raises(PoseError, match=rf"PointCloud.with_facts_moved: {words}"):
+        cloud.with_facts_moved([matrix, spoil(matrix)])
+    cloud = dataclasses.replace(cloud, recorded_signals={})
+    with pytest.raises(PoseError, match=rf"PointCloud: source_from_cloud: {words}"):
+        dataclasses.replace(cloud, source_from_cloud=spoil(matrix))
+    with pytest.raises(PoseError, match=rf"PointCloud: frames\['table'\]: {words}"):
+        dataclasses.replace(cloud, frames={"table": spoil(matrix)})
+
+
+def test_motions_of_other_clouds_move_none():
+    with pytest.raises(ShapeError, match=r"PointCloud.with_facts_moved: matrix must be \(2, 4, 4\)"):
+        cloud_in_base((5, 4)).with_facts_moved([torch.eye(4, dtype=torch.float64)])

@@ -416,7 +416,7 @@ def test_names_that_differ_by_case_alone_are_stored(tmp_path):
     for place, name in enumerate(("q", "Q", "%51", "qq", "qQ", "QQ")):
         cloud = cloud.with_signal(name, torch.full((1,), float(place)), "invariant")
     eye = torch.eye(4, dtype=torch.float64)[None]
-    cloud = replace(cloud, frames={"Tool": eye, "tool": 2 * eye})
+    cloud = replace(cloud, frames={"Tool": eye, "tool": eye * torch.tensor([2.0, 2.0, 2.0, 1.0])})
     for form in ("npz", "hdf5", "packed", "pt"):
         store = STORES[form](tmp_path)
         store.write("k", record_from_cloud(cloud))

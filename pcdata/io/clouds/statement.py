@@ -176,6 +176,7 @@ def _take(found: CloudStatement, key: str, value: Any) -> None:
         found.viewpoint = None if value is None else _numbers(value, (3,)).tolist()
     elif key == "source_from_cloud":
         found.source_from_cloud = _matrix(value)
+        rigid.check_affine("it", found.source_from_cloud[None])
     elif key == "frame":
         name, matrix = value
         pose = _matrix(matrix)

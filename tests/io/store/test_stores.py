@@ -38,6 +38,7 @@ def full_cloud(seed: int = 0) -> PointCloud:
     n, counts = 37, [20, 0, 17]
     normals = torch.nn.functional.normalize(torch.randn(n, 3, generator=draw), dim=1)
     matrices = torch.randn(3, 4, 4, generator=draw, dtype=torch.float64)
+    matrices[:, 3] = torch.tensor([0.0, 0.0, 0.0, 1.0])
     k = [[600.0, 0.0, 319.5], [0.0, 601.0, 239.5], [0.0, 0.0, 1.0]]
     camera = {"intrinsics": [k], "size": [480, 640], "distortion": None, "world_from_camera": matrices[0].tolist()}
     return PointCloud(
@@ -67,7 +68,7 @@ def full_cloud(seed: int = 0) -> PointCloud:
         viewpoint=torch.randn(3, 3, generator=draw),
         source_from_cloud=matrices,
         source_frame="camera",
-        frames={"camera": matrices + 1, "robot/tool 0": matrices + 2},
+        frames={"camera": matrices @ matrices, "robot/tool 0": matrices.flip(0)},
         unit="normalized",
         meta=[{"sample_id": "a/b é", "planes": [[0.1, 0.2, 0.3, 1e-300]], "cameras": [camera]}, {}, {"none": None}],
         history=[[{"step": "Deproject", "points": 20, "fields": {}}], [], [{"step": "X"}, {"step": "Y"}]],
