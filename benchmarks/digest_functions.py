@@ -80,10 +80,24 @@ def _function_calls() -> Iterator[Case]:
         "voxel_mean": lambda g: f.voxel_mean(g.source, g.inverse, g.count),
         "voxel_mean_direction": lambda g: f.voxel_mean_direction(g.normals, g.inverse, g.count),
         "voxel_minimum": lambda g: f.voxel_minimum(torch.arange(300) % 7, g.inverse, g.count),
+        "NeighborIndex": lambda g: _searched_often(f.NeighborIndex(g.source, ptr_of(170, 130)), points(40, 9)),
+        "convex_hull": lambda g: f.convex_hull(g.source[:, :2]),
+        "shape_features": lambda g: f.shape_features(f.neighborhood_covariance(g.source, max_neighbors=12)[1]),
+        "smallest_rectangle": lambda g: f.smallest_rectangle(g.source[:, :2]),
+        "voxel_cells": lambda g: f.voxel_cells(g.source, 0.04),
+        "voxel_maximum": lambda g: f.voxel_maximum(torch.arange(300) % 7, g.inverse, g.count),
         "register_to_color": lambda g: _registered(g.frame, g.colors),
     }
     for name, make in calls.items():
         yield f"function/{name}", lambda make=make: make(_given())
+
+
+def _searched_often(index: Any, queries: Tensor) -> list[Any]:
+    asked = {"queries": queries, "queries_ptr": ptr_of(25, 15)}
+    return [
+        *(index.knn(k=5, **asked), index.knn(k=5, exclude_self=True)),
+        *(index.ball_query(radius=0.03, max_neighbors=7, **asked), index.radius_neighbors(radius=0.03, **asked)),
+    ]
 
 
 def _registered(frame: Any, colors: Tensor) -> Any:

@@ -152,6 +152,13 @@ def with_confidence(frame: Any) -> Any:
     return replace(frame, confidence=3 - (frame.depth == 0).to(torch.uint8))
 
 
+def with_lens(frame: Any) -> Any:
+    """The capture as if its images were seen through a lens."""
+    lens = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=torch.float64)
+    camera = replace(frame.camera, distortion=lens.repeat(len(frame.depth), 1))
+    return replace(frame, camera=camera)
+
+
 class Samples:
     """Captures or clouds in memory as a source."""
 

@@ -1,33 +1,19 @@
-"""Digests of every operation, public and inner, on every backend."""
+"""Digests of every public operation, on every backend."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
-import numpy as np
 import torch
-from digest_inputs import poses, rendered, seeded, with_confidence
-from digest_names import (
-    Role,
-    StoredForm,
-    StoredGroups,
-    backends_of,
-    call,
-    call_inner,
-    find_records,
-    functional,
-    inner_names,
-    operation_names,
-    parts_of,
-    tsdf,
-)
+from digest_inputs import rendered, seeded
+from digest_names import backends_of, call, functional, inner_names, operation_names, tsdf
 from torch import Tensor
 
 Case = tuple[str, Callable[[], Any]]
 K = torch.tensor([[[30.0, 0.1, 8.2], [0.0, 31.0, 6.1], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+LAST = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENS = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=torch.float64)
 
 
@@ -73,6 +59,13 @@ CLOUDS: dict[str, Callable[[], dict[str, Any]]] = {
     "with empty": lambda: {"points": torch.cat([points(60, 0), lattice(3)]), "ptr": ptr_of(60, 0, 36)},
     "on a grid": on_a_grid,
 }
+PAIRS: dict[str, Callable[[], dict[str, Any]]] = {
+    "two": lambda: {
+        **{"points_a": points(90, 1), "ptr_a": ptr_of(50, 40)},
+        **{"points_b": points(80, 2), "ptr_b": ptr_of(30, 50)},
+    },
+    "ties": lambda: {"points_a": lattice(), "ptr_a": None, "points_b": lattice(3), "ptr_b": None},
+}
 NEIGHBOR_OPERATIONS = {
     "ball_query": [{"radius": 0.03, "max_neighbors": 5}, {"radius": 0.04, "max_neighbors": 40}],
     "knn": [{"k": 4}, {"k": 40}],
@@ -80,10 +73,13 @@ NEIGHBOR_OPERATIONS = {
     "estimate_normals": [{"radius": 0.05, "max_neighbors": 12}, {"radius": None, "max_neighbors": 9}],
     "neighborhood_covariance": [{"radius": 0.05, "max_neighbors": 12}],
     "radius_neighbors": [{"radius": 0.03}, {"radius": 0.06, "exclude_self": True}],
+    "core_point_mask": [{"eps": 0.03, "min_points": 4}],
     "radius_outlier_mask": [{"radius": 0.03, "min_neighbors": 2}, {"radius": 0.02, "min_neighbors": 6}],
     "statistical_outlier_mask": [{"num_neighbors": 6, "std_ratio": 1.0}],
 }
 CLOUD_OPERATIONS = {
+    "box_mask": [{"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}],
+    "duplicate_mask": [{}],
     "farthest_point_sample": [{"num_samples": 20}],
     "farthest_point_groups": [{"ratio": 0.2}],
     "find_voxel_size": [{"num_points": 12}],
@@ -91,6 +87,8 @@ CLOUD_OPERATIONS = {
         {"distance": 0.01, "num_hypotheses": 100},
         {"distance": 0.01, "seed": 5, "up": (0.0, 0.0, 1.0), "max_tilt": 0.3},
     ],
+    "segment_planes": [{"num_hypotheses": 50, "min_share": 0.1}],
+    "supporting_plane": [{"num_hypotheses": 50, "distance": 0.005}],
     "voxel_downsample": [
         {"voxel_size": 0.04},
         {"voxel_size": 0.021},
@@ -219,10 +217,8 @@ def _operation_calls() -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]
                     yield name, f"{label} {number}", partial(_on_cloud, name, label, options)
     for name, options in (("knn", {"k": 7}), ("ball_query", {"radius": 0.05, "max_neighbors": 6})):
         yield name, "queries", partial(_queries, options)
-    pair = {"points_a": points(90, 1), "ptr_a": ptr_of(50, 40), "points_b": points(80, 2), "ptr_b": ptr_of(30, 50)}
-    yield "chamfer_distance", "two", lambda: pair
-    same = {"points_a": lattice(), "ptr_a": None, "points_b": lattice(3), "ptr_b": None}
-    yield "chamfer_distance", "ties", lambda: same
+    for label, clouds in PAIRS.items():
+        yield "chamfer_distance", label, clouds
     for name, variants in IMAGE_OPERATIONS.items():
         for number, options in enumerate(variants):
             for label, make in IMAGES.items():
@@ -237,120 +233,97 @@ def _operation_calls() -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]
     for name in FUSIONS:
         yield name, "two views", partial(_fusion, name)
     yield "pack_colors", "rendered", lambda: {"colors": rendered(2, 5).colors[0]}
+    yield from _clouds_and_what_else()
+    yield from _image_pairs()
 
 
-Arguments = tuple[tuple[Any, ...], dict[str, Any]]
+def _clouds_and_what_else() -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]:
+    """Yield calls of operations on clouds that take more than clouds, or a pair of them."""
+    for name, options in (("f_score", {"threshold": 0.02}), ("hausdorff_distance", {})):
+        for label, clouds in PAIRS.items():
+            yield name, label, lambda clouds=clouds, options=options: {**clouds(), **options}
+    two = CLOUDS["two"]
+    yield "chamfer_distance", "normals", lambda: {**PAIRS["two"](), **_normals(), "norm": "l1", "squared": False}
+    weights = torch.rand(126, generator=seeded(9)) * 2
+    yield "core_point_mask", "weights", lambda: {**two(), "eps": 0.03, "min_points": 4, "weights": weights}
+    yield "dbscan", "weights", lambda: {**two(), "eps": [0.03, 0.021], "min_points": 4, "weights": weights}
+    target = two()["points"][:, [1, 2, 0]] + 0.01 * torch.rand(126, 3, generator=seeded(3))
+    for number, options in enumerate(({}, {"with_scale": True, "weights": weights})):
+        yield "fit_paired_points", f"two {number}", lambda options=options: {**two(), "targets": target, **options}
+    features = torch.rand(227, 4, generator=seeded(5))
+    yield "interpolate_features", "queries", lambda: {**_queries({"k": 5}), "features": features}
+    polygon = [[0.0, 0.0], [0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
+    for label in ("random", "ties"):
+        flat = CLOUDS[label]()["points"][:, :2].contiguous()
+        yield "polygon_mask", label, lambda flat=flat: {"points": flat, "polygon": polygon}
+    planes = torch.tensor([[0.0, 0.0, 2.0, -0.2], [0.0, 0.0, 1.0, -0.02]], dtype=torch.float64)
+    yield "table_surface", "two", lambda: {**two(), "planes": planes, "viewpoint": (0.1, 0.1, 1.0)}
+    yield "table_surface", "on a grid", _table_of_a_grid
 
 
-def _fields() -> dict[str, Tensor]:
-    return {"points": points(90, 1), "labels": torch.arange(90), "byte": torch.arange(90).to(torch.uint8)}
+def _normals() -> dict[str, Tensor]:
+    normals = torch.nn.functional.normalize(torch.randn(90, 3, generator=seeded(7)), dim=1)
+    return {"normals_a": normals, "normals_b": normals.flip(0)[:80]}
 
 
-def _parts() -> dict[str, list[Tensor]]:
-    return {name: [field[:50], field[50:]] for name, field in _fields().items()}
+def _table_of_a_grid() -> dict[str, Any]:
+    cloud = on_a_grid()
+    planes, _ = functional.supporting_plane(cloud["points"], cloud["ptr"], distance=0.005, num_hypotheses=50)
+    return {**cloud, "planes": planes, "viewpoint": (0.0, 0.0, 0.0)}
 
 
-def _fillers() -> dict[str, int]:
-    """What stands for no value: -1 where that is a signed integer."""
-    signed = (torch.int16, torch.int32, torch.int64)
-    return {name: -1 if values[0].dtype in signed else 0 for name, values in _parts().items()}
-
-
-def _mask() -> Tensor:
-    return torch.rand(rendered(2, 5).depth.shape, generator=seeded(8)) < 0.7
-
-
-def _images(lens: str) -> Arguments:
-    frame = with_confidence(rendered(2, 5))
-    distortion = LENS.repeat(2, 1) * 0.1 if lens == "lens" else None
-    more = {"labels": frame.labels, "confidence": frame.confidence}
-    return (frame.depth, frame.camera.intrinsics, distortion, frame.colors, more), {}
-
-
-def _into_box(lens: str, *, moved: bool) -> Arguments:
-    box = {"lower": (-0.3, -0.3, 0.0), "upper": (0.3, 0.2, 0.9), "near": 0.2, "far": 1.5, "mask": _mask()}
-    matrix = rendered(2, 5).world_from_camera if moved else None
-    return _images(lens)[0], {**box, "matrix": matrix}
-
-
-_ROWS = np.arange(60, dtype=np.float32).reshape(20, 3)  # of five records
-_PLACES = torch.tensor([4, 0, 2])
-
-
-def _groups() -> tuple[StoredGroups, StoredForm]:
-    table = torch.tensor([[[_ROWS.ctypes.data, 0, 0]]])
-    groups = StoredGroups(torch.tensor([0]), torch.tensor([[0, 0]]), torch.tensor([0, 2, 2, 6, 11, 20]))
-    return groups, StoredForm(0, table, torch.tensor([12]), torch.tensor([Role.ANY]))
-
-
-def _found_records() -> Arguments:
-    groups, form = _groups()
-    table = find_records(_PLACES, groups, form)
-    return (torch.zeros(int(parts_of(table, 1, len(_PLACES)).starts[-1]), dtype=torch.uint8), form, table), {}
-
-
-def _inner_calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
-    """Yield inner function, input, and what makes the arguments."""
-    rows = torch.tensor([3, 3, 89, 0])
-    yield "pick_rows", "index", lambda: ((_fields(), rows), {})
-    yield "pick_rows", "mask", lambda: ((_fields(), points(90, 1)[:, 0] > 0.1), {})
-    yield "join_rows", "two", lambda: ((_parts(),), {})
-    yield "pad_rows", "two", lambda: ((_parts(), 60, _fillers()), {})
-    for name in ("transform_points", "transform_directions"):
-        yield name, "one", lambda: ((points(90, 1), ptr_of(90), poses(2)[:1]), {})
-        yield name, "two", lambda: ((points(90, 1), ptr_of(50, 40), poses(2)), {})
-    seeds, two = torch.tensor([5, -7]), ptr_of(50, 40)
-    yield (
-        "move_points",
-        "two",
-        lambda: ((points(90, 1), two, [poses(2), (seeds, 0.01, None), (seeds + 1, 0.02, 0.03)]), {}),
-    )
-    yield (
-        "random_rows",
-        "three",
-        lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
-    )
-    yield "find_records", "three", lambda: ((_PLACES, *_groups()), {})
-    yield "gather_records", "three", _found_records
-    yield "inside_box", "random", lambda: ((points(90, 1), (0.05, 0.0, 0.0), (0.15, 0.2, 0.1)), {})
-    spoilt = points(90, 1).index_fill(0, rows[:1], torch.nan)
-    yield "inside_box", "not finite", lambda: ((spoilt, (0.0,) * 3, (1.0,) * 3), {})
-    yield "mask_depth", "range", lambda: ((rendered(2, 5).depth, 0.5, 0.9, None), {})
-    yield "mask_depth", "mask", lambda: ((rendered(2, 5).depth, None, None, _mask()), {})
+def _image_pairs() -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]:
+    """Yield calls of operations between clouds and images, or between two cameras."""
+    for label, make in IMAGES.items():
+        yield "deproject_ranges", label, lambda make=make: {"ranges": make()}
+        for lens in ("pinhole", "lens"):
+            yield "depth_normals", f"{label} {lens}", lambda label=label, lens=lens: {**_seen(label, lens), "reach": 2}
+        for rule in ("nearest", "surface"):
+            yield "undistort_depth", f"{label} {rule}", partial(_undistorted, label, rule=rule, max_jump=0.3)
+    for rule in ("bilinear", "nearest"):
+        yield "undistort_image", f"rendered {rule}", partial(_undistorted, "rendered", rule=rule, size=(7, 30))
+    yield "image_clusters", "on a grid", _on_its_pixels
     for lens in ("pinhole", "lens"):
-        yield "deproject_images", lens, partial(_images, lens)
-        yield "deproject_into_box", f"{lens} camera", partial(_into_box, lens, moved=False)
-        yield "deproject_into_box", f"{lens} base", partial(_into_box, lens, moved=True)
-    yield "nearest_chunks", "radius", lambda: ((points(400, 3), ptr_of(400), 6), {"radius": 0.03})
-    asked = _queries({})
-    searched = asked.pop("points"), asked.pop("ptr"), 5
-    yield "nearest_chunks", "queries", lambda: (searched, asked)
-    cloud, ptr, distance = CLOUDS["two"]()["points"], ptr_of(90, 36), 0.01
-    triples = torch.stack([torch.arange(90).reshape(30, 3) % count for count in (90, 36)])
-    planes = torch.nn.functional.normalize(torch.randn(2, 30, 4, generator=seeded(4), dtype=torch.float64), dim=2)
-    planes[:, :, 3] *= 0.1
-    yield "draw_planes", "two", lambda: ((cloud, ptr, triples, torch.tensor([0, 1])), {})
-    yield "count_near_planes", "two", lambda: ((cloud, ptr, planes, distance), {})
-    yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
-    yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
+        seen = {"size": (12, 16), "point_size": 0.02}
+        yield "render_points", lens, lambda lens=lens, seen=seen: {**_projected(lens), **seen}
+        yield "render_triangles", lens, partial(_triangles, lens)
+    for label in ("two", "with empty"):
+        yield "render_ranges", label, lambda label=label: {**CLOUDS[label](), "size": (12, 16)}
+
+
+def _undistorted(label: str, **options: Any) -> dict[str, Any]:
+    seen = _seen(label, "lens")
+    if "size" in options:
+        seen["image"] = rendered(2, 5).colors
+        del seen["depth"]
+    return {**seen, "new_intrinsics": 0.9 * K.repeat(len(seen["intrinsics"]), 1, 1) + 0.1 * LAST, **options}
+
+
+def _on_its_pixels() -> dict[str, Any]:
+    cloud = dict(on_a_grid())
+    grid = cloud.pop("grid")
+    return {**cloud, "pixel_index": grid.pixel_index, "size": grid.size, "eps": 0.05, "reach": 2}
+
+
+def _triangles(lens: str) -> dict[str, Any]:
+    seen = _projected(lens)
+    corners = seen.pop("points").reshape(30, 3, 3)
+    return {**seen, "triangles": corners, "ptr": ptr_of(16, 14), "size": (12, 16)}
+
+
+def without_example() -> list[str]:
+    """Return the operations that no case calls, and the cases of operations that are no more."""
+    from digest_inner import calls
+
+    seen = {name for name, _, _ in _operation_calls()} | {name for name, _, _ in calls()}
+    return sorted(seen ^ {*operation_names(), *inner_names()})
 
 
 def cases() -> Iterator[Case]:
-    """Yield ``op/NAME/backend/input`` and ``inner/NAME/backend/input``."""
-    seen = set()
+    """Yield ``op/NAME/backend/input``."""
     for name, label, make in _operation_calls():
-        seen.add(name)
         for backend in backends_of(name):
             yield (
                 f"op/{name}/{backend}/{label}",
                 lambda name=name, backend=backend, make=make: call(name, backend, make()),
             )
-    for name, label, given in _inner_calls():
-        seen.add(name)
-        for backend in backends_of(name):
-            yield (
-                f"inner/{name}/{backend}/{label}",
-                lambda name=name, backend=backend, given=given: call_inner(name, backend, *given()),
-            )
-    for name in sorted(seen ^ {*operation_names(), *inner_names()}):
-        print(f"digests: the operation {name} has no example, or is no more", file=sys.stderr)

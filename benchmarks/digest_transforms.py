@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from digest_inputs import COUNTS, base_cloud, camera_cloud, normalized_cloud, rendered, small_frame, with_confidence
+from digest_inputs import (
+    COUNTS,
+    base_cloud,
+    camera_cloud,
+    normalized_cloud,
+    rendered,
+    small_frame,
+    with_confidence,
+    with_lens,
+)
 from digest_names import chain, randomly, run, step, takes_frames, transform_names
 from digest_real import real_clouds, real_folder, real_frames
 
@@ -32,6 +40,10 @@ def _of(name: str, *fields: dict[str, Any], **others: Any) -> list[Example]:
 
 def _table(counts: tuple[int, ...] = COUNTS, seed: int = 0) -> Any:
     return with_confidence(rendered(len(counts), seed))
+
+
+def _through_a_lens(counts: tuple[int, ...] = COUNTS, seed: int = 0) -> Any:
+    return with_lens(small_frame(counts, seed))
 
 
 EXAMPLES: dict[str, list[Example]] = {
@@ -188,6 +200,7 @@ EXAMPLES: dict[str, list[Example]] = {
         *_of("ToFrame", {"frame": "base"}, make=camera_cloud, real=False),
         *_of("ToFrame", {"frame": "camera"}, {"frame": "table", "start": "base", "matrix": TURN}),
     ],
+    "Undistort": _of("Undistort", {}, {"rule": "surface", "zoom": 0.7, "max_jump": 0.3}, make=_through_a_lens),
     "VoxelDownsample": [
         *_of("VoxelDownsample", {"voxel_size": 0.02}, {"num_points": 40}),
         *_of("VoxelDownsample", {"voxel_size": 0.1, "unit": "normalized"}, make=normalized_cloud, real=False),
@@ -199,10 +212,13 @@ EXAMPLES: dict[str, list[Example]] = {
 }
 
 
+def without_example() -> list[str]:
+    """Return the transforms that have no example, and the examples of transforms that are no more."""
+    return sorted(set(transform_names()) ^ set(EXAMPLES))
+
+
 def cases() -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield ``transform/NAME/number/input`` for one cloud, a batch of two, and real captures."""
-    for name in sorted(set(transform_names()) ^ set(EXAMPLES)):
-        print(f"digests: the transform {name} has no example, or is no more", file=sys.stderr)
     for name, examples in EXAMPLES.items():
         for number, example in enumerate(examples):
             yield from _cases_of(f"transform/{name}/{number}", example)

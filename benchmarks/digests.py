@@ -32,6 +32,7 @@ from typing import Any
 Case = tuple[str, Callable[[], Any]]
 MODULES = [
     "digest_operations",
+    "digest_inner",
     "digest_functions",
     "digest_transforms",
     "digest_files",

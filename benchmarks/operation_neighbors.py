@@ -20,6 +20,7 @@ def cases(cloud: pcdata.PointCloud) -> Iterator[Case]:
     """All of this file."""
     points = cloud.points[::8].contiguous()
     yield from wide_cases(points)
+    yield from index_cases(points)
     yield from radius_cases(points)
     yield from shape_cases(points)
     yield from metric_cases(points)
@@ -71,6 +72,21 @@ def wide_cases(points: torch.Tensor) -> Iterator[Case]:
                 f"kNN {K}, {width} columns", count, lambda table=table: F.knn(table, k=K), "Open3D tensor", indexed,
                 lambda a, b: f"distances within {np.abs(a[1].numpy() - b).max():.0e}",
             )  # fmt: skip
+
+
+def index_cases(points: torch.Tensor) -> Iterator[Case]:
+    """Few queries at a time into points that were sorted once, as a planner or a tracker asks."""
+    queries = (points[::97] + 0.003).contiguous()
+    index = F.NeighborIndex(points)
+    if installed("scipy"):
+        from scipy.spatial import cKDTree
+
+        tree, asked = cKDTree(points.numpy()), queries.numpy()
+        yield Case(
+            "kNN 16, few queries, sorted before", len(queries), lambda: index.knn(queries=queries, k=K),
+            "SciPy cKDTree, built before", lambda: tree.query(asked, k=K, workers=-1),
+            lambda a, b: f"distances within {np.abs(a[1].numpy() - b[0]).max():.0e}",
+        )  # fmt: skip
 
 
 def radius_cases(points: torch.Tensor) -> Iterator[Case]:

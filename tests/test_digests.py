@@ -13,9 +13,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import digest_operations
+import digest_transforms
 import digests
 from digest_hash import Many, digest, digests_of
 from digest_inputs import base_cloud, small_frame
+
+from pcdata.contracts.dispatch import why_unavailable
 
 SUBSET = (
     "op/knn/torch/ties",
@@ -34,6 +38,12 @@ def test_every_case_has_a_name_of_its_own(cases):
     names = [name for name, _ in cases]
     assert len(set(names)) == len(names)
     assert {name.split("/")[0] for name in names} >= {"op", "inner", "fusion", "transform", "store", "export", "check"}
+
+
+@pytest.mark.skipif(why_unavailable("cpu") is not None, reason="what has a kernel alone is registered with it")
+def test_every_operation_and_transform_has_an_example():
+    assert digest_operations.without_example() == []
+    assert digest_transforms.without_example() == []
 
 
 def test_two_runs_give_equal_digests(cases, tmp_path):

@@ -129,6 +129,10 @@ def page() -> str:
         lines.append(f"| `{name}` | {gradient} | {batches(name)} | {compiled} | `tests/{test}` | {peers} |")
     lines += [
         "",
+        "Points that are searched often are sorted once by `NeighborIndex` (SciPy `cKDTree`, scikit-learn "
+        "`NearestNeighbors`, Open3D `NearestNeighborSearch`): its `knn`, `ball_query` and `radius_neighbors` give what "
+        "the operations of these names give, bit for bit (`tests/functional/test_neighbor_index.py`).",
+        "",
         "Alignment of clouds without partners is `pcdata.alignment.align_clouds` "
         "([alignment.md](alignment.md)), fusion "
         "`pcdata.TSDFVolume` ([fusion.md](fusion.md)), rendering of structures `pcdata.render` "

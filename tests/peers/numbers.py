@@ -54,6 +54,12 @@ SCIPY = Section(
             by(lambda a: a[1], lambda b: b[0]),
         ),
         Call(
+            "spatial.cKDTree(points.numpy()).query(queries.numpy(), k=4)",
+            "F.NeighborIndex(points).knn(queries=queries, k=4)",
+            "sorted once, searched often; `ball_query` and `radius_neighbors` too",
+            by(lambda a: a[1], lambda b: b[0]),
+        ),
+        Call(
             "tree.query(queries.numpy(), k=8, distance_upper_bound=0.03)",
             "F.ball_query(points, queries=queries, radius=0.03, max_neighbors=8)",
             "with the number found",
@@ -163,6 +169,11 @@ SCIKIT_LEARN = Section(
             "F.knn(points, queries=queries, k=8)",
             "(index, distance)",
             by(lambda a: a[1], lambda b: b[0]),
+        ),
+        Call(
+            "NearestNeighbors(n_neighbors=5).fit(points.numpy()).kneighbors",
+            "F.NeighborIndex(points)",
+            "an index made once: `.knn(queries=queries, k=5)`",
         ),
         Call(
             "NearestNeighbors(n_neighbors=7).fit(points.numpy()).kneighbors()",

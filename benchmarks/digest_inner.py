@@ -1,0 +1,212 @@
+"""Digests of every inner function: the steps of operations, and what picks, joins and moves rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from digest_inputs import poses, rendered, seeded, with_confidence
+from digest_names import (
+    Limits,
+    ParallelJaw,
+    PixelCamera,
+    Role,
+    StoredForm,
+    StoredGroups,
+    backends_of,
+    call_inner,
+    find_records,
+    parts_of,
+)
+from digest_operations import CLOUDS, LENS, Case, _queries, on_a_grid, points, ptr_of
+from torch import Tensor
+
+Arguments = tuple[tuple[Any, ...], dict[str, Any]]
+
+
+def _fields() -> dict[str, Tensor]:
+    return {"points": points(90, 1), "labels": torch.arange(90), "byte": torch.arange(90).to(torch.uint8)}
+
+
+def _parts() -> dict[str, list[Tensor]]:
+    return {name: [field[:50], field[50:]] for name, field in _fields().items()}
+
+
+def _fillers() -> dict[str, int]:
+    """What stands for no value: -1 where that is a signed integer."""
+    signed = (torch.int16, torch.int32, torch.int64)
+    return {name: -1 if values[0].dtype in signed else 0 for name, values in _parts().items()}
+
+
+def _mask() -> Tensor:
+    return torch.rand(rendered(2, 5).depth.shape, generator=seeded(8)) < 0.7
+
+
+def _images(lens: str) -> Arguments:
+    frame = with_confidence(rendered(2, 5))
+    distortion = LENS.repeat(2, 1) * 0.1 if lens == "lens" else None
+    more = {"labels": frame.labels, "confidence": frame.confidence}
+    return (frame.depth, frame.camera.intrinsics, distortion, frame.colors, more), {}
+
+
+def _into_box(lens: str, *, moved: bool) -> Arguments:
+    box = {"lower": (-0.3, -0.3, 0.0), "upper": (0.3, 0.2, 0.9), "near": 0.2, "far": 1.5, "mask": _mask()}
+    matrix = rendered(2, 5).world_from_camera if moved else None
+    return _images(lens)[0], {**box, "matrix": matrix}
+
+
+_ROWS = np.arange(60, dtype=np.float32).reshape(20, 3)  # of five records
+_PLACES = torch.tensor([4, 0, 2])
+
+
+def _groups() -> tuple[StoredGroups, StoredForm]:
+    table = torch.tensor([[[_ROWS.ctypes.data, 0, 0]]])
+    groups = StoredGroups(torch.tensor([0]), torch.tensor([[0, 0]]), torch.tensor([0, 2, 2, 6, 11, 20]))
+    return groups, StoredForm(0, table, torch.tensor([12]), torch.tensor([Role.ANY]))
+
+
+def _found_records() -> Arguments:
+    groups, form = _groups()
+    table = find_records(_PLACES, groups, form)
+    return (torch.zeros(int(parts_of(table, 1, len(_PLACES)).starts[-1]), dtype=torch.uint8), form, table), {}
+
+
+def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
+    """Yield inner function, input, and what makes the arguments."""
+    rows = torch.tensor([3, 3, 89, 0])
+    yield "pick_rows", "index", lambda: ((_fields(), rows), {})
+    yield "pick_rows", "mask", lambda: ((_fields(), points(90, 1)[:, 0] > 0.1), {})
+    yield "join_rows", "two", lambda: ((_parts(),), {})
+    yield "pad_rows", "two", lambda: ((_parts(), 60, _fillers()), {})
+    for name in ("transform_points", "transform_directions"):
+        yield name, "one", lambda: ((points(90, 1), ptr_of(90), poses(2)[:1]), {})
+        yield name, "two", lambda: ((points(90, 1), ptr_of(50, 40), poses(2)), {})
+    seeds, two = torch.tensor([5, -7]), ptr_of(50, 40)
+    yield (
+        "move_points",
+        "two",
+        lambda: ((points(90, 1), two, [poses(2), (seeds, 0.01, None), (seeds + 1, 0.02, 0.03)]), {}),
+    )
+    yield (
+        "random_rows",
+        "three",
+        lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
+    )
+    yield "find_records", "three", lambda: ((_PLACES, *_groups()), {})
+    yield "gather_records", "three", _found_records
+    yield "inside_box", "random", lambda: ((points(90, 1), (0.05, 0.0, 0.0), (0.15, 0.2, 0.1)), {})
+    spoilt = points(90, 1).index_fill(0, rows[:1], torch.nan)
+    yield "inside_box", "not finite", lambda: ((spoilt, (0.0,) * 3, (1.0,) * 3), {})
+    yield "mask_depth", "range", lambda: ((rendered(2, 5).depth, 0.5, 0.9, None), {})
+    yield "mask_depth", "mask", lambda: ((rendered(2, 5).depth, None, None, _mask()), {})
+    for lens in ("pinhole", "lens"):
+        yield "deproject_images", lens, partial(_images, lens)
+        yield "deproject_into_box", f"{lens} camera", partial(_into_box, lens, moved=False)
+        yield "deproject_into_box", f"{lens} base", partial(_into_box, lens, moved=True)
+    yield "nearest_chunks", "radius", lambda: ((points(400, 3), ptr_of(400), 6), {"radius": 0.03})
+    asked = _queries({})
+    searched = asked.pop("points"), asked.pop("ptr"), 5
+    yield "nearest_chunks", "queries", lambda: (searched, asked)
+    cloud, ptr, distance = CLOUDS["two"]()["points"], ptr_of(90, 36), 0.01
+    triples = torch.stack([torch.arange(90).reshape(30, 3) % count for count in (90, 36)])
+    planes = torch.nn.functional.normalize(torch.randn(2, 30, 4, generator=seeded(4), dtype=torch.float64), dim=2)
+    planes[:, :, 3] *= 0.1
+    yield "draw_planes", "two", lambda: ((cloud, ptr, triples, torch.tensor([0, 1])), {})
+    yield "count_near_planes", "two", lambda: ((cloud, ptr, planes, distance), {})
+    yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
+    yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
+    yield from _calls_of_searches()
+    yield from _calls_of_images()
+
+
+def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
+    cloud, ptr = CLOUDS["two"]()["points"], ptr_of(90, 36)
+    asked = _queries({})
+    searched = asked.pop("points"), asked.pop("ptr")
+    for name, more in (("nearest_rows", ()), ("nearest_in", ({},))):
+        yield name, "radius", lambda more=more: ((cloud, ptr, *more, 6), {"radius": 0.03})
+        yield name, "queries", lambda more=more: ((*searched, *more, 5), asked)
+    yield "sorted_rows", "two", lambda: ((cloud, ptr), {})
+    yield "density_clusters", "two", lambda: ((cloud, ptr, 0.03, 4, None), {})
+    yield "farthest_rows", "two", lambda: ((cloud, ptr, [20, 7]), {})
+    yield "voxel_means", "two", lambda: ((cloud, ptr, 0.04 * torch.ones(2, 1, dtype=torch.float64), None), {})
+    values = torch.rand(126, generator=seeded(4), dtype=torch.float64)
+    yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})
+    yield "window_medians", "on a grid", _medians
+    jaw = ParallelJaw(
+        opening=0.08, finger_length=0.04, finger_thickness=0.01, finger_width=0.02, palm_length=0.05, tip=0.03
+    )
+    grasps = poses(5, 3)
+    grasps[:, :3, 3] = cloud[:5] + 0.01
+    lower, upper = jaw.boxes(torch.full((5,), 0.06))
+    yield "points_in_grippers", "five", lambda: ((cloud, jaw.axes(grasps), grasps[:, :3, 3], lower, upper), {})
+
+
+def _medians() -> Arguments:
+    cloud = on_a_grid()
+    return (cloud["points"][:, 2].double(), cloud["points"], cloud["ptr"], cloud["grid"]), {}
+
+
+def _calls_of_images() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
+    value = torch.rand(90, generator=seeded(6)) + 0.1
+    pixel = torch.randint(-1, 40, (90,), generator=seeded(7))
+    yield "least_at_pixels", "random", lambda: ((value, pixel, 40), {})
+    yield "linked_pixels", "on a grid", _linked
+    bent = torch.rand(30, 2, generator=seeded(4), dtype=torch.float64) - 0.5
+    twelve = torch.nn.functional.pad(LENS[0], (0, 7))
+    yield "unbent", "lens", lambda: ((bent, twelve, False, 1e3), {})
+    yield "front_triangles", "two", _triangles_in_boxes
+    for name, make in (("smooth_regions", _touching), ("region_planes", _sides)):
+        yield name, "table", make
+
+
+def _linked() -> Arguments:
+    cloud = on_a_grid()
+    grid = cloud["grid"]
+    return (cloud["points"], cloud["ptr"], grid.pixel_index, grid.size, 0.05, 2), {}
+
+
+def _triangles_in_boxes() -> Arguments:
+    """Two triangles over a small image, the one in front in part."""
+    corners = torch.tensor(
+        [
+            [[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.0, 0.6, 1.0]],
+            [[-0.6, 0.0, 0.8], [0.6, 0.1, 1.3], [0.0, -0.6, 0.9]],
+        ],
+        dtype=torch.float64,
+    )
+    a, b, c = corners.unbind(1)
+    cross = torch.linalg.cross
+    normal = cross(b - a, c - a)
+    axis = torch.linspace(-0.6, 0.6, 12, dtype=torch.float64)
+    rays = torch.cartesian_prod(axis, axis).flip(1)
+    boxes = tuple(torch.tensor(values) for values in ([0, 0], [12, 12], [12, 12]))
+    return (boxes, 12, rays, normal, (normal * a).sum(1), torch.stack([cross(b, c), cross(c, a), cross(a, b)], 1)), {}
+
+
+def _touching() -> Arguments:
+    """A table with objects as inverse depth, and the pinhole that saw it."""
+    depth = rendered(1, 3, (120, 160)).depth[0].double()
+    (fx, _, cx), (_, fy, cy), _ = rendered(1, 3, (120, 160)).camera.intrinsics[0].tolist()
+    inverse = torch.where(depth > 0, 1 / depth, 0.0)
+    return (inverse, PixelCamera(fx, fy, cx, cy), 0.0026, Limits()), {}
+
+
+def _sides() -> Arguments:
+    (inverse, camera, noise, limits), _ = _touching()
+    label = (torch.arange(160) // 40).expand(120, 160).contiguous()
+    pixel = torch.arange(0, 120 * 160, 97)
+    return (inverse, label, pixel[inverse.flatten()[pixel] > 0], camera, noise, limits), {}
+
+
+def cases() -> Iterator[Case]:
+    """Yield ``inner/NAME/backend/input``."""
+    for name, label, given in calls():
+        for backend in backends_of(name):
+            yield (
+                f"inner/{name}/{backend}/{label}",
+                lambda name=name, backend=backend, given=given: call_inner(name, backend, *given()),
+            )
