@@ -31,9 +31,6 @@ def check_cloud(
     sizes = check_tensors("PointCloud", {**fields, **others}, specs, check_values=False)
     if ptr.device.type == "cpu":
         check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
-        check_affine("PointCloud: source_from_cloud", cloud.source_from_cloud)
-        for name, matrix in poses.items():
-            check_affine(f"PointCloud: {name}", matrix)
     _check_extra(extra, cloud.kinds, sizes["N"], ptr)
     for name in ("meta", "history"):
         if (entries := len(vars(cloud)[name])) != sizes["B"]:
@@ -41,6 +38,12 @@ def check_cloud(
     check_names("PointCloud", cloud.frame_id, cloud.unit)
     if cloud.recorded_signals:
         check_signals(cloud)
+
+
+def check_motions(where: str, motions: Mapping[str, Tensor]) -> None:
+    """Raise unless the motions between frames that clouds are given can be undone."""
+    for name, matrix in motions.items():
+        check_affine(f"{where}: {name if name == 'source_from_cloud' else f'frames[{name!r}]'}", matrix)
 
 
 def _check_extra(extra: Mapping[str, Tensor], kinds: Mapping[str, Kind], num_points: int, ptr: Tensor) -> None:

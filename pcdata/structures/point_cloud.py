@@ -17,7 +17,7 @@ from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_rows, pick_rows, ptr_from_counts
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
-from pcdata.structures.cloud_checks import check_cloud
+from pcdata.structures.cloud_checks import check_cloud, check_motions
 from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
@@ -57,8 +57,12 @@ class PointCloud(CloudBatch):
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        given: Any = self.source_from_cloud  # whatever the annotation promises
         self._fill_defaults()
         check_cloud(self, {name: getattr(self, name) for name in FIELDS}, self.extra, self.ptr)
+        if self.ptr.device.type == "cpu":  # values elsewhere would have to be waited for
+            motions = dict(self.frames) if given is None else {"source_from_cloud": given, **self.frames}
+            check_motions("PointCloud", motions)
 
     # -- construction ----------------------------------------------------------------------------------------------
 
