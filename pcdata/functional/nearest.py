@@ -33,7 +33,7 @@ def nearest_chunks(
     *,
     queries: Tensor | None = None,  # (Q, D) float32; None = the points
     queries_ptr: Tensor | None = None,  # (B+1,)
-    radius: float | None = None,
+    radius: float | Tensor | None = None,  # or (Q,) float32
     backend: str = "auto",
 ) -> Iterator[Neighbors]:
     """Yield every query's k nearest points of its own cloud (with d < radius), each query once, in no fixed order.
@@ -47,7 +47,8 @@ def nearest_chunks(
     infinity = torch.tensor(torch.inf, dtype=torch.float32, device=points.device)
     missing = _order(infinity, torch.tensor(len(points), dtype=torch.int64, device=points.device))
     for pairs in pair_chunks(points, ptr, queries.detach(), queries_ptr):
-        order = torch.where(pairs.squared < limit, _order(pairs.squared, pairs.row), missing)
+        below = limit[pairs.query, None] if limit.ndim else limit
+        order = torch.where(pairs.squared < below, _order(pairs.squared, pairs.row), missing)
         nearest = order.topk(min(k, len(pairs.row)), largest=False).values
         padded = torch.cat([nearest, missing.expand(len(nearest), k - nearest.shape[1])], dim=1)
         yield pairs.query, (padded >> 32).int().view(torch.float32), padded & 0xFFFFFFFF

@@ -12,7 +12,7 @@ from pcdata.contracts.dispatch import inner
 from pcdata.contracts.numbers import checked_count
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ShapeError
-from pcdata.functional.neighbors import all_within, checked_radius, nearest, nearest_rows
+from pcdata.functional.neighbors import Listed, all_within, checked_radius, nearest, nearest_rows, rows_within
 
 
 @inner
@@ -35,12 +35,31 @@ def nearest_in(
     *,
     queries: Tensor | None = None,  # (Q, D) float32; None = the points
     queries_ptr: Tensor | None = None,
-    radius: float | None = None,
+    radius: float | Tensor | None = None,  # or (Q,) float32
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # index (Q, k) int64, distance (Q, k) float32
     """Find what :func:`nearest_rows` finds, among points that were prepared by the same backend."""
     found: tuple[Tensor, Tensor] = nearest_rows(
         points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius, backend="auto"
+    )
+    return found
+
+
+@inner
+def within_in(
+    points: Tensor,  # (N, D) float32
+    ptr: Tensor,  # (B+1,)
+    prepared: dict[str, Tensor],
+    radius: float | Tensor,  # or (Q,) float32
+    *,
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points
+    queries_ptr: Tensor | None = None,
+    exclude_self: bool = False,
+    backend: str = "auto",
+) -> Listed:
+    """Find what :func:`rows_within` finds, among points that were prepared by the same backend."""
+    found: Listed = rows_within(
+        points, ptr, radius, queries=queries, queries_ptr=queries_ptr, exclude_self=exclude_self, backend="auto"
     )
     return found
 
@@ -117,7 +136,8 @@ class NeighborIndex:
         """Find all points within a radius; see :func:`radius_neighbors`."""
         where = "NeighborIndex.radius_neighbors"
         own = self._checked(where, queries, queries_ptr, radius=radius)
-        return all_within(where, self._find, self.points, self.ptr, **own, exclude_self=exclude_self)
+        find = functools.partial(within_in, self._plain, self.ptr, self._prepared)
+        return all_within(where, find, self.points, **own, exclude_self=exclude_self)
 
     @property
     def _find(self) -> Any:

@@ -12,7 +12,7 @@ from pcdata.contracts.numbers import checked_count
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, near_matches
 from pcdata.functional.image_grid import ImageGrid, checked_grid
-from pcdata.functional.neighbors import checked_radius, finder, nearest_rows, search
+from pcdata.functional.neighbors import checked_radius, finder, nearest_rows
 
 _ROWS = 1 << 21  # neighbors whose offsets are alive at once
 
@@ -61,7 +61,7 @@ def neighborhood_covariance(
     """
     assert ptr is not None  # @op fills it
     own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
-    index, _ = search(finder(points, ptr, grid, backend), points, max_neighbors, own, radius)
+    index, _ = finder(points, ptr, grid, backend)(max_neighbors, **own, radius=radius)
     centers = (points if queries is None else queries).detach().double()
     wide = torch.cat([points.double(), points.new_zeros(1, 3, dtype=torch.float64)])
     parts = []

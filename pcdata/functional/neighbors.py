@@ -24,12 +24,15 @@ from pcdata.contracts.numbers import checked_count, require_length
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, rooted, squared_distance
-from pcdata.functional.rows import ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 
 # What finds the nearest rows of stated points: nearest_rows, with its points.
 Find = Callable[..., tuple[Tensor, Tensor]]
 
-# Neighbors of a query that radius_neighbors asks for at first, and places in a table that it fills at once.
+# All neighbors of every query: index (E,) int64, distance (E,) float32, neighbors_ptr (Q+1,).
+Listed = tuple[Tensor, Tensor, Tensor]
+
+# Neighbors of a query that grown_within asks for at first, and places in a table that it fills at once.
 _FIRST, _PLACES = 32, 1 << 22
 
 
@@ -41,7 +44,7 @@ def nearest_rows(
     *,
     queries: Tensor | None = None,  # (Q, D) float32; None = the points
     queries_ptr: Tensor | None = None,
-    radius: float | None = None,
+    radius: float | Tensor | None = None,  # or (Q,) float32
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # index (Q, k) int64, distance (Q, k) float32
@@ -52,6 +55,23 @@ def nearest_rows(
         k,
         points.device,
     )
+
+
+@inner
+def rows_within(
+    points: Tensor,  # (N, D) float32
+    ptr: Tensor,  # (B+1,)
+    radius: float | Tensor,  # or (Q,) float32
+    *,
+    queries: Tensor | None = None,  # (Q, D) float32; None = the points
+    queries_ptr: Tensor | None = None,
+    exclude_self: bool = False,
+    grid: ImageGrid | None = None,
+    backend: str = "auto",
+) -> Listed:
+    """Find all points of its own cloud with d < radius for every query."""
+    search = functools.partial(nearest_rows, points, ptr, grid=grid, backend="torch")
+    return grown_within(search, points, ptr, radius, queries, queries_ptr, exclude_self)
 
 
 def laid_out(chunks: Any, num_queries: int, k: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -180,7 +200,7 @@ def ball_query(
     queries_ptr="ptr Q B",
     radius=checked_radius,
     grid=checked_grid,
-    steps=(nearest_rows,),
+    steps=(rows_within,),
 )
 def radius_neighbors(
     points: Tensor,  # (N, D) float32
@@ -213,8 +233,8 @@ def radius_neighbors(
         ConfigError: the radius is not a positive length, or exclude_self with other queries.
     """
     assert ptr is not None  # @op fills it
-    find = finder(points, ptr, grid, backend)
-    return all_within("radius_neighbors", find, points, ptr, queries, queries_ptr, radius, exclude_self)
+    find = functools.partial(rows_within, points.detach(), ptr, grid=grid, backend=backend)
+    return all_within("radius_neighbors", find, points, queries, queries_ptr, radius, exclude_self)
 
 
 # -- shared by the functions above and by the index ------------------------------------------------------------------
@@ -227,16 +247,36 @@ def finder(points: Tensor, ptr: Tensor, grid: ImageGrid | None, backend: str) ->
 
 def all_within(
     where: str,
-    find: Find,
+    find: Callable[..., Listed],
     points: Tensor,
-    ptr: Tensor,
     queries: Tensor | None,
     queries_ptr: Tensor | None,
     radius: float | Tensor,
     exclude_self: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what :func:`radius_neighbors` does, by whatever finds the nearest among the points."""
+) -> Listed:
+    """Return what :func:`radius_neighbors` does, by whatever finds the neighbors among the points."""
     _require_own_queries(where, exclude_self, queries)
+    own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
+    index, distance, neighbors_ptr = find(radius, **own, exclude_self=exclude_self)
+    if _wants_gradient(points, queries):
+        query = cloud_of_rows(neighbors_ptr)
+        distance = _distance((points if queries is None else queries)[query], points[index])
+    return index, distance, neighbors_ptr
+
+
+def grown_within(
+    find: Find,
+    points: Tensor,
+    ptr: Tensor,
+    radius: float | Tensor,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    exclude_self: bool,
+) -> Listed:
+    """List all neighbors by asking for the nearest few, and for four times as many of the queries that had all those.
+
+    For backends that find a stated number of neighbors alone.
+    """
     asked, asked_ptr = (points, ptr) if queries is None or queries_ptr is None else (queries, queries_ptr)
     open_ = torch.arange(len(asked), dtype=torch.int64, device=points.device)
     largest = int((ptr[1:] - ptr[:-1]).max())
@@ -248,9 +288,9 @@ def all_within(
             own: dict[str, Any] = {}
             if not everyone or queries is not None:
                 bounds = torch.searchsorted(query, asked_ptr.contiguous())
-                own = {"queries": asked[query].detach(), "queries_ptr": bounds}
+                own = {"queries": asked[query], "queries_ptr": bounds}
             limit = radius if isinstance(radius, float) else radius[query]
-            index, distance = search(find if everyone else _without_grid(find), points, width, own, limit)
+            index, distance = (find if everyone else _without_grid(find))(width, **own, radius=limit)
             found = index < len(points)
             more = found[:, -1] & (width < largest)
             full.append(query[more])
@@ -262,8 +302,6 @@ def all_within(
         query, index, distance = (values[index != query] for values in (query, index, distance))
     order = query.argsort(stable=True)  # entries of one query are from one table, in order
     query, index, distance = query[order], index[order], distance[order]
-    if _wants_gradient(points, queries):
-        distance = _distance(asked[query], points[index])
     return index, distance, ptr_from_counts(torch.bincount(query, minlength=len(asked)))
 
 
@@ -280,7 +318,7 @@ def nearest(
     """Return what :func:`knn` does, within a radius if there is one, by whatever finds the nearest among the points."""
     _require_own_queries(where, exclude_self, queries)
     own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
-    index, distance = search(find, points, k + exclude_self, own, radius)
+    index, distance = find(k + exclude_self, **own, radius=radius)
     if exclude_self:
         itself = index == torch.arange(len(points), dtype=torch.int64, device=points.device)[:, None]
         itself[:, -1] |= ~itself.any(1)  # more repeats than were asked for: the last one is too many
@@ -299,19 +337,23 @@ def _without_grid(find: Find) -> Find:
     return find
 
 
-def search(
-    find: Find, points: Tensor, k: int, own: dict[str, Any], radius: float | Tensor | None
+def widest(radius: float | Tensor | None) -> float | None:
+    """Return the largest of the radii of some queries, (Q,) or one for all; None where there is none."""
+    if isinstance(radius, Tensor):
+        return float(radius.max()) if len(radius) else None
+    return radius
+
+
+def cut_to_radii(
+    found: tuple[Tensor, Tensor], points: Tensor, queries: Tensor | None, radius: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Search from the points, or from ``own`` queries; a radius per query is cut out of the largest."""
-    points = points.detach()
-    if not isinstance(radius, Tensor):
-        return find(k, **own, radius=radius)
-    widest = float(radius.max()) if len(radius) else None
-    index, distance = find(k, **own, radius=widest)
+    """Drop what lies outside the radius of its query (Q,) from neighbors within the largest."""
+    index, distance = found
     if not len(points):
-        return index, distance
-    queries = own.get("queries", points)
-    squared = squared_distance(queries[:, None], points[index.clamp(max=len(points) - 1)])
+        return found
+    squared = squared_distance(
+        (points if queries is None else queries)[:, None], points[index.clamp(max=len(points) - 1)]
+    )
     outside = squared >= (radius * radius)[:, None]
     return index.masked_fill(outside, len(points)), distance.masked_fill(outside, torch.inf)
 

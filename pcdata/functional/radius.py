@@ -20,13 +20,14 @@ _MARGIN = 1e-4
 _MAX_CELLS_PER_AXIS = 2**36
 
 
-def squared_radius(radius: float | None, device: torch.device) -> Tensor:
-    """Return the () float32 that d2 of a neighbor is below; infinite when there is no radius."""
-    limit = torch.tensor(math.inf if radius is None else radius, dtype=torch.float32, device=device)
-    return limit * limit
+def squared_radius(radius: float | Tensor | None, device: torch.device) -> Tensor:
+    """Return the () or (Q,) float32 that d2 of a neighbor is below; infinite when there is no radius."""
+    if not isinstance(radius, Tensor):
+        radius = torch.tensor(math.inf if radius is None else radius, dtype=torch.float32, device=device)
+    return radius * radius
 
 
-def largest_squared(radius: float | None, device: torch.device) -> Tensor:
+def largest_squared(radius: float | Tensor | None, device: torch.device) -> Tensor:
     """Return the largest float32 d2 that counts as d < radius; a finite maximum when there is no radius."""
     limit = squared_radius(radius, device)
     return torch.nextafter(limit, torch.zeros_like(limit))

@@ -7,6 +7,8 @@ Results are those of the references: the same neighbors in the same order, the s
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -17,8 +19,10 @@ import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud
+from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, widest
 from pcdata.functional.radius import largest_squared, require_cells
-from pcdata.kernels.cpu.native import call, room
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.kernels.cpu.native import call, room, room_for
 
 # The core keeps rows, and numbers of neighbors, in 31 bits.
 _MAX_ROWS = 2**31 - 1
@@ -35,17 +39,79 @@ def nearest_rows(
     *,
     queries: Tensor | None = None,
     queries_ptr: Tensor | None = None,
-    radius: float | None = None,
+    radius: float | Tensor | None = None,
     grid: ImageGrid | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Run the reference's contract in the core."""
+    """Run the reference's contract in the core; a radius per query is cut out of the largest in its wide trees."""
     if points.shape[1] not in (0, 3) and max(k, len(points)) <= _MAX_ROWS:
-        return _wide_neighbors(points, ptr, k, radius, queries, queries_ptr)
+        found = _wide_neighbors(points, ptr, k, widest(radius), queries, queries_ptr)
+        return cut_to_radii(found, points, queries, radius) if isinstance(radius, Tensor) else found
     if k > _MAX_ROWS or points.shape[1] != 3:
         others = {"queries": queries, "queries_ptr": queries_ptr, "radius": radius, "grid": grid}
-        found: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
-        return found
+        fallen: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
+        return fallen
     return _neighbors(points, ptr, k, radius, queries, queries_ptr, grid)
+
+
+@kernel("rows_within", "cpu")
+def rows_within(
+    points: Tensor,
+    ptr: Tensor,
+    radius: float | Tensor,
+    *,
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    exclude_self: bool = False,
+    grid: ImageGrid | None = None,
+) -> Listed:
+    """Count the neighbors of three columns, then list them; of others ask for more and more of the nearest."""
+    if points.shape[1] != 3 or len(points) > _MAX_ROWS:
+        search = functools.partial(nearest_rows, points, ptr, grid=grid)
+        return grown_within(search, points, ptr, radius, queries, queries_ptr, exclude_self)
+    return _listed(_tree(points, ptr, _MAX_ROWS), radius, queries, queries_ptr, exclude_self)
+
+
+@kernel("within_in", "cpu")
+def within_in(
+    points: Tensor,
+    ptr: Tensor,
+    prepared: dict[str, Tensor],
+    radius: float | Tensor,
+    *,
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    exclude_self: bool = False,
+) -> Listed:
+    """List what is sorted; where equal points were left out, sort anew."""
+    if not prepared or int(prepared["kept"]) != len(points):
+        return rows_within(points, ptr, radius, queries=queries, queries_ptr=queries_ptr, exclude_self=exclude_self)
+    return _listed(prepared, radius, queries, queries_ptr, exclude_self)
+
+
+def _listed(
+    tree: dict[str, Tensor],
+    radius: float | Tensor,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    exclude_self: bool,
+) -> Listed:
+    """List all neighbors among the points of a tree with all rows kept."""
+    groups = tree
+    if queries is not None:
+        assert queries_ptr is not None
+        groups = _tree(queries, queries_ptr, _MAX_ROWS)
+    radii = radius if isinstance(radius, Tensor) else torch.tensor([radius], dtype=torch.float32, device="cpu")
+    arguments = (
+        *(tree["leaves"], tree["leaf_ptr"], len(tree["leaf_ptr"]) - 1, tree["boxes"]),
+        *(groups["leaves"], groups["leaf_ptr"], radii.contiguous(), int(isinstance(radius, Tensor)), int(exclude_self)),
+    )
+    counts = room(int(groups["kept"]), torch.int64)
+    call("pc_count_within", *arguments, counts)
+    neighbors_ptr = ptr_from_counts(counts)
+    size = int(neighbors_ptr[-1])
+    index, distance = room_for(((size,), torch.int64), ((size,), torch.float32))
+    call("pc_list_within", *arguments, neighbors_ptr, index, distance)
+    return index, distance, neighbors_ptr
 
 
 @kernel("sorted_rows", "cpu")
@@ -53,6 +119,12 @@ def sorted_rows(points: Tensor, ptr: Tensor) -> dict[str, Tensor]:
     """Sort points of three columns into leaves with boxes over them, as the search builds them for one call."""
     if points.shape[1] != 3 or len(points) > _MAX_ROWS:
         return {}
+    return _tree(points, ptr, _COPIES)
+
+
+def _tree(points: Tensor, ptr: Tensor, copies: int) -> dict[str, Tensor]:
+    """Return the leaves and boxes of points, of equal ones so many."""
+    points, ptr = _rows(points, ptr)
     leaves, boxes = 0, 0
     for count in torch.diff(ptr).tolist():
         nodes = -(-count // 16)
@@ -67,7 +139,7 @@ def sorted_rows(points: Tensor, ptr: Tensor) -> dict[str, Tensor]:
         "boxes": room((boxes, 96), torch.float32),
         "kept": room(1, torch.int64),
     }
-    call("pc_index_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _COPIES, *made.values())
+    call("pc_index_points", points, ptr, len(ptr) - 1, copies, *made.values())
     return made
 
 
@@ -80,7 +152,7 @@ def nearest_in(
     *,
     queries: Tensor | None = None,
     queries_ptr: Tensor | None = None,
-    radius: float | None = None,
+    radius: float | Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Search what is sorted; where equal points were left out that now count, sort anew."""
     is_whole = bool(prepared) and int(prepared["kept"]) == len(points)
@@ -95,7 +167,7 @@ def nearest_in(
         num_queries = len(queries)
     index, distance = room((num_queries, k), torch.int64), room((num_queries, k), torch.float32)
     tree = prepared["leaves"], prepared["leaf_ptr"], len(ptr) - 1, prepared["boxes"], len(points)
-    call("pc_indexed_neighbors", *tree, queries, queries_ptr, k, _limit(radius), index, distance)
+    call("pc_indexed_neighbors", *tree, queries, queries_ptr, k, *_limits(radius), index, distance)
     return index, distance
 
 
@@ -167,7 +239,7 @@ def _neighbors(
     points: Tensor,
     ptr: Tensor,
     k: int,
-    radius: float | None,
+    radius: float | Tensor | None,
     queries: Tensor | None,
     queries_ptr: Tensor | None,
     grid: ImageGrid | None,
@@ -182,7 +254,7 @@ def _neighbors(
     distance = room((num_queries, k), torch.float32)
     call(
         "pc_neighbors",
-        *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, _limit(radius)),
+        *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, *_limits(radius)),
         *(*_grid_arguments(grid), index, distance, None),
     )
     return index, distance
@@ -226,6 +298,13 @@ def _reachable(count: int, points: Tensor) -> int:
 
 def _limit(radius: float | None) -> float:
     return float(largest_squared(radius, torch.device("cpu")))
+
+
+def _limits(radius: float | Tensor | None) -> tuple[float, Tensor | None]:
+    """Return the limit of squared distances of all queries, and those of each where they have radii of their own."""
+    if isinstance(radius, Tensor):
+        return 0.0, largest_squared(radius, radius.device).contiguous()
+    return _limit(radius), None
 
 
 @kernel("radius_outlier_mask", "cpu")

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x00C726BD13BC28F
+INTERFACE_NUMBER = 0xF35E76D0795FD56
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -49,13 +49,17 @@ pc_sample_image: uint8* whole, float* real, int64 views, int64 height, int64 wid
 pc_sample_depth: float* depth, int64 views, int64 height, int64 width, double* places, int64 out_pixels, int64 surface,
     double max_jump, float* sampled, int64* pixel_index
 pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
-    int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
+    float* limits, int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
 pc_wide_neighbors: float* points, int64* ptr, int64 num_clouds, int64 width, float* queries, int64* queries_ptr, int64
     k, double limit, int64* index, float* distance
 pc_index_points: float* points, int64* ptr, int64 num_clouds, int64 copies, float* leaves, int64* leaf_ptr, float*
     boxes, int64* kept
 pc_indexed_neighbors: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes, int64 num_points, float* queries,
-    int64* queries_ptr, int64 k, double limit, int64* index, float* distance
+    int64* queries_ptr, int64 k, double limit, float* limits, int64* index, float* distance
+pc_count_within: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes, float* groups, int64* group_ptr, float*
+    radii, int64 per_query, int64 exclude_self, int64* counts
+pc_list_within: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes, float* groups, int64* group_ptr, float*
+    radii, int64 per_query, int64 exclude_self, int64* neighbors_ptr, int64* index, float* distance
 pc_nearest_squared: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, float* squared
 pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
     double* camera, float* normals

@@ -7,6 +7,7 @@ Nothing is approximate: a box is dropped only when all of it is farther than k p
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
-from pcdata.functional.neighbors import laid_out
+from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, laid_out, widest
 from pcdata.functional.radius import largest_squared
 from pcdata.functional.rows import cloud_of_rows
 from pcdata.kernels.torch_tree.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
@@ -66,12 +67,29 @@ def nearest_rows(
     *,
     queries: Tensor | None = None,
     queries_ptr: Tensor | None = None,
-    radius: float | None = None,
+    radius: float | Tensor | None = None,
     grid: ImageGrid | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Lay out what the tree finds; a grid of pixels would tell it nothing."""
-    chunks = nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius)
-    return laid_out(chunks, len(points if queries is None else queries), k, points.device)
+    """Lay out what the tree finds within the largest radius; a grid of pixels would tell it nothing."""
+    chunks = nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=widest(radius))
+    found = laid_out(chunks, len(points if queries is None else queries), k, points.device)
+    return cut_to_radii(found, points, queries, radius) if isinstance(radius, Tensor) else found
+
+
+@kernel("rows_within", "torch_tree")
+def rows_within(
+    points: Tensor,
+    ptr: Tensor,
+    radius: float | Tensor,
+    *,
+    queries: Tensor | None = None,
+    queries_ptr: Tensor | None = None,
+    exclude_self: bool = False,
+    grid: ImageGrid | None = None,
+) -> Listed:
+    """Ask the tree for more and more of the nearest."""
+    search = functools.partial(nearest_rows, points, ptr, grid=grid)
+    return grown_within(search, points, ptr, radius, queries, queries_ptr, exclude_self)
 
 
 def _build_together(

@@ -205,16 +205,18 @@ PC_EXPORT int32_t pc_sample_depth(const pc_context* context, const float* depth,
 
 // -- neighbors --------------------------------------------------------------------------------------------------------
 
-// queries null: the points; pixel null: no grid; neighbors have d2 <= limit; count may be null.
+// queries null: the points; pixel null: no grid; neighbors have d2 <= limit, or <= that of their query where limits
+// (Q,) is not null; count may be null.
 PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
-                               const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
-                               float* distance, int64_t* count);
+                               const float* limits, const int64_t* pixel, int64_t width, const double* camera,
+                               int64_t* index, float* distance, int64_t* count);
 
 // The same for points (N, width) and queries (Q, width), without a grid; rows are less than 2^32 - 1.
 PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* points, const int64_t* ptr,
                                     int64_t num_clouds, int64_t width, const float* queries, const int64_t* queries_ptr,
                                     int64_t k, double limit, int64_t* index, float* distance);
+
 // Points sorted into leaves (sum of ceil(n / 16), 64) with leaf_ptr (num_clouds + 1,), and boxes over them, 96 floats
 // for every sixteen leaves, boxes of sixteen and so on of each cloud: both aligned to 64 bytes. Of consecutive equal
 // points the lowest `copies` rows stay: kept (1,) of all.
@@ -225,8 +227,21 @@ PC_EXPORT int32_t pc_index_points(const pc_context* context, const float* points
 // As pc_neighbors, of points that were indexed with copies >= k, or all kept; queries null: the points, all kept.
 PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
                                        int64_t num_clouds, const float* boxes, int64_t num_points, const float* queries,
-                                       const int64_t* queries_ptr, int64_t k, double limit, int64_t* index,
-                                       float* distance);
+                                       const int64_t* queries_ptr, int64_t k, double limit, const float* limits,
+                                       int64_t* index, float* distance);
+
+// Points and queries that were indexed, all rows kept: counts (Q,) of the points with d2 < radius^2 of every query, of
+// one radius for all or, with per_query not 0, of radii (Q,). exclude_self leaves out the row of the query's number.
+PC_EXPORT int32_t pc_count_within(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
+                                  int64_t num_clouds, const float* boxes, const float* groups, const int64_t* group_ptr,
+                                  const float* radii, int64_t per_query, int64_t exclude_self, int64_t* counts);
+
+// The points counted: query q has entries neighbors_ptr[q] to neighbors_ptr[q + 1] of index and distance, ascending by
+// (squared distance, row).
+PC_EXPORT int32_t pc_list_within(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
+                                 int64_t num_clouds, const float* boxes, const float* groups, const int64_t* group_ptr,
+                                 const float* radii, int64_t per_query, int64_t exclude_self,
+                                 const int64_t* neighbors_ptr, int64_t* index, float* distance);
 
 // squared (Q,) float: from every query to the nearest point of its cloud.
 PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,

@@ -46,9 +46,9 @@ struct WriteNearest {
 };
 
 template <class Nearest>
-void find_neighbors(const pc_context& context, float limit, const Clouds& clouds, const Clouds* queries,
+void find_neighbors(const pc_context& context, const Limits& limits, const Clouds& clouds, const Clouds* queries,
                     const Grid* grid, const WriteNeighbors& task) {
-  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limit, task);
+  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limits, task);
   if (queries != nullptr)
     search.run(clouds, *queries);
   else
@@ -56,11 +56,11 @@ void find_neighbors(const pc_context& context, float limit, const Clouds& clouds
 }
 
 template <class Nearest>
-void find_in_index(const pc_context& context, float limit, const Leaves& leaves, Boxes* boxes, const Clouds* queries,
-                   const WriteNeighbors& task) {
+void find_in_index(const pc_context& context, const Limits& limits, const Leaves& leaves, Boxes* boxes,
+                   const Clouds* queries, const WriteNeighbors& task) {
   ScratchFrame scratch;
   const CloudTree* trees = lay_out_trees(scratch, leaves, boxes);
-  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limit, task);
+  BatchSearch<Nearest, WriteNeighbors> search(context, task.k, limits, task);
   if (queries != nullptr)
     search.run(scratch, trees, *queries);
   else
@@ -72,8 +72,8 @@ void find_in_index(const pc_context& context, float limit, const Leaves& leaves,
 
 PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
-                               const int64_t* pixel, int64_t width, const double* camera, int64_t* index,
-                               float* distance, int64_t* count) {
+                               const float* limits, const int64_t* pixel, int64_t width, const double* camera,
+                               int64_t* index, float* distance, int64_t* count) {
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
@@ -81,7 +81,7 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
     const Clouds clouds{points, ptr, num_clouds}, from{queries, queries_ptr, num_clouds};
     const WriteNeighbors task{k, ptr[num_clouds], index, distance, count};
     const auto find = k <= NearestKeys::kMax ? find_neighbors<NearestKeys> : find_neighbors<NearestMany>;
-    find(*context, static_cast<float>(limit), clouds, queries == nullptr ? nullptr : &from,
+    find(*context, {static_cast<float>(limit), limits}, clouds, queries == nullptr ? nullptr : &from,
          pixel == nullptr ? nullptr : &grid, task);
   });
 }
@@ -109,8 +109,8 @@ PC_EXPORT int32_t pc_index_points(const pc_context* context, const float* points
 
 PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* leaves, const int64_t* leaf_ptr,
                                        int64_t num_clouds, const float* boxes, int64_t num_points, const float* queries,
-                                       const int64_t* queries_ptr, int64_t k, double limit, int64_t* index,
-                                       float* distance) {
+                                       const int64_t* queries_ptr, int64_t k, double limit, const float* limits,
+                                       int64_t* index, float* distance) {
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
@@ -119,7 +119,7 @@ PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* l
     const Clouds from{queries, queries_ptr, num_clouds};
     const WriteNeighbors task{k, num_points, index, distance, nullptr};
     const auto find = k <= NearestKeys::kMax ? find_in_index<NearestKeys> : find_in_index<NearestMany>;
-    find(*context, static_cast<float>(limit), own, reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
+    find(*context, {static_cast<float>(limit), limits}, own, reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
          queries == nullptr ? nullptr : &from, task);
   });
 }

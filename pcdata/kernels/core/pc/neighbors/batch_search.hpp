@@ -19,8 +19,8 @@ struct Clouds {
 template <class Nearest, class Task>
 class BatchSearch {
  public:
-  BatchSearch(const pc_context& context, int64_t k, float limit, const Task& task)
-      : context_(context), k_(static_cast<int>(k)), limit_(limit), task_(task) {}
+  BatchSearch(const pc_context& context, int64_t k, const Limits& limits, const Task& task)
+      : context_(context), k_(static_cast<int>(k)), limits_(limits), task_(task) {}
 
   // Queries are the points themselves.
   void run(const Clouds& clouds, const Grid* grid) {
@@ -47,7 +47,7 @@ class BatchSearch {
     LeafBuilder groups(context_, scratch, queries.points, queries.ptr, queries.num_clouds);
     for_groups(groups.all(), [&](const Leaf& leaf, int64_t, int64_t cloud, TreeSearch& search, Worker& worker) {
       const QueryGroup group(leaf);
-      worker.nearest.start(k_, group.limits(limit_));
+      worker.nearest.start(k_, group.limits(limits_, leaf.row));
       if (trees[cloud].num_leaves > 0)
         search.run(trees[cloud], group, search.leaf_near(trees[cloud], group), worker.nearest);
       worker.nearest.finish();
@@ -59,7 +59,7 @@ class BatchSearch {
   void by_tree(const Leaves& leaves, const CloudTree* trees, const Leaves& groups, const int64_t* home) {
     for_groups(groups, [&](const Leaf& leaf, int64_t g, int64_t cloud, TreeSearch& search, Worker& worker) {
       const QueryGroup group(leaf);
-      worker.nearest.start(k_, group.limits(limit_));
+      worker.nearest.start(k_, group.limits(limits_, leaf.row));
       search.run(trees[cloud], group, (home == nullptr ? g : home[g]) - leaves.leaf_ptr[cloud], worker.nearest);
       worker.nearest.finish();
       worker.task(search, group, worker.nearest, leaf.row);
@@ -129,13 +129,13 @@ class BatchSearch {
         QueryGroup group = search.queries_at(u, v);
         const PackMask points = group.active;
         if (points == 0) continue;
-        worker.nearest.start(k_, group.limits(limit_));
-        group.active = search.run(group, u, v, first_reach(), worker.nearest);
         uint32_t row[kQueries] = {};
         for (PackMask left = points; left != 0; left &= left - 1) {
           const int lane = __builtin_ctz(left);
           row[lane] = cloud.row(v * cloud.stride() + u + lane);
         }
+        worker.nearest.start(k_, group.limits(limits_, row));
+        group.active = search.run(group, u, v, first_reach(), worker.nearest);
         if (const PackMask rest = points & ~group.active) {
           alignas(64) float bound[kQueries];
           worker.nearest.bound().store(bound);
@@ -188,7 +188,7 @@ class BatchSearch {
 
   const pc_context& context_;
   int k_;
-  float limit_;
+  Limits limits_;
   const Task& task_;
 };
 

@@ -7,6 +7,16 @@
 
 namespace pc::neighbors {
 
+// The squared distance that neighbors of a query have at most: one for all, or one for each row of the queries.
+struct Limits {
+  float all;
+  const float* each = nullptr;  // (Q,)
+
+  Limits(float one) : all(one) {}  // implicit: most searches have one
+  Limits(float one, const float* many) : all(one), each(many) {}
+  float of(uint32_t row) const { return each == nullptr ? all : each[row]; }
+};
+
 // Sixteen queries, one per lane.
 struct QueryGroup {
   FloatPack x, y, z;
@@ -26,13 +36,34 @@ struct QueryGroup {
   static FloatPack finite(const float* from) {
     return minimum(FloatPack::load(from), FloatPack(std::numeric_limits<float>::max()));
   }
-  // `limit` in the lanes that count, off in the others.
-  FloatPack limits(float limit) const {
+  // The limit of every lane that counts, off in the others.
+  FloatPack limits(const Limits& limits, const uint32_t* row) const {
     alignas(64) float value[kQueries];
-    for (int lane = 0; lane < kQueries; ++lane) value[lane] = active >> lane & 1 ? limit : kOff;
+    for (int lane = 0; lane < kQueries; ++lane) value[lane] = active >> lane & 1 ? limits.of(row[lane]) : kOff;
     return FloatPack::load(value);
   }
 };
+
+// Squared gaps between the group's box and sixteen boxes.
+inline FloatPack box_gaps(const QueryGroup& queries, const Boxes& boxes) {
+  FloatPack gap[3];
+  for (int axis = 0; axis < 3; ++axis)
+    gap[axis] = maximum(maximum(FloatPack::load(boxes.low[axis]) - FloatPack(queries.high[axis]),
+                                FloatPack(queries.low[axis]) - FloatPack::load(boxes.high[axis])),
+                        FloatPack(0.0f));
+  return squared_length(gap[0], gap[1], gap[2]);
+}
+
+// The lanes whose query has less than `reach` between itself and one box.
+inline PackMask lanes_near(const QueryGroup& queries, const Boxes& boxes, int64_t slot, const FloatPack& reach) {
+  const FloatPack* at[3] = {&queries.x, &queries.y, &queries.z};
+  FloatPack gap[3];
+  for (int axis = 0; axis < 3; ++axis)
+    gap[axis] =
+        maximum(maximum(FloatPack(boxes.low[axis][slot]) - *at[axis], *at[axis] - FloatPack(boxes.high[axis][slot])),
+                FloatPack(0.0f));
+  return less_equal(squared_length(gap[0], gap[1], gap[2]), reach);
+}
 
 // Walks up from a leaf to the root; on the way looks into every sibling that is near enough, nearest first. A box is
 // passed by only when its computed gap exceeds what is wanted: rounding is monotone and a gap takes the operations of a
@@ -128,27 +159,6 @@ class TreeSearch {
       children[at] = {gap[slot], slot};
     }
     return count;
-  }
-
-  // Squared gaps between the group's box and sixteen boxes.
-  static FloatPack box_gaps(const QueryGroup& queries, const Boxes& boxes) {
-    FloatPack gap[3];
-    for (int axis = 0; axis < 3; ++axis)
-      gap[axis] = maximum(maximum(FloatPack::load(boxes.low[axis]) - FloatPack(queries.high[axis]),
-                                  FloatPack(queries.low[axis]) - FloatPack::load(boxes.high[axis])),
-                          FloatPack(0.0f));
-    return squared_length(gap[0], gap[1], gap[2]);
-  }
-
-  // The lanes whose query has less than `reach` between itself and one box.
-  static PackMask lanes_near(const QueryGroup& queries, const Boxes& boxes, int64_t slot, const FloatPack& reach) {
-    const FloatPack* at[3] = {&queries.x, &queries.y, &queries.z};
-    FloatPack gap[3];
-    for (int axis = 0; axis < 3; ++axis)
-      gap[axis] =
-          maximum(maximum(FloatPack(boxes.low[axis][slot]) - *at[axis], *at[axis] - FloatPack(boxes.high[axis][slot])),
-                  FloatPack(0.0f));
-    return less_equal(squared_length(gap[0], gap[1], gap[2]), reach);
   }
 
   CloudTree tree_{};
