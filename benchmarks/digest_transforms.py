@@ -144,6 +144,10 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomColorDrop": _of("RandomColorDrop", {"probability": 0.5}),
     "RandomCuboid": _of("RandomCuboid", {}, {"keep": "inside", "low": 0.1, "high": (0.2, 0.3, 0.4)}),
     "RandomOcclusion": _of("RandomOcclusion", {}),
+    "RandomOneOf": [
+        Example(lambda: step("RandomOneOf", steps=[step("RandomFlip"), step("RandomPointDropout")], weights=(1.0, 2.0)))
+    ],
+    "RandomShear": _of("RandomShear", {}, {"low": 0.1, "high": 0.3, "about": "centroid"}),
     "RandomTurnDepth": _of("RandomTurnDepth", {}),
     "TurnDepth": _of("TurnDepth", {}, {"quarter_turns": 2}),
     "RandomFarthestPointSample": _of("RandomFarthestPointSample", {"num_points": 32, "color_weight": 0.1}),

@@ -30,10 +30,16 @@ from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.object_facts import ObjectFacts, describe_objects, label_image
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
 from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning
-from pcdata.transforms.random_apply import RandomApply
+from pcdata.transforms.random_apply import RandomApply, RandomOneOf
 from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_jitter import RandomColorDrop, RandomColorJitter, RandomJitter, RandomPointDropout
-from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms.random_motions import (
+    RandomFlip,
+    RandomRotation,
+    RandomScale,
+    RandomShear,
+    RandomTranslation,
+)
 from pcdata.transforms.random_parts import RandomCuboid, RandomOcclusion
 from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplicates
 from pcdata.transforms.sensor_noise import RandomSensorNoise
@@ -82,12 +88,14 @@ __all__ = [
     "RandomFlip",
     "RandomJitter",
     "RandomOcclusion",
+    "RandomOneOf",
     "RandomPointCount",
     "RandomPointDropout",
     "RandomRotation",
     "RandomSample",
     "RandomScale",
     "RandomSensorNoise",
+    "RandomShear",
     "RandomTranslation",
     "RandomTurnDepth",
     "RandomVoxelSample",

@@ -17,7 +17,7 @@ from pcdata.functional.rows import ptr_after_mask, ptr_from_counts
 from pcdata.functional.touching import REASONS, Separation, in_order_of_rows, separate_objects
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decision, Decisions
 from pcdata.transforms.families import DropLimit, LeftOutWarning
 from pcdata.transforms.field_types import Count, Metres
@@ -202,7 +202,7 @@ def _touching(params: Params, b: int) -> dict[str, Any]:
     }
 
 
-class SplitObjects(Transform):
+class SplitObjects(DropLimit):
     """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped.
 
     ``meta["object"]`` keeps the label, ``meta["unlabeled"]`` the number of points dropped from the whole cloud.
@@ -221,6 +221,12 @@ class SplitObjects(Transform):
                     f"SplitObjects: cloud {b}{sample_name(data, b)} has no labeled point among its "
                     f"{int(data.counts[b])}; check the fields of ClusterObjects"
                 )
+        member = torch.nn.functional.pad((data.labels >= 0).cumsum(0), (1, 0))
+        self.check_drop(
+            data.counts.tolist(),
+            member[data.ptr].diff().tolist(),
+            lambda b: f"points of cloud {b}{sample_name(data, b)}",
+        )
         ranks = [torch.arange(len(labels), dtype=torch.int64, device="cpu") for labels in found]
         return {
             "label": torch.cat(found),

@@ -73,7 +73,7 @@ class Decisions:
         Raises:
             ReplayError: the history has it not, or something else than such numbers.
         """
-        told = [self._params(b).get(name) for b in range(len(self))]
+        told = [self.told(b).get(name) for b in range(len(self))]
         dtype, device = (torch.float64, torch.device("cpu")) if like is None else (like.dtype, like.device)
         try:
             values = torch.tensor(told, dtype=dtype, device=device)
@@ -93,9 +93,10 @@ class Decisions:
 
     def has(self, name: str) -> bool:
         """Whether the history tells a param."""
-        return all(name in self._params(b) for b in range(len(self)))
+        return all(name in self.told(b) for b in range(len(self)))
 
-    def _params(self, b: int) -> Mapping[str, Any]:
+    def told(self, b: int) -> Mapping[str, Any]:
+        """Return all params of one cloud as the history has them."""
         params = self.of_clouds[b].entry.get("params")
         if not isinstance(params, Mapping):
             raise ReplayError(f"{self.step}: the history tells no params, got {params!r:.100}")

@@ -13,10 +13,11 @@ from pcdata.functional.depth.deproject import Deprojected, deproject_images
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import ConfidenceName, FromSensor, Metres, confidence_named
 
 
-class MaskDepth(Transform):
+class MaskDepth(MaskTransform):
     """Set depth to "no reading" outside a range, outside the frame's mask, on unwanted labels or below a confidence.
 
     Args:
@@ -27,9 +28,6 @@ class MaskDepth(Transform):
         drop_labels: drop pixels with these labels.
         min_confidence: drop pixels that are less to be trusted.
     """
-
-    takes = DepthFrame
-    gives = DepthFrame
 
     # Readings closer than near or beyond far are dropped.
     near: Annotated[Metres | None, FromSensor(lambda sensor, _: sensor.range[0])] = None

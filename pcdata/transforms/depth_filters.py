@@ -14,6 +14,7 @@ from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.structures.filled_depth import with_filled_depth
 from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
@@ -75,7 +76,7 @@ class FillHoles(Transform):
         return with_filled_depth(data, depth, distance > 0, distance > self.max_distance)
 
 
-class RemoveFlyingPixels(Transform):
+class RemoveFlyingPixels(MaskTransform):
     """Set readings to "no reading" that hang between two surfaces at a depth edge.
 
     Cheap enough for every frame, and best done before any filter that averages or fills: those would spread them.
@@ -84,9 +85,6 @@ class RemoveFlyingPixels(Transform):
         tolerance: how far a reading may be off the plane through its neighbors, as a part of its depth.
         min_neighbors: of the eight, on the reading's own surface.
     """
-
-    takes = DepthFrame
-    gives = DepthFrame
 
     # As a part of the depth: neighbors that differ more lie on two surfaces.
     tolerance: Annotated[Positive, FromSensor(lambda sensor, depth: sensor.edge_threshold(depth) / depth)] = 0.02

@@ -16,10 +16,11 @@ from pcdata.rng import Streams
 from pcdata.structures import DepthFrame
 from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import Count, Positive
 
 
-class CropCenter(Transform):
+class CropCenter(MaskTransform):
     """Keep the window in the middle of the images, pixel for pixel; an odd margin is smaller above and left.
 
     Args:
@@ -29,9 +30,6 @@ class CropCenter(Transform):
     Raises:
         ShapeError: the window leaves the images.
     """
-
-    takes = DepthFrame
-    gives = DepthFrame
 
     size: tuple[Count, Count]
     up: int = 0

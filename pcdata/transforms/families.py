@@ -1,16 +1,19 @@
-"""The families that carry most steps: those that move clouds, those that choose rows, those that remove some."""
+"""The families that carry most steps: those that move clouds, that choose rows, that remove points or readings."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import PcdataWarning, ReplayError, TooFewPointsError
 from pcdata.rng import Streams
-from pcdata.structures import PointCloud
+from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
 from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.field_types import Fraction
@@ -53,17 +56,18 @@ class SelectTransform(Transform, abstract=True):
 
 
 class DropLimit(Transform, abstract=True):
-    """A step that removes points, and says when it removes more than is meant.
+    """A step that removes points, or readings of depth images, and says when it removes more than is meant.
 
     Args:
-        max_drop: largest part of a cloud's points that it may remove; None = all but the last.
+        max_drop: largest part of a cloud's points, or of a view's readings, that it may remove; None = no limit, but
+            that a cloud keeps a point.
         drop_alarm: what it does where it removes more.
 
     Raises:
-        TooFewPointsError: it removes more of a cloud, and the alarm is an error.
+        TooFewPointsError: it removes more of a cloud or a view, and the alarm is an error.
 
     Warns:
-        LeftOutWarning: it removes more of a cloud, and the alarm is a warning.
+        LeftOutWarning: it removes more of a cloud or a view, and the alarm is a warning.
     """
 
     max_drop: Fraction | None = None
@@ -72,20 +76,41 @@ class DropLimit(Transform, abstract=True):
     def recorded_counts(
         self, result: PointCloud, before: list[int] | None, after: list[int], params: Params, **told: Any
     ) -> PointCloud:
-        """Hold the counts to the limit before they are recorded."""
-        for b, (had, count) in enumerate(zip(before or [], after)):
+        """Hold the points to the limit before the step is recorded."""
+        if self.max_drop is not None:
+            self.check_drop(before or [], after, lambda b: f"points of cloud {b}{sample_name(result, b)}")
+        return super().recorded_counts(result, before, after, params, **told)
+
+    def check_drop(self, before: list[int], after: list[int], of: Callable[[int], str]) -> None:
+        """Hold what is left of each cloud or view to the limit; ``of`` says what is counted there."""
+        for b, (had, count) in enumerate(zip(before, after)):
             if self.max_drop is None or had - count <= self.max_drop * had:
                 continue
             text = (
-                f"{type(self).__name__}: {had - count} of the {had} points of cloud {b}{sample_name(result, b)} are "
-                f"removed, {(had - count) / had:.1%}, more than max_drop={self.max_drop:g}; look at its fields, or at "
-                "the capture"
+                f"{type(self).__name__}: {had - count} of the {had} {of(b)} are removed, {(had - count) / had:.1%}, "
+                f"more than max_drop={self.max_drop:g}; look at its fields, or at the capture"
             )
             if self.drop_alarm == "error":
                 raise TooFewPointsError(text)
             warnings.warn(text, LeftOutWarning, stacklevel=2)
-        return super().recorded_counts(result, before, after, params, **told)
 
 
 class RemoveTransform(DropLimit, SelectTransform, abstract=True):
     """A step that removes rows: write ``pick``."""
+
+
+class MaskTransform(DropLimit, abstract=True):
+    """A step that blanks readings of depth images, or cuts them off."""
+
+    takes = DepthFrame
+    gives = DepthFrame
+
+    def recorded(
+        self, data: DepthFrame, result: DepthFrame, params: Params, drawn: NDArray[np.int64] | None = None
+    ) -> Any:
+        """Hold the readings to the limit before the step is recorded."""
+        if self.max_drop is not None:
+            before, after = ((frame.depth > 0).flatten(1).sum(1).tolist() for frame in (data, result))
+            sample = f" (sample {data.sample_id!r})" if data.sample_id else ""
+            self.check_drop(before, after, lambda view: f"readings of view {view}{sample}")
+        return super().recorded(data, result, params, drawn)

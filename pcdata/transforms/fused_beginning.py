@@ -34,7 +34,9 @@ def find_beginning(steps: Sequence[Transform]) -> slice | None:
     crop = steps[stop] if stop < len(steps) else None
     if type(crop) is not CropWorkspace or not crop.is_plain:
         return None
-    if kinds[start - 1 : start] == [MaskDepth]:
+    mask = steps[start - 1] if start else None
+    # A limit to what the mask may remove needs its readings counted.
+    if type(mask) is MaskDepth and mask.max_drop is None:
         start -= 1
     return slice(start, stop + 1)
 

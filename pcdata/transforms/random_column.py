@@ -9,14 +9,15 @@ from pcdata.errors import TooFewPointsError
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms.base import Params, Transform, sample_name
+from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
+from pcdata.transforms.families import DropLimit
 from pcdata.transforms.field_types import Count, Metres
 
 _TRIALS = 100  # columns drawn before a scene counts as too sparse
 
 
-class RandomColumn(Transform):
+class RandomColumn(DropLimit):
     """Keep a square column about a random point: all heights, x and y within half its size of that point.
 
     Columns with fewer than ``min_points`` are drawn again, 100 times at most. The point goes into meta as

@@ -1,4 +1,4 @@
-"""Random motions, one 4x4 per cloud: RandomRotation, RandomTranslation, RandomScale, RandomFlip."""
+"""Random motions, one 4x4 per cloud: RandomRotation, RandomTranslation, RandomScale, RandomShear, RandomFlip."""
 
 from __future__ import annotations
 
@@ -150,6 +150,60 @@ class RandomScale(SpatialTransform):
         low, high = self._ends()
         factors = low + (high - low) * streams.uniform(0.0, 1.0, 3 if self.per_axis else 1)
         return {"matrix": _about(self.about, data, torch.diag_embed(factors.expand(-1, 3)))}
+
+
+Row3 = tuple[float, float, float]
+Shears = tuple[Row3, Row3, Row3]
+
+
+class RandomShear(SpatialTransform):
+    """Shear every cloud: each coordinate moves along each other axis by a random part of it.
+
+    A point (x, y, z) goes to (x + a y + b z, c x + y + d z, e x + f y + z). Normals stay at right angles to their
+    surfaces; a sheared scene has sheared objects.
+
+    Args:
+        low: smallest shear; one for all six, or a 3x3 with zeros on its diagonal, whose entry [i][j] is the way along
+            axis i per length along axis j.
+        high: largest shear, likewise.
+        about: the point that stays.
+
+    Raises:
+        ConfigError: along an axis the largest shears add up to 1 or more, where a cloud may be flattened or mirrored.
+    """
+
+    is_random = True
+
+    low: float | Shears = -0.1
+    high: float | Shears = 0.1
+    about: About = "origin"
+
+    def check_fields(self) -> None:
+        """Require ranges that neither flatten nor mirror."""
+        low, high = self._ends()
+        if bool((low > high).any()):
+            raise ConfigError(f"RandomShear: low {self.low} exceeds high {self.high}")
+        if bool((torch.diagonal(low) != 0).any() or (torch.diagonal(high) != 0).any()):
+            raise ConfigError("RandomShear: the diagonal of low and high must be 0; RandomScale changes the extent")
+        # Gershgorin: then no eigenvalue reaches 0.
+        if bool((torch.maximum(low.abs(), high.abs()).sum(1) >= 1).any()):
+            raise ConfigError(
+                f"RandomShear: the shears along an axis must add up to less than 1, got low {self.low}, high "
+                f"{self.high}"
+            )
+
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        ends = []
+        for end in (self.low, self.high):
+            matrix = torch.tensor(end, dtype=torch.float64, device="cpu")
+            ends.append(matrix if matrix.ndim else matrix.repeat(3, 3).fill_diagonal_(0.0))
+        return ends[0], ends[1]
+
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+        """Draw six shears per cloud."""
+        low, high = self._ends()
+        linear = torch.eye(3, dtype=torch.float64, device="cpu") + low + (high - low) * streams.uniform(0.0, 1.0, 3, 3)
+        return {"matrix": _about(self.about, data, linear)}
 
 
 class RandomFlip(SpatialTransform):

@@ -13,11 +13,11 @@ from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params
 from pcdata.transforms.decisions import Decisions
-from pcdata.transforms.families import SelectTransform
+from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Fraction, Positive
 
 
-class RandomCuboid(SelectTransform):
+class RandomCuboid(RemoveTransform):
     """Keep, or drop, the points in a random box about a random point of every cloud; at least one point stays.
 
     ``keep="inside"`` is a random crop, ``"outside"`` cuboid dropout: a part of the scene that the camera missed.
@@ -75,7 +75,7 @@ class RandomCuboid(SelectTransform):
         return {"index": keep, "ptr": ptr_after_mask(keep, cloud.ptr), "center": center, "half": half}
 
 
-class RandomOcclusion(SelectTransform):
+class RandomOcclusion(RemoveTransform):
     """Drop what lies beyond a random plane through the sensor: a side of the picture, as if something stood before it.
 
     The plane passes the viewpoint of each cloud at a random angle in the picture, so that a random part of the points

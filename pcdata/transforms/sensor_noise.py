@@ -23,7 +23,8 @@ from pcdata.functional.depth.sensor_noise import (
 from pcdata.rng import Streams, child_seed, seeded
 from pcdata.sensors import SensorProfile, StereoNoise, sensor_profile
 from pcdata.structures import DepthFrame
-from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.base import Params
+from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import Fraction, FromSensor, Name, NonNegative
 
 
@@ -39,7 +40,7 @@ def depth_camera(where: str, name: str) -> SensorProfile:
     return profile
 
 
-class RandomSensorNoise(Transform):
+class RandomSensorNoise(MaskTransform):
     """Give clean depth (rendered, or averaged over many frames) the errors of a real depth camera.
 
     The error follows the sensor's profile at the capture's own focal length: stereo errs in disparity and rounds to its
@@ -60,8 +61,6 @@ class RandomSensorNoise(Transform):
     """
 
     is_random = True
-    takes = DepthFrame
-    gives = DepthFrame
 
     sensor: Annotated[Name, FromSensor(lambda sensor, _: sensor.name)]
     strength: NonNegative = 1.0

@@ -176,6 +176,15 @@ EXAMPLES: dict[str, list[Example]] = {
         Example(T.RandomJitter(along_ray=True, clip=0.004), displacement=0.004),
     ],
     "RandomOcclusion": _of(T.RandomOcclusion(), T.RandomOcclusion(low=0.5, high=1.0)),
+    "RandomOneOf": [
+        Example(T.RandomOneOf(steps=[T.RandomRotation(), T.RandomScale()])),
+        Example(
+            T.RandomOneOf(
+                steps=[T.RandomPointDropout(), T.Compose([]), T.Compose([T.RandomRotation(), T.RemovePlane()])],
+                weights=(2.0, 1.0, 3.0),
+            )
+        ),
+    ],
     "RandomPointCount": _of(
         T.RandomPointCount(num_points=50),
         T.RandomPointCount(num_points=100, spread=0.5, if_short="repeat"),
@@ -203,6 +212,14 @@ EXAMPLES: dict[str, list[Example]] = {
         T.RandomSensorNoise(sensor="realsense_d435"),
         T.RandomSensorNoise(sensor="azure_kinect_nfov", strength=0.5, edge_dropout=0.1, grazing_degrees=70.0),
         make=frame_with_counts,
+    ),
+    "RandomShear": _of(
+        T.RandomShear(),
+        T.RandomShear(low=0.1, high=0.3, about="centroid"),
+        T.RandomShear(
+            low=((0.0, 0.0, -0.4), (0.0, 0.0, 0.2), (0.0, 0.0, 0.0)),
+            high=((0.0, 0.0, 0.6), (0.1, 0.0, 0.2), (0.0, 0.0, 0.0)),
+        ),
     ),
     "RandomTranslation": _of(
         T.RandomTranslation(),

@@ -125,7 +125,7 @@ def test_split_counts_no_points_before_even_when_the_numbers_agree():
         {
             "step": "SplitObjects",
             "version": 1,
-            "fields": {},
+            "fields": {"max_drop": None, "drop_alarm": "error"},
             "frame": "base",
             "unit": "m",
             "params": {"label": 0, "rank": 0},

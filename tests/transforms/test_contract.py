@@ -331,7 +331,7 @@ def changed_values(value: Any) -> list[Any]:
         return [{**value, "colors": "first"}, {**value, "colors": "max"}]
     items = list(value)
     if not items or isinstance(items[0], T.Transform):
-        return [[*items, 1], [*items, T.Center()]]
+        return [[*items, 1], [*items, T.Center()], [*items, T.RandomFlip()]]
     return [[*items[:i], new, *items[i + 1 :]] for i, item in enumerate(items) for new in changed_values(item)]
 
 

@@ -11,7 +11,7 @@ from pcdata.errors import ConfigError, PoseError
 from pcdata.geometry import rigid
 from pcdata.rng import Streams, seeded
 from pcdata.structures import PointCloud
-from pcdata.transforms import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms import RandomFlip, RandomRotation, RandomScale, RandomShear, RandomTranslation
 from tests.factories import cloud_in_base
 
 MANY = 400
@@ -60,6 +60,7 @@ def test_about_the_centroid_the_mean_stays():
         RandomRotation(axis=None, about="centroid"),
         RandomScale(low=0.5, high=2.0, about="centroid", per_axis=True),
         RandomFlip(probability=(1, 1, 0), about="centroid"),
+        RandomShear(about="centroid"),
     ):
         moved = step(cloud, generator=seeded(1))
         for before, after in zip(cloud.unbatch(), moved.unbatch()):
@@ -117,6 +118,49 @@ def test_scaling_keeps_metres_so_objects_really_grow():
     moved = RandomScale(low=2.0, high=2.0)(cloud, generator=seeded(0))
     assert moved.unit == "m"
     torch.testing.assert_close(moved.points, cloud.points * 2)
+
+
+def test_shears_fill_their_ranges_entry_by_entry():
+    linear = matrices(RandomShear(low=-0.2, high=0.4))[:, :3, :3]
+    assert bool((torch.diagonal(linear, dim1=1, dim2=2) == 1).all())
+    off = linear[:, ~torch.eye(3, dtype=torch.bool)]
+    assert float(off.min()) >= -0.2
+    assert float(off.max()) < 0.4
+    assert float(off.amin(0).max()) < -0.15
+    assert float(off.amax(0).min()) > 0.35
+    assert float((torch.corrcoef(off.T) - torch.eye(6)).abs().max()) < 0.25
+    low = ((0.0, 0.0, -0.5), (0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
+    high = ((0.0, 0.0, 0.9), (0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
+    linear = matrices(RandomShear(low=low, high=high))[:, :3, :3]
+    expected = torch.eye(3, dtype=torch.float64).repeat(MANY, 1, 1)
+    expected[:, 0, 2], expected[:, 1, 2] = linear[:, 0, 2], 0.1
+    assert torch.equal(linear, expected)
+    assert float(linear[:, 0, 2].min()) < -0.45
+    assert float(linear[:, 0, 2].max()) > 0.85
+
+
+def test_a_sheared_plane_keeps_its_points_and_its_normal():
+    generator = seeded(4)
+    normal = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
+    across = torch.linalg.svd(normal[None])[2][1:]
+    points = torch.randn(50, 2, generator=generator) @ across
+    cloud = PointCloud(points=points, normals=normal.repeat(50, 1), frame_id="base")
+    moved = RandomShear(low=-0.4, high=0.4)(cloud, generator=seeded(1))
+    assert not torch.allclose(moved.points, points, atol=0.05)
+    assert float((moved.points @ moved.normals[0]).abs().max()) < 1e-5
+    assert float((moved.normals.norm(dim=1) - 1).abs().max()) < 1e-6
+
+
+def test_shears_that_flatten_or_mirror_and_what_is_no_shear_are_refused():
+    for low, high in ((-0.5, 0.1), (0.0, 0.5), (((0, 1.0, 0), (0, 0, 0), (0, 0, 0)),) * 2):
+        with pytest.raises(ConfigError, match="must add up to less than 1"):
+            RandomShear(low=low, high=high)
+    with pytest.raises(ConfigError, match=r"low 0\.2 exceeds high 0\.1"):
+        RandomShear(low=0.2)
+    with pytest.raises(ConfigError, match="diagonal"):
+        RandomShear(high=((0.1, 0.1, 0.1),) * 3)
+    linear = matrices(RandomShear(low=-0.49, high=0.49))[:, :3, :3]
+    assert float(torch.linalg.det(linear).min()) > 0
 
 
 def test_each_axis_flips_with_its_own_probability():

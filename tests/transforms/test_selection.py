@@ -13,15 +13,6 @@ from pcdata.structures import PointCloud
 from tests.factories import cloud_in_base
 from tests.transforms.examples import BOX
 
-REMOVING = [cls for cls in T.REGISTRY.values() if "max_drop" in cls.__dataclass_fields__]
-
-
-def test_every_step_that_removes_points_by_what_they_are_has_a_limit():
-    assert {cls.__name__ for cls in REMOVING} == {
-        *("ClusterObjects", "CropPolygon", "CropWorkspace", "DropNonFinite", "KeepConfidence", "KeepValues"),
-        *("RemoveDuplicates", "RemovePlane", "RemoveRadiusOutliers", "RemoveStatisticalOutliers"),
-    }
-
 
 def test_removing_more_than_the_limit_is_an_error_or_a_warning_that_names_the_cloud():
     data = cloud_in_base((120, 90))
