@@ -117,6 +117,7 @@ _HOMES = {
         "CloudDataset",
         "CountedSampler",
         "DevicePipeline",
+        "MixedCloudDataset",
         "EpisodeWindows",
         "StreamedCloudDataset",
         "collate_fixed",

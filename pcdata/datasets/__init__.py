@@ -13,6 +13,7 @@ from pcdata.datasets.collate import (
 from pcdata.datasets.copies import CountedSampler
 from pcdata.datasets.device_pipeline import DevicePipeline
 from pcdata.datasets.epoch_setting import set_epoch
+from pcdata.datasets.mixed import MixedCloudDataset
 from pcdata.datasets.normalizers import LinearNormalizer, fit_normalizers
 from pcdata.datasets.passes import RepeatedEpochWarning
 from pcdata.datasets.samples import SampleDataset
@@ -30,6 +31,7 @@ __all__ = [
     "DevicePipeline",
     "EpisodeWindows",
     "LinearNormalizer",
+    "MixedCloudDataset",
     "RepeatedEpochWarning",
     "SampleDataset",
     "Splits",

@@ -116,6 +116,11 @@ class SampleDataset(Dataset[PointCloud]):
         """
         return split_episodes(repr(self), self.episodes, parts, seed)
 
+    @property
+    def is_random(self) -> bool:
+        """Whether samples are drawn by the epoch."""
+        return self.transform is not None and self.transform.is_random
+
     def __len__(self) -> int:
         return len(self.ids) * self.repeats
 
@@ -130,7 +135,7 @@ class SampleDataset(Dataset[PointCloud]):
         number = int(asked.numbers[0])
         sample_id = self.ids[number]
         try:
-            if self.transform is not None and self.transform.is_random and not asked.again[0]:
+            if not asked.again[0] and self.is_random:
                 self._passes.note(int(asked.places[0]), repr(self))
             made = self._made(number, self._streams(asked))
             return _noted(made, self._keys_of(made, self._streams(asked))) if self.notes_draws else made
@@ -158,7 +163,7 @@ class SampleDataset(Dataset[PointCloud]):
         Stored clouds are read at once and go through the steps as one batch, each with its own draws.
         """
         asked = self._asked(indices)
-        is_random = self.transform is not None and self.transform.is_random
+        is_random = self.is_random
         try:
             made = self._made_at_once(asked.numbers, self._streams(asked) if is_random else None)
         except Exception:  # a sample is at fault: read by itself, it is named
@@ -168,7 +173,7 @@ class SampleDataset(Dataset[PointCloud]):
         if is_random and not asked.again.all():
             self._passes.note_all(asked.places[asked.again == 0], repr(self))
         if self.notes_draws:  # clouds of one sample that is made at once share its draws
-            keys = [key for key in self._streams(asked).keys for _ in range(made.each)]
+            keys = [key for key in self._of_transform(self._streams(asked)).keys for _ in range(made.each)]
             ends = [0, *itertools.accumulate(batch.num_clouds for batch in made.batches)]
             cut = [keys[begin:end] for begin, end in itertools.pairwise(ends)]
             return Unbatched([_noted(one, own) for one, own in zip(made.batches, cut, strict=True)], made.each)
@@ -203,7 +208,11 @@ class SampleDataset(Dataset[PointCloud]):
 
     def _keys_of(self, made: PointCloud, streams: Streams) -> list[int]:
         """Return the key of the stream that random steps would draw from for each cloud of a sample."""
-        return Streams.of(streams, made.num_clouds).keys
+        return Streams.of(self._of_transform(streams), made.num_clouds).keys
+
+    def _of_transform(self, streams: Streams) -> Streams:
+        """Return the streams that the transform draws from, given those of some samples."""
+        return streams
 
     def _made_at_once(self, numbers: NDArray[np.int64], streams: Streams | None) -> Unbatched | None:
         """Return what :meth:`_made` does for each, or None where that must be done; None = nothing is drawn."""

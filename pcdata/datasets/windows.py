@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.datasets.cached import CachedCloudDataset
+from pcdata.datasets.mixed import MixedCloudDataset
 from pcdata.datasets.samples import SampleDataset, runs_on_batches
 from pcdata.datasets.window_places import window_places, window_steps
 from pcdata.errors import ConfigError, DTypeError, FrameError, PcdataWarning, ShapeError, near_matches
@@ -71,7 +72,7 @@ class EpisodeWindows(SampleDataset):
         actions: Sequence[str] = ("action",),
         episodes: Iterable[Episode] | None = None,
     ) -> None:
-        if not isinstance(dataset, SampleDataset) or isinstance(dataset, EpisodeWindows):
+        if not isinstance(dataset, SampleDataset) or isinstance(dataset, EpisodeWindows | MixedCloudDataset):
             raise DTypeError(
                 f"EpisodeWindows: dataset must be a CloudDataset or CachedCloudDataset, got {type(dataset).__name__}; "
                 "choose episodes by episodes=, not by a Subset"

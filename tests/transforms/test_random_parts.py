@@ -13,7 +13,7 @@ from pcdata import transforms as T
 from pcdata.errors import ConfigError, DTypeError, FrameError, IntrinsicsError, ShapeError
 from pcdata.functional import project_points
 from pcdata.rng import seeded
-from pcdata.structures import Camera, PointCloud
+from pcdata.structures import Camera, Kind, PointCloud
 from tests.factories import cloud_in_base, frame_with_counts
 
 MANY = (2,) * 400
@@ -169,12 +169,50 @@ def test_scenes_are_mixed_with_their_labels_kept_apart():
     assert not set(ours[ours >= 0].tolist()) & set(theirs[theirs >= 0].tolist())
     assert torch.equal(theirs < 0, second[0].labels < 0)
     assert mixed.extra["scene"].tolist() == [0] * 30 + [1] * 10 + [0] * 20
+    assert torch.equal(mixed[0].source_index[:30], first[0].source_index)
+    assert mixed[0].source_index[30:].tolist() == [-1] * 10
+    entries = [history[-1] for history in mixed.history]
+    assert [entry["params"] for entry in entries] == [{"partner": one["sample_id"]} for one in second.meta]
+    assert [(entry["points_before"], entry["points"]) for entry in entries] == [(30, 40), (20, 20)]
     with pytest.raises(ShapeError, match="as many clouds"):
         T.mix_scenes(first, cloud_in_base((3,)))
     with pytest.raises(DTypeError, match="give both the same fields"):
         T.mix_scenes(first, second.with_fields(colors=None))
     with pytest.raises(FrameError, match="by ToFrame"):
         T.mix_scenes(first, second.to_frame("camera"))
+    with pytest.raises(DTypeError, match="mixed already"):
+        T.mix_scenes(mixed, mixed)
+
+
+def test_only_numbers_of_objects_are_kept_apart_in_a_mixed_scene():
+    first, second = cloud_in_base((30,)), cloud_in_base((10,))
+    kept = T.mix_scenes(first, second, apart=())
+    assert torch.equal(kept.labels, torch.cat([first.labels, second.labels]))
+    numbered = [
+        one.with_extra("instance", torch.arange(one.num_points) % 4 - 1, Kind.INVARIANT) for one in (first, second)
+    ]
+    mixed = T.mix_scenes(*numbered, apart=("instance",))
+    assert torch.equal(mixed.labels, kept.labels)
+    assert mixed.extra["instance"][30:].tolist() == [-1, 3, 4, 5, -1, 3, 4, 5, -1, 3]
+    for wrong in ("weight", "colors", "nothing"):
+        with pytest.raises(DTypeError, match=f"'{wrong}' is to be kept apart"):
+            T.mix_scenes(first, second, apart=(wrong,))
+
+
+def test_every_point_of_a_mixed_scene_keeps_the_viewpoint_that_saw_it():
+    first, second = cloud_in_base((30, 20)), cloud_in_base((10, 5))
+    second = replace(second, viewpoint=first.viewpoint + 1.0)
+    mixed = T.mix_scenes(first, second)
+    assert mixed.viewpoint is None
+    expected = torch.cat(
+        [part.viewpoint_per_point() for pair in zip(first.unbatch(), second.unbatch()) for part in pair]
+    )
+    assert torch.equal(mixed.viewpoint_per_point(), expected)
+    turned = T.RandomRotation()(mixed, generator=seeded(0))
+    before = (mixed.points - mixed.viewpoint_per_point()).norm(dim=1)
+    torch.testing.assert_close((turned.points - turned.viewpoint_per_point()).norm(dim=1), before)
+    with pytest.raises(FrameError, match=r"of the first clouds it is known where the sensor stood, of the second"):
+        T.mix_scenes(first, replace(second, viewpoint=None))
 
 
 def test_colors_are_lost_with_the_probability():
