@@ -83,6 +83,10 @@ CLOUD_OPERATIONS = {
     "farthest_point_sample": [{"num_samples": 20}],
     "farthest_point_groups": [{"ratio": 0.2}],
     "find_voxel_size": [{"num_points": 12}],
+    "ransac_circle": [{"num_hypotheses": 100, "radius": (0.01, 0.2)}],
+    "ransac_cylinder": [{"num_hypotheses": 100, "up": (0.0, 0.0, 1.0), "max_tilt": 1.0}],
+    "ransac_line": [{"num_hypotheses": 100, "seed": 5}],
+    "ransac_sphere": [{"num_hypotheses": 100, "radius": (0.01, 0.2)}],
     "ransac_plane": [
         {"distance": 0.01, "num_hypotheses": 100},
         {"distance": 0.01, "seed": 5, "up": (0.0, 0.0, 1.0), "max_tilt": 0.3},

@@ -73,6 +73,10 @@ class NoPlaneError(PcdataError, ValueError):
     """No plane satisfies the constraints."""
 
 
+class NoShapeError(PcdataError, ValueError):
+    """No sphere, cylinder, line or circle satisfies the constraints."""
+
+
 class ContractError(PcdataError, ValueError):
     """Data are not what a model takes: wrong frame, unit, count, channels or layout."""
 

@@ -3,8 +3,8 @@
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
 decimated, resized, undistorted and filled depth, undistorted images, disparity, distances between clouds, distances and
 covariances of neighbors, interpolated features, the motion between paired points. None flow through decisions (indices,
-masks, labels, planes, sizes, which points are neighbors), nor through estimated normals, ``register_depth``, rendering,
-``spatial_filter`` and TSDF volumes.
+masks, labels, planes and other shapes, sizes, which points are neighbors), nor through estimated normals,
+``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.clusters import core_point_mask, dbscan
@@ -43,6 +43,16 @@ from pcdata.functional.rendering import (
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_groups, farthest_point_sample, random_sample_index
 from pcdata.functional.selection import box_mask, convex_hull, duplicate_mask, polygon_mask
+from pcdata.functional.shapes import (
+    FoundCircle,
+    FoundCylinder,
+    FoundLine,
+    FoundSphere,
+    ransac_circle,
+    ransac_cylinder,
+    ransac_line,
+    ransac_sphere,
+)
 from pcdata.functional.table_surface import TableSurface, table_surface
 from pcdata.functional.voxels import (
     find_voxel_size,
@@ -60,6 +70,10 @@ from pcdata.geometry.lens import distort_normalized, undistort_normalized
 __all__ = [
     "SHAPE_FEATURES",
     "DepthAverage",
+    "FoundCircle",
+    "FoundCylinder",
+    "FoundLine",
+    "FoundSphere",
     "GraspChecks",
     "ImageGrid",
     "NeighborIndex",
@@ -110,7 +124,11 @@ __all__ = [
     "radius_outlier_mask",
     "random_sample_index",
     "range_to_depth",
+    "ransac_circle",
+    "ransac_cylinder",
+    "ransac_line",
     "ransac_plane",
+    "ransac_sphere",
     "register_depth",
     "render_points",
     "render_ranges",

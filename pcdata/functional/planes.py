@@ -13,6 +13,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
+from pcdata.functional.ransac import draw_rows
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
 from pcdata.geometry.rigid import angle_between
@@ -221,20 +222,8 @@ def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> t
     """Draw the triples of every cloud, (T, P, 3) int64, and say which each takes, (B,): equal clouds share a draw."""
     number: dict[tuple[int, int], int] = {}
     which = [number.setdefault(draw, len(number)) for draw in zip(counts, seeds)]
-    drawn = [_triples_of(count, num_hypotheses, seed) for count, seed in number]
+    drawn = [draw_rows(count, 3, num_hypotheses, seeded(seed)) for count, seed in number]
     return torch.stack(drawn), torch.tensor(which, dtype=torch.int64, device="cpu")
-
-
-def _triples_of(num_points: int, count: int, seed: int) -> Tensor:
-    """Draw (count, 3) indices, distinct within a row and uniform: each skips over those before it."""
-    generator = seeded(seed)
-    first, second, third = (
-        torch.randint(num_points - taken, (count,), generator=generator, device="cpu") for taken in range(3)
-    )
-    second += second >= first
-    third += third >= torch.minimum(first, second)
-    third += third >= torch.maximum(first, second)
-    return torch.stack([first, second, third], dim=1)
 
 
 def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: float, first_cloud: int) -> Tensor:

@@ -82,6 +82,11 @@ def with_weights(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "weights": torch.rand(count, generator=seeded(seed)) * 2}
 
 
+def with_normals(count: int, seed: int) -> dict[str, Tensor]:
+    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=seeded(seed + 9)), dim=1)
+    return {"points": points(count, seed), "normals": normals}
+
+
 def with_labels(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": points(count, seed), "labels": torch.randint(-1, 3, (count,), generator=seeded(seed))}
 
@@ -242,6 +247,12 @@ EXAMPLES = [
     Example("radius_neighbors", with_queries, ("index", "row", "rows_ptr"), {"radius": 0.03}),
     Example("radius_neighbors", one_cloud, ("index", "row", "rows_ptr"), {"radius": 0.06, "exclude_self": True}),
     Example("radius_outlier_mask", one_cloud, ("row",), {"radius": 0.03, "min_neighbors": 2}),
+    Example("ransac_circle", one_cloud, ("cloud",) * 3 + ("row",), {"num_hypotheses": 100}),
+    Example("ransac_cylinder", one_cloud, ("cloud",) * 4 + ("row",), {"num_hypotheses": 100, "radius": (0.01, 1.0)}),
+    Example("ransac_cylinder", with_normals, ("cloud",) * 4 + ("row",), {"num_hypotheses": 100}),
+    Example("ransac_line", one_cloud, ("cloud",) * 3 + ("row",), {"num_hypotheses": 100}),
+    Example("ransac_sphere", one_cloud, ("cloud",) * 2 + ("row",), {"num_hypotheses": 100}),
+    Example("ransac_sphere", with_normals, ("cloud",) * 2 + ("row",), {"num_hypotheses": 100}),
     Example("ransac_plane", one_cloud, ("cloud", "row"), {"distance": 0.01, "num_hypotheses": 100}),
     Example("register_depth", beside_a_color_camera, ("row",) * 4, {"color_size": (18, 24)}),
     Example("render_points", in_front_of_a_camera, ("row", "index"), {"size": (12, 16), "point_size": 0.05}),

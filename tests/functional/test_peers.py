@@ -73,7 +73,11 @@ PEERS = {
     ),
     "radius_neighbors": ("functional/test_neighbors.py", "torch-cluster `radius`; Open3D `fixed_radius_search`"),
     "radius_outlier_mask": ("functional/test_outliers.py", "Open3D `remove_radius_outlier`"),
-    "ransac_plane": ("functional/test_planes.py", "Open3D `segment_plane`"),
+    "ransac_circle": ("functional/test_shapes.py", "PCL `SACMODEL_CIRCLE3D`, `SACMODEL_CIRCLE2D`"),
+    "ransac_cylinder": ("functional/test_shapes.py", "PCL `SACMODEL_CYLINDER`"),
+    "ransac_line": ("functional/test_shapes.py", "PCL `SACMODEL_LINE`, `SACMODEL_STICK`"),
+    "ransac_plane": ("functional/test_planes.py", "Open3D `segment_plane`; PCL `SACMODEL_PLANE`"),
+    "ransac_sphere": ("functional/test_shapes.py", "PCL `SACMODEL_SPHERE`, `SACMODEL_NORMAL_SPHERE`"),
     "register_depth": (
         "functional/depth/test_depth_to_color.py",
         "librealsense `align`; OpenCV `rgbd.registerDepth`",

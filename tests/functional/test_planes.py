@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional import planes as planes_module
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.ransac import draw_rows
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through
+from pcdata.rng import seeded
 
 
 def slab(count: int, normal: list[float], offset: float, *, noise: float = 0.002, seed: int = 0) -> torch.Tensor:
@@ -87,7 +89,7 @@ def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
 def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
     monkeypatch.setitem(planes_module._BLOCK, "cpu", (3, 7))
     points = scene()
-    hypotheses = planes_through(points[planes_module._triples_of(len(points), 50, seed=0)])
+    hypotheses = planes_through(points[draw_rows(len(points), 3, 50, seeded(0))])
     counts = planes_module._count_near(points, hypotheses, 0.01)
     expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
     assert torch.equal(counts, expected)
@@ -105,14 +107,6 @@ def test_among_equal_hypotheses_the_earliest_wins():
     allowed = torch.ones(1, 3, dtype=torch.bool)
     near = planes_module._count_near(points, hypotheses, 0.01)[None]
     assert torch.equal(planes_module._best_planes(hypotheses[None], allowed, near, 0.01, 0), hypotheses[1:2])
-
-
-def test_triples_are_distinct_and_uniform():
-    triples = planes_module._triples_of(4, 24_000, seed=1)
-    assert bool((triples.sort(dim=1).values.diff(dim=1) > 0).all())
-    ordered = torch.bincount(triples @ torch.tensor([16, 4, 1]), minlength=64)
-    assert int((ordered > 0).sum()) == 24  # every ordered triple of 4 points
-    assert int((ordered[ordered > 0] - 1000).abs().max()) < 160  # five standard deviations
 
 
 def test_the_same_seed_repeats_and_a_batch_is_each_cloud_alone():

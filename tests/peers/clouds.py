@@ -537,6 +537,23 @@ PCL = Section(
             "F.ransac_plane(points, distance=0.01, up=(0, 0, 1), max_tilt=0.2)",
             "radians",
         ),
+        Call(
+            "SACSegmentation (SACMODEL_SPHERE), setRadiusLimits(0.01, 0.2)",
+            "F.ransac_sphere(points, distance=0.01, radius=(0.01, 0.2))",
+            "refined by least squares, seeded; `normals=` is SACMODEL_NORMAL_SPHERE without its weight",
+        ),
+        Call(
+            "SACSegmentationFromNormals (SACMODEL_CYLINDER), setAxis, setEpsAngle(0.3)",
+            "F.ransac_cylinder(points, distance=0.01, radius=(0.01, 0.2), up=(0, 0, 1), max_tilt=0.3)",
+            "normals are found where none are given, and weigh nothing; with the length along the axis",
+        ),
+        Call("SACSegmentation (SACMODEL_LINE)", "F.ransac_line(points, distance=0.01)", "with its length"),
+        Call("SACSegmentation (SACMODEL_CIRCLE3D)", "F.ransac_circle(points, distance=0.01)", ""),
+        Call(
+            "SACSegmentation (SACMODEL_CIRCLE2D)",
+            "F.ransac_circle(points * torch.tensor([1.0, 1.0, 0.0]), distance=0.01)",
+            "",
+        ),
         Call("TransformationEstimationSVD", "F.fit_paired_points(points, moved)", ""),
         Call(
             "GeneralizedIterativeClosestPoint.align",
