@@ -13,7 +13,6 @@ from torch import Tensor
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
-from pcdata.functional.ransac import draw_rows
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
 from pcdata.geometry.rigid import angle_between
@@ -224,6 +223,17 @@ def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> t
     which = [number.setdefault(draw, len(number)) for draw in zip(counts, seeds)]
     drawn = [draw_rows(count, 3, num_hypotheses, seeded(seed)) for count, seed in number]
     return torch.stack(drawn), torch.tensor(which, dtype=torch.int64, device="cpu")
+
+
+def draw_rows(num_points: int, size: int, count: int, generator: torch.Generator) -> Tensor:
+    """Draw (count, size) rows of a cloud, distinct within each draw and uniform: each skips over those before it."""
+    drawn: list[Tensor] = []
+    for taken in range(size):
+        row = torch.randint(num_points - taken, (count,), generator=generator, device="cpu")
+        for before in torch.stack(drawn).sort(0).values if drawn else ():
+            row += row >= before
+        drawn.append(row)
+    return torch.stack(drawn, dim=1)
 
 
 def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: float, first_cloud: int) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import NoShapeError
+from pcdata.functional.planes import draw_rows
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.rigid import angle_between
 from pcdata.geometry.shape_fit import Family, length
@@ -48,17 +49,6 @@ class Limits(NamedTuple):
             angle = angle_between(shapes[..., 3:6], axis)
             allowed &= torch.minimum(angle, math.pi - angle) <= self.max_tilt
         return allowed
-
-
-def draw_rows(num_points: int, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw (count, size) rows of a cloud, distinct within each draw and uniform: each skips over those before it."""
-    drawn: list[Tensor] = []
-    for taken in range(size):
-        row = torch.randint(num_points - taken, (count,), generator=generator, device="cpu")
-        for before in torch.stack(drawn).sort(0).values if drawn else ():
-            row += row >= before
-        drawn.append(row)
-    return torch.stack(drawn, dim=1)
 
 
 def found_shapes(

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
 from pcdata.functional import planes as planes_module
-from pcdata.functional.planes import ransac_plane
-from pcdata.functional.ransac import draw_rows
+from pcdata.functional.planes import draw_rows, ransac_plane
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through
 from pcdata.rng import seeded
 

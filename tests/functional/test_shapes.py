@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NoShapeError, ShapeError, TooFewPointsError
 from pcdata.functional import ransac
-from pcdata.functional.ransac import draw_rows
+from pcdata.functional.planes import draw_rows
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.shapes import ransac_circle, ransac_cylinder, ransac_line, ransac_sphere
 from pcdata.rng import seeded
@@ -99,6 +99,18 @@ def test_it_is_the_least_squares_of_its_own_inliers(kind):
     ours = numbers(kind, found)
     fitted = least_squares(lambda shape: apart(kind, shape, inliers), ours, xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert (apart(kind, ours, inliers) ** 2).sum() <= (fitted.fun**2).sum() * (1 + 1e-9)
+
+
+def test_two_points_are_a_line_and_a_flat_ring_is_a_circle():
+    line = ransac_line(torch.tensor([[0.0, 0, 1], [0, 4, 1]]))
+    assert line.center.tolist() == [[0, 2, 1]]
+    assert line.direction.tolist() == [[0, 1, 0]]
+    assert line.length.tolist() == [4]
+    turn = torch.linspace(0, 6, 40)
+    ring = torch.stack([2 + turn.cos(), 3 + turn.sin(), 0 * turn], 1)
+    circle = ransac_circle(ring, distance=1e-4)
+    torch.testing.assert_close(circle.center, torch.tensor([[2.0, 3, 0]], dtype=WIDE), atol=1e-6, rtol=0)
+    assert float(circle.normal[0, 2]) == pytest.approx(1)
 
 
 @KINDS
