@@ -129,6 +129,9 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     for name, more in (("nearest_rows", ()), ("nearest_in", ({},))):
         yield name, "radius", lambda more=more: ((cloud, ptr, *more, 6), {"radius": 0.03})
         yield name, "queries", lambda more=more: ((*searched, *more, 5), asked)
+    for name, more in (("rows_within", ()), ("within_in", ({},))):
+        yield name, "own", lambda more=more: ((cloud, ptr, *more, 0.03), {"exclude_self": True})
+        yield name, "queries", lambda more=more: ((*searched, *more, 0.04), asked)
     yield "sorted_rows", "two", lambda: ((cloud, ptr), {})
     yield "density_clusters", "two", lambda: ((cloud, ptr, 0.03, 4, None), {})
     yield "farthest_rows", "two", lambda: ((cloud, ptr, [20, 7]), {})
