@@ -260,6 +260,9 @@ def _clouds_and_what_else() -> Iterator[tuple[str, str, Callable[[], dict[str, A
     for label in ("random", "ties"):
         flat = CLOUDS[label]()["points"][:, :2].contiguous()
         yield "polygon_mask", label, lambda flat=flat: {"points": flat, "polygon": polygon}
+    seen = {"intrinsics": K, "size": (9, 12), "near": 0.02}
+    yield "frustum_mask", "random", lambda: {"points": CLOUDS["random"]()["points"], **seen}
+    yield "hidden_point_mask", "two", lambda: {**two(), "viewpoint": (0.1, 0.1, 0.5)}
     planes = torch.tensor([[0.0, 0.0, 2.0, -0.2], [0.0, 0.0, 1.0, -0.02]], dtype=torch.float64)
     yield "table_surface", "two", lambda: {**two(), "planes": planes, "viewpoint": (0.1, 0.1, 1.0)}
     yield "table_surface", "on a grid", _table_of_a_grid

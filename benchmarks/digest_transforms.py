@@ -91,6 +91,14 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "DecimateDepth": _of("DecimateDepth", {"factor": 2}, {"factor": 5, "max_jump": 0.5}, {"factor": 3, "rule": "mean"}),
     "Deproject": _of("Deproject", {}),
+    "CropFrustum": _of(
+        "CropFrustum",
+        {
+            **{"frame": "base", "frame_from_camera": TURN, "fx": 20.0, "fy": 21.0, "cx": 7.5, "cy": 5.5},
+            **{"size": (12, 16), "near": 0.01, "far": 2.0},
+        },
+    ),
+    "RemoveHiddenPoints": _of("RemoveHiddenPoints", {}),
     "CropPolygon": _of("CropPolygon", {"frame": "base", "polygon": ((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (0, 0))}),
     "DropNonFinite": _of("DropNonFinite", {}),
     "KeepValues": _of("KeepValues", {"values": (0, 1)}),

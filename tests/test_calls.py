@@ -13,10 +13,13 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
     "points": (400, 34),  # sampling is told its options by the reference, whose step a kernel does
     "build": (
-        3380,
+        3390,
         103,
     ),  # of which 600 keep what a build was when it is stopped, 700 write its card, 30 tell rows, 16 look at poses
-    "open": (860, 33),  # six arrays of the index, each a file that is checked; every field of a step is
+    "open": (
+        870,
+        34,
+    ),  # six arrays of the index, each a file that is checked; every field of a step is; limits that are off
 }
 
 

@@ -54,6 +54,7 @@ from pcdata.functional.shapes import (
     ransac_sphere,
 )
 from pcdata.functional.table_surface import TableSurface, table_surface
+from pcdata.functional.visibility import frustum_mask, hidden_point_mask
 from pcdata.functional.voxels import (
     find_voxel_size,
     voxel_cells,
@@ -110,7 +111,9 @@ __all__ = [
     "find_voxel_size",
     "fit_paired_points",
     "flying_pixel_mask",
+    "frustum_mask",
     "hausdorff_distance",
+    "hidden_point_mask",
     "image_clusters",
     "interpolate_features",
     "knn",

@@ -24,7 +24,11 @@ LENS_MODELS: dict[str, tuple[int, tuple[int, ...]]] = {
     "inverse_brown_conrady": (1, (5,)),
     "fisheye": (2, (4,)),
     "f_theta": (3, (1,)),
+    "f_theta_polynomial": (4, (4,)),
+    "inverse_f_theta_polynomial": (5, (4,)),
 }
+# Lenses that look the same in all directions around the axis; the last three bend with zeros for coefficients too.
+RADIAL = ("f_theta", "fisheye", "f_theta_polynomial", "inverse_f_theta_polynomial")
 _NAMES = {number: name for name, (number, _) in LENS_MODELS.items()}
 # What others call them. RealSense's SDK computes its inverse and its modified model alike, in both directions.
 _OTHER_NAMES = {
@@ -115,7 +119,7 @@ def turned_lenses(where: str, distortion: Tensor) -> Tensor:
     """
     turned = distortion.clone()
     begin = int(distortion.shape[1] == ROW)
-    radial = {LENS_MODELS[name][0] for name in ("fisheye", "f_theta")}
+    radial = {LENS_MODELS[name][0] for name in RADIAL}
     bends = [view for view in range(len(turned)) if not begin or int(distortion[view, 0]) not in radial]
     given = distortion[bends, begin:]
     if bool((given[:, WIDEST_PLAIN:] != 0).any()):

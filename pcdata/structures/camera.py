@@ -30,8 +30,8 @@ class Camera(Structure):
         intrinsics: (V, 3, 3) float64, pixels.
         size: (height, width) in pixels.
         distortion: (V, D) float64, OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]; or rows of 16
-            numbers that name another model (``fisheye``, ``inverse_brown_conrady``, ``f_theta``), which
-            :meth:`pinhole` makes.
+            numbers that name another model (``fisheye``, ``f_theta`` and others, see docs/lenses.md), which
+            :meth:`pinhole` and :meth:`f_theta` make.
         is_window: cut from a larger image, so the principal point may lie outside.
     """
 
@@ -87,6 +87,61 @@ class Camera(Structure):
             None if distortion is None else torch.tensor([list(distortion)], dtype=torch.float64, device="cpu")
         )
         return cls(intrinsics=intrinsics, size=size, distortion=coefficients)
+
+    @classmethod
+    def f_theta(
+        cls,
+        *,
+        polynomial: Sequence[float],
+        cx: float,
+        cy: float,
+        size: tuple[int, int],
+        inverse: bool = False,
+        c: float = 1.0,
+        d: float = 0.0,
+        e: float = 0.0,
+    ) -> Camera:
+        """Make one camera of NVIDIA's f-theta model.
+
+        Args:
+            polynomial: up to six coefficients k0 .. k5, k0 = 0, lowest power first: from the angle off axis in radians
+                to the distance from the principal point in pixels.
+            cx: principal point, in pixels; integers are centers of pixels, so subtract 0.5 where theirs are corners.
+            cy: likewise.
+            size: (height, width).
+            inverse: the polynomial leads from pixels to angles.
+            c: of the linear map [[c, d], [e, 1]] from offsets to pixels; where all three are 0 it is the identity.
+            d: likewise.
+            e: likewise; must be 0.
+
+        Raises:
+            CaptureError: more coefficients, a k0 that is not 0, a k1 that is not positive, or an e.
+            IntrinsicsError: numbers that cannot be the intrinsics of this image.
+
+        Source: NVIDIA DriveWorks, dwFThetaCameraConfig.
+        """
+        values = [float(value) for value in polynomial]
+        if not 2 <= len(values) <= 6 or values[0] != 0 or not 0 < values[1] < float("inf"):
+            raise CaptureError(
+                "Camera.f_theta: polynomial must be 2 to 6 coefficients, lowest power first, the first 0 and the "
+                f"second above 0, got {values}"
+            )
+        if e != 0:
+            raise CaptureError(f"Camera.f_theta: e must be 0, got {e}: rows of pixels that lean are not known here")
+        c = 1.0 if c == d == 0 else c
+        values += [0.0] * (6 - len(values))
+        focal = 1 / values[1] if inverse else values[1]
+        scale = [focal ** (power if inverse else 0) / (1 if inverse else focal) for power in range(2, 6)]
+        coefficients = [value * factor for value, factor in zip(values[2:], scale, strict=True)]
+        model = "inverse_f_theta_polynomial" if inverse else "f_theta_polynomial"
+        intrinsics = [[[c * focal, d * focal, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]]]
+        return cls(
+            intrinsics=torch.tensor(intrinsics, dtype=torch.float64, device="cpu"),
+            size=size,
+            distortion=torch.tensor(
+                [lens_row("Camera.f_theta", model, coefficients)], dtype=torch.float64, device="cpu"
+            ),
+        )
 
     @property
     def num_views(self) -> int:

@@ -47,6 +47,7 @@ from pcdata.transforms.shape import DescribeShape
 from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
 from pcdata.transforms.undistort import Undistort
 from pcdata.transforms.unreliable import MarkUnreliableDepth
+from pcdata.transforms.visibility import CropFrustum, RemoveHiddenPoints
 from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "CompleteDepth",
     "Compose",
     "CropCenter",
+    "CropFrustum",
     "CropPolygon",
     "CropWorkspace",
     "DecimateDepth",
@@ -101,6 +103,7 @@ __all__ = [
     "RandomVoxelSample",
     "RemoveDuplicates",
     "RemoveFlyingPixels",
+    "RemoveHiddenPoints",
     "RemovePlane",
     "RemoveRadiusOutliers",
     "RemoveStatisticalOutliers",

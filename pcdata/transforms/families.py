@@ -81,6 +81,12 @@ class DropLimit(Transform, abstract=True):
             self.check_drop(before or [], after, lambda b: f"points of cloud {b}{sample_name(result, b)}")
         return super().recorded_counts(result, before, after, params, **told)
 
+    def _identity(self) -> Any:
+        name, version, fields = super()._identity()
+        if self.max_drop is None and self.drop_alarm == "error":  # what is stored is that of a step without a limit
+            fields = {field: value for field, value in fields.items() if field not in ("max_drop", "drop_alarm")}
+        return [name, version, fields]
+
     def check_drop(self, before: list[int], after: list[int], of: Callable[[int], str]) -> None:
         """Hold what is left of each cloud or view to the limit; ``of`` says what is counted there."""
         for b, (had, count) in enumerate(zip(before, after)):

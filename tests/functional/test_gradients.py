@@ -32,6 +32,8 @@ WITHOUT = {
     "farthest_point_sample",
     "find_voxel_size",
     "flying_pixel_mask",
+    "frustum_mask",
+    "hidden_point_mask",
     "polygon_mask",
     "radius_outlier_mask",
     "ransac_circle",

@@ -212,6 +212,8 @@ EXAMPLES = [
     Example("chamfer_distance", two_clouds_with_normals, ("cloud",), {"norm": "l1", "squared": False}),
     Example("f_score", two_clouds, ("cloud",), {"threshold": 0.02}),
     Example("hausdorff_distance", two_clouds, ("cloud",)),
+    Example("frustum_mask", in_front_of_a_camera, ("row",), {"size": (9, 12), "near": 0.52, "far": 0.65}),
+    Example("hidden_point_mask", one_cloud, ("row",), {"viewpoint": (0.1, 0.1, 0.5)}),
     Example("core_point_mask", with_weights, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("dbscan", with_weights, ("row",), {"eps": 0.03, "min_points": 4}),
     Example("dbscan", one_cloud, ("row",), {"eps": 0.03, "min_points": 4}),

@@ -52,7 +52,9 @@ PEERS = {
         "PCL `TransformationEstimationSVD`; OpenCV `estimateAffine3D`",
     ),
     "flying_pixel_mask": ("functional/depth/test_flying_pixels.py", "PCL `ShadowPoints`"),
+    "frustum_mask": ("functional/test_visibility.py", "PCL `FrustumCulling`"),
     "hausdorff_distance": ("functional/test_metrics.py", "SciPy `directed_hausdorff`"),
+    "hidden_point_mask": ("functional/test_visibility.py", "Open3D `hidden_point_removal`"),
     "image_clusters": ("functional/test_image_clusters.py", "PCL `OrganizedEuclideanClusterExtraction`"),
     "interpolate_features": (
         "functional/test_interpolation.py",

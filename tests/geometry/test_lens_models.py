@@ -12,6 +12,7 @@ from pcdata.errors import CaptureError
 from pcdata.functional import pixel_rays, project_points
 from pcdata.geometry.lens import distort_normalized, fold_radius, undistort_normalized
 from pcdata.geometry.lens_models import LENS_MODELS, lens_facts, lens_row, model_named, same_width
+from pcdata.structures import Camera
 
 D455 = [-0.0565362684428692, 0.068201869726181, 0.0003659751964733, 0.000692575704306364, -0.0218431670218706]
 T265 = [-0.0051, 0.0391, -0.0368, 0.0062]
@@ -20,6 +21,8 @@ LENSES = {
     "inverse_brown_conrady": D455,
     "fisheye": T265,
     "f_theta": [0.92],
+    "f_theta_polynomial": [0.004, -0.06, 0.02, -0.011],
+    "inverse_f_theta_polynomial": [-0.003, 0.05, 0.01, 0.008],
 }
 each_model = pytest.mark.parametrize("model", LENSES)
 
@@ -62,6 +65,75 @@ def test_realsense_models_agree_with_the_formulas_of_its_sdk():
     scale = np.where(r > 0, np.arctan(2 * r * math.tan(0.92 / 2)) / 0.92 / np.where(r > 0, r, 1), 1.0)
     found = distort_normalized(grid(0.6), lens("f_theta")).reshape(-1, 2)[r > 0]
     np.testing.assert_allclose(found.numpy(), np.stack([x * scale, y * scale], 1)[r > 0], atol=1e-14)
+
+
+F_THETA = {  # of an image of 1936 x 1220: from angles to pixels, and from pixels to angles
+    False: [0.0, 930.4, 3.2, -41.7, 12.9, -8.3],
+    True: [0.0, 1.0748e-3, 2.1e-9, 4.2e-11, -3.1e-14, 2.5e-17],
+}
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize(("c", "d"), [(1.0, 0.0), (0.0, 0.0), (0.9987, 0.0021)])
+def test_pixels_of_nvidia_s_f_theta_are_those_of_a_search(inverse, c, d):
+    camera = Camera.f_theta(
+        polynomial=F_THETA[inverse], cx=970.3, cy=604.9, size=(1220, 1936), inverse=inverse, c=c, d=d
+    )
+    theta = torch.linspace(0.0, 1.1, 23, dtype=torch.float64)
+    turn = torch.linspace(0.0, 6.0, 23, dtype=torch.float64)
+    around = torch.stack([turn.cos(), turn.sin()], 1)
+    points = torch.cat([theta.sin()[:, None] * around, theta.cos()[:, None]], 1) * 2.3
+    if inverse:  # halving, of which no derivative is needed
+        low, high = np.zeros(23), np.full(23, 2000.0)
+        for _ in range(100):
+            middle = (low + high) / 2
+            below = np.polynomial.polynomial.polyval(middle, F_THETA[True]) < theta.numpy()
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        distance = torch.from_numpy((low + high) / 2)
+    else:
+        distance = torch.from_numpy(np.polynomial.polynomial.polyval(theta.numpy(), F_THETA[False]))
+    linear = torch.tensor([[c or 1.0, d], [0.0, 1.0]], dtype=torch.float64)
+    expected = (distance[:, None] * around) @ linear.T + torch.tensor([970.3, 604.9], dtype=torch.float64)
+    found, _ = project_points(points, intrinsics=camera.intrinsics, distortion=camera.distortion)
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=0)
+    # And the rays of those pixels are the points' again.
+    normalized = torch.linalg.solve(
+        camera.intrinsics[0], torch.cat([expected, torch.ones(23, 1, dtype=torch.float64)], 1).T
+    ).T[None, :, :2]
+    rays = undistort_normalized(normalized, camera.distortion)[0]
+    torch.testing.assert_close(rays, points[:, :2] / points[:, 2:], atol=1e-11, rtol=1e-11)
+
+
+@pytest.mark.parametrize("model", ["f_theta_polynomial", "inverse_f_theta_polynomial"])
+def test_a_polynomial_of_angles_ends_where_it_turns_back(model):
+    row = lens(model, [0.0, -0.4, 0.0, 0.0])  # x - 0.4 x^3 grows up to 1 / sqrt(1.2)
+    top = 1 / math.sqrt(1.2)
+    reached = top - 0.4 * top**3
+    theta, radius = (reached, top) if "inverse" in model else (top, reached)
+    assert float(fold_radius(row)[0]) == pytest.approx(math.tan(theta), rel=1e-9)
+    near = torch.tensor([[[0.999 * radius, 0.0], [1.001 * radius, 0.0], [0.0, 0.5 * radius]]], dtype=torch.float64)
+    assert undistort_normalized(near, row).isnan().any(-1).tolist() == [[False, True, False]]
+    points = torch.tensor([[math.tan(0.999 * theta), 0.0, 1.0], [math.tan(1.001 * theta), 0.0, 1.0]])
+    pixels, _ = project_points(points, intrinsics=torch.eye(3, dtype=torch.float64)[None], distortion=row)
+    assert pixels.isnan().any(-1).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("model", ["fisheye", "f_theta_polynomial", "inverse_f_theta_polynomial"])
+def test_with_no_coefficients_the_radius_is_the_angle(model):
+    row = lens(model, [0.0] * 4)
+    bent = distort_normalized(grid(1.5), row)[0]
+    rays = grid(1.5)[0]
+    torch.testing.assert_close(bent.norm(dim=-1), rays.norm(dim=-1).atan(), atol=1e-14, rtol=0)
+
+
+def test_what_is_no_f_theta_polynomial_is_refused():
+    given = {"cx": 31.5, "cy": 23.5, "size": (48, 64)}
+    for polynomial in ([], [0.0], [0.1, 50.0], [0.0, -50.0], [0.0, float("nan")], [0.0] + [1.0] * 6):
+        with pytest.raises(CaptureError, match=r"Camera\.f_theta: polynomial must be 2 to 6 coefficients"):
+            Camera.f_theta(polynomial=polynomial, **given)
+    with pytest.raises(CaptureError, match="e must be 0"):
+        Camera.f_theta(polynomial=[0.0, 50.0], e=0.1, **given)
+    assert Camera.f_theta(polynomial=[0.0, 50.0], **given).lenses == [("f_theta_polynomial", [0.0] * 4)]
 
 
 def test_the_lens_of_a_d455_is_opencv_s_to_a_twentieth_of_a_pixel():

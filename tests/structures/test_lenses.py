@@ -21,6 +21,8 @@ LENSES = {
     "fisheye": [-0.005, 0.04, -0.03, 0.006],
     "inverse_brown_conrady": [-0.0565, 0.0682, 0.0004, 0.0007, -0.0218],
     "f_theta": [0.5],
+    "f_theta_polynomial": [0.01, -0.08, 0.02, -0.01],
+    "inverse_f_theta_polynomial": [-0.01, 0.1, 0.02, 0.01],
     "opencv": [0.1, -0.05, 0.001, 0.002, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.02, -0.01],
 }
 each_model = pytest.mark.parametrize("model", LENSES)

@@ -17,6 +17,11 @@ from pcdata.structures import NORMALIZED, DepthFrame, PointCloud
 from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
 QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
+VIEW = {
+    "frame": "base",
+    "frame_from_camera": ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.1), (0.0, 0.0, 1.0, -0.3), (0.0, 0.0, 0.0, 1.0)),
+    **{"fx": 30.0, "fy": 31.0, "cx": 15.5, "cy": 11.5, "size": (24, 32)},
+}
 BOX = {"lower": (-0.15, -0.15, -0.01), "upper": (0.15, 0.15, 0.2)}
 
 
@@ -88,6 +93,10 @@ EXAMPLES: dict[str, list[Example]] = {
         ),
     ],
     "CropCenter": _of(T.CropCenter(size=(5, 7)), make=frame_with_counts),
+    "CropFrustum": _of(
+        T.CropFrustum(**VIEW, near=0.2, far=0.45),
+        T.CropFrustum(**VIEW, lens="fisheye", distortion=(0.01, 0.02, 0.0, 0.0), invert=True),
+    ),
     "CropPolygon": _of(
         T.CropPolygon(frame="base", polygon=((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (0.0, 0.0), (-0.2, 0.2))),
         T.CropPolygon(frame="base", polygon=((0, 0), (0.1, 0), (0, 0.1)), axis="x", low=-0.2, high=0.4, invert=True),
@@ -236,6 +245,9 @@ EXAMPLES: dict[str, list[Example]] = {
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
         make=frame_with_counts,
+    ),
+    "RemoveHiddenPoints": _of(
+        T.RemoveHiddenPoints(), T.RemoveHiddenPoints(viewpoint=(0.5, 0.1, 0.9), frame="base", radius_factor=10.0)
     ),
     "RemovePlane": _of(
         T.RemovePlane(distance=0.005),

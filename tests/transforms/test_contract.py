@@ -322,6 +322,7 @@ def changed_values(value: Any) -> list[Any]:
             "slab",
             "warn",
             "y",
+            "equidistant",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]

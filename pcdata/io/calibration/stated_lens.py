@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from pcdata.errors import IntrinsicsError, PcdataError
-from pcdata.geometry.lens_models import LENS_MODELS, lens_row, model_named
+from pcdata.geometry.lens_models import LENS_MODELS, RADIAL, lens_row, model_named
 
 
 def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float] | None:
@@ -20,7 +20,7 @@ def lens_of(where: str, model: str, coefficients: Sequence[float]) -> list[float
         raise IntrinsicsError(f"{where} has a lens with coefficients that are not finite: {numbers}")
     known = model_named(model)
     # All zeros bend nothing, but for a fisheye, which they leave equidistant.
-    if not any(numbers) and (known != "fisheye" or not numbers):
+    if not any(numbers) and (known not in RADIAL[1:] or not numbers):
         return None
     if known is None:
         raise IntrinsicsError(

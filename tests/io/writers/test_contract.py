@@ -64,10 +64,12 @@ def test_the_lenses_of_a_rig_come_back_by_their_models(kind: str, tmp_path: Path
             ("fisheye", [-0.005, 0.04, -0.03, 0.006]),
             ("inverse_brown_conrady", [-0.056, 0.068, 0.0004, 0.0007, -0.02]),
             ("f_theta", [0.3]),
+            ("f_theta_polynomial", [0.01, -0.08, 0.02, -0.01]),
+            ("inverse_f_theta_polynomial", [0.0, 0.0, 0.0, 0.0]),
         )
     ]
-    camera = replace(made_frame(views=3).camera, distortion=torch.tensor(rows, dtype=torch.float64))
-    source = written(cut_to_episodes(made_captures(4, views=3, camera=camera)), kind, tmp_path / "out")
+    camera = replace(made_frame(views=5).camera, distortion=torch.tensor(rows, dtype=torch.float64))
+    source = written(cut_to_episodes(made_captures(4, views=5, camera=camera)), kind, tmp_path / "out")
     assert source.load(source.ids[0]).camera.lenses == camera.lenses
 
 

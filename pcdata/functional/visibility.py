@@ -1,0 +1,146 @@
+"""Which points a camera sees: those in its view, and those that nothing before them hides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pcdata.contracts.dispatch import op
+from pcdata.contracts.numbers import checked_image_size, checked_places, checked_positive
+from pcdata.errors import ConfigError
+from pcdata.functional.depth.deproject import projected
+
+_FLAT = 1e-9  # as a part of a set's extent: thinner than this it has a dimension less
+
+
+def _checked_near(where: str, name: str, arguments: Mapping[str, Any]) -> float:
+    value = arguments[name]
+    return 0.0 if value == 0 and not isinstance(value, bool) else checked_positive(where, name, arguments)
+
+
+def _checked_far(where: str, name: str, arguments: Mapping[str, Any]) -> float:
+    far = checked_positive(where, name, arguments, finite=False)
+    near = _checked_near(where, "near", arguments)
+    if not near < far:
+        raise ConfigError(f"{where}: near must be below far, got near={near}, far={far}")
+    return far
+
+
+@op(
+    points="N 3 : float",
+    ptr="ptr N V",
+    intrinsics="V 3 3 : float",
+    distortion="V D : float",
+    size=checked_image_size,
+    near=_checked_near,
+    far=_checked_far,
+    gradient=False,
+)
+def frustum_mask(
+    points: Tensor,  # (N, 3) float32 or float64 metres, those of cloud v in the frame of camera v
+    ptr: Tensor | None = None,  # (V+1,)
+    *,
+    intrinsics: Tensor,  # (V, 3, 3), pixels
+    distortion: Tensor | None = None,  # (V, D) lenses, see pcdata.geometry.lens_models
+    size: tuple[int, int],
+    near: float = 0.0,
+    far: float = math.inf,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool
+    """Mark the points that lie before a camera and inside its image, hidden by others or not.
+
+    Args:
+        points: the clouds.
+        ptr: row pointers.
+        intrinsics: of the cameras.
+        distortion: their lenses.
+        size: (height, width) of the images, which span -0.5 .. width - 0.5, the left and upper edges included.
+        near: metres along z; nearer points are not seen, nor is what has no depth.
+        far: metres along z, likewise, itself included.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        CaptureError: impossible intrinsics or distortion.
+        ConfigError: near or far are no range.
+    """
+    assert ptr is not None  # @op fills it
+    pixels, depth = projected(points, ptr, intrinsics, distortion)
+    u, v = pixels.unbind(-1)  # NaN where there is no pixel, which is inside of nothing
+    inside = (u >= -0.5) & (u < size[1] - 0.5) & (v >= -0.5) & (v < size[0] - 0.5)
+    return inside & (depth >= near) & (depth <= far)
+
+
+@op(points="N 3", ptr="ptr N B", viewpoint=checked_places, radius_factor=checked_positive, gradient=False)
+def hidden_point_mask(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor | None = None,  # (B+1,); None = one cloud
+    *,
+    viewpoint: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+    radius_factor: float = 100.0,
+    backend: str = "auto",
+) -> Tensor:  # (N,) bool, True = hidden
+    """Mark the points of surfaces that others hide from a viewpoint, without a mesh: the clouds' own points decide.
+
+    Points are mirrored at a sphere around the viewpoint that holds them all; those on the convex hull of what comes out
+    and the viewpoint are visible, the others hidden. Equal points are hidden together, a point at the viewpoint is
+    visible. SciPy's hull, in float64 on the CPU: N log N a cloud, one cloud after another.
+
+    Args:
+        points: the clouds, in any unit of length.
+        ptr: row pointers.
+        viewpoint: x, y, z of the eye, (3,) or one per cloud (B, 3).
+        radius_factor: the radius of the sphere, as a multiple of the distance to the cloud's farthest point, 1 or more.
+            Larger ones hide less: 100 suits surfaces as densely sampled as a depth camera does.
+        backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
+
+    Raises:
+        ConfigError: a viewpoint that is not finite, or a factor below 1.
+
+    Source: Katz, Tal and Basri, Direct visibility of point sets, SIGGRAPH 2007.
+    """
+    assert ptr is not None  # @op fills it
+    assert isinstance(viewpoint, Tensor)  # and makes it (B, 3)
+    if radius_factor < 1:
+        raise ConfigError(f"hidden_point_mask: radius_factor must be 1 or more, got {radius_factor}")
+    bounds, eyes = ptr.tolist(), viewpoint.double().cpu().numpy()
+    rows = points.detach().double().cpu().numpy()
+    hidden = np.ones(len(rows), dtype=np.bool_)
+    for eye, start, stop in zip(eyes, bounds[:-1], bounds[1:], strict=True):
+        hidden[start:stop] = _hidden(rows[start:stop] - eye, radius_factor)
+    return torch.from_numpy(hidden).to(points.device)
+
+
+def _hidden(rays: NDArray[np.float64], radius_factor: float) -> NDArray[np.bool_]:
+    """Decide about the points of one cloud, (n, 3) from the eye."""
+    own, number = np.unique(rays, axis=0, return_inverse=True)
+    distance = np.sqrt((own * own).sum(1))
+    away = distance > 0
+    hidden = np.zeros(len(own), dtype=np.bool_)
+    if away.any():
+        ray, length = own[away], distance[away, None]
+        flipped = ray * (2 * radius_factor * length.max() / length - 1)
+        corners = _hull_corners(np.concatenate([flipped, np.zeros((1, 3))]))
+        hidden[away] = ~np.isin(np.arange(len(ray)), corners)
+    return hidden[number.reshape(-1)]
+
+
+def _hull_corners(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the corners of the convex hull of (n, 3) points, which may lie in a plane or on a line."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    dimensions = int((extents > _FLAT * max(extents[0], np.finfo(np.float64).tiny)).sum()) if len(points) > 1 else 0
+    while dimensions > 1:
+        try:
+            places = points if dimensions == 3 else points @ axes[:dimensions].T
+            return ConvexHull(places).vertices.astype(np.int64)
+        except QhullError:  # flat to its eyes
+            dimensions -= 1
+    along = points @ axes[0]
+    return np.array([along.argmin(), along.argmax()], dtype=np.int64)
