@@ -101,6 +101,8 @@ CLOUD_OPERATIONS = {
 }
 IMAGE_OPERATIONS = {
     "decimate_depth": [{"factor": 3}, {"factor": 2, "rule": "mean", "max_jump": 0.3}],
+    "bilateral_filter": [{}, {"reach": 1, "sigma_depth": 0.2, "max_jump": 0.5}],
+    "median_filter": [{}, {"reach": 2, "max_jump": 0.3}],
     "fill_holes": [{"rule": "nearest"}, {"rule": "left"}, {"rule": "farthest"}],
     "flying_pixel_mask": [{}],
     "resize_depth": [{"size": (7, 30), "max_jump": 0.3}, {"size": (24, 32), "max_jump": None}],

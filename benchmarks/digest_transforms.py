@@ -188,6 +188,8 @@ EXAMPLES: dict[str, list[Example]] = {
     ),
     "RandomTranslation": _of("RandomTranslation", {}, {"max_offset": (0.1, 0.0, 0.3)}),
     "RandomVoxelSample": _of("RandomVoxelSample", {"voxel_size": 0.05}),
+    "BilateralFilterDepth": _of("BilateralFilterDepth", {}, {"reach": 1, "sigma_depth": 0.2, "max_jump": 0.5}),
+    "MedianFilterDepth": _of("MedianFilterDepth", {}, {"reach": 2, "max_jump": 0.5}),
     "RemoveFlyingPixels": _of("RemoveFlyingPixels", {}, {"tolerance": 0.2, "min_neighbors": 2}),
     "RemovePlane": _of(
         "RemovePlane",

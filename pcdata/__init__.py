@@ -58,6 +58,8 @@ _HOMES = {
         "RandomColorJitter",
         "RandomColumn",
         "RandomCuboid",
+        "BilateralFilterDepth",
+        "MedianFilterDepth",
         "RandomFarthestPointSample",
         "RandomFlip",
         "RandomJitter",

@@ -1,10 +1,10 @@
 """Operations on tensors: points (N, 3) and row pointers ``ptr`` (B+1,) in, tensors out, on any device.
 
 Gradients flow through what is computed from coordinates and depth: deprojection, projection, motions, voxel means,
-decimated, resized, undistorted and filled depth, undistorted images, disparity, distances between clouds, distances and
-covariances of neighbors, interpolated features, the motion between paired points. None flow through decisions (indices,
-masks, labels, planes and other shapes, sizes, which points are neighbors), nor through estimated normals,
-``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
+decimated, resized, undistorted, filtered and filled depth, undistorted images, disparity, distances between clouds,
+distances and covariances of neighbors, interpolated features, the motion between paired points. None flow through
+decisions (indices, masks, labels, planes and other shapes, sizes, which points are neighbors), nor through estimated
+normals, ``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.clusters import core_point_mask, dbscan
@@ -17,6 +17,7 @@ from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
+from pcdata.functional.depth.window_filters import bilateral_filter, median_filter
 from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
 from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
@@ -87,6 +88,7 @@ __all__ = [
     "TemporalState",
     "average_depth",
     "ball_query",
+    "bilateral_filter",
     "box_mask",
     "chamfer_distance",
     "check_grasps",
@@ -117,6 +119,7 @@ __all__ = [
     "image_clusters",
     "interpolate_features",
     "knn",
+    "median_filter",
     "neighborhood_covariance",
     "orient_normals",
     "pixel_rays",

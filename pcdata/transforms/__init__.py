@@ -49,9 +49,11 @@ from pcdata.transforms.undistort import Undistort
 from pcdata.transforms.unreliable import MarkUnreliableDepth
 from pcdata.transforms.visibility import CropFrustum, RemoveHiddenPoints
 from pcdata.transforms.voxel_sample import RandomVoxelSample, VoxelSample
+from pcdata.transforms.window_filters import BilateralFilterDepth, MedianFilterDepth
 
 __all__ = [
     "REGISTRY",
+    "BilateralFilterDepth",
     "Center",
     "ClusterObjects",
     "CompleteDepth",
@@ -75,6 +77,7 @@ __all__ = [
     "MapLabels",
     "MarkUnreliableDepth",
     "MaskDepth",
+    "MedianFilterDepth",
     "MergeViews",
     "NearestCompletion",
     "NormalizeUnitSphere",

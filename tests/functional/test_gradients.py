@@ -61,6 +61,7 @@ WITHOUT = {
 }
 WITH = {
     "ball_query",
+    "bilateral_filter",
     "chamfer_distance",
     "decimate_depth",
     "deproject_depth",
@@ -70,6 +71,7 @@ WITH = {
     "hausdorff_distance",
     "interpolate_features",  # tests/functional/test_interpolation.py
     "knn",
+    "median_filter",
     "neighborhood_covariance",
     "project_points",
     "radius_neighbors",
@@ -120,6 +122,8 @@ def test_every_operation_is_on_one_of_the_two_lists():
         (lambda d: resize_depth(d, size=(9, 11), max_jump=0.5)[0], image()),
         (lambda d: resize_depth(d, size=(9, 11))[0], image()),
         (lambda d: F.fill_holes(d)[0], image()),
+        (lambda d: F.bilateral_filter(d, sigma_depth=0.02), image()),
+        (lambda d: F.median_filter(d), image()),
         (lambda d: F.undistort_depth(d, INTRINSICS, LENS)[0], image()),
         (lambda d: F.undistort_depth(d, INTRINSICS, LENS, rule="surface")[0], image()),
         (lambda d: F.deproject_ranges(d)[0], image()),
@@ -130,6 +134,7 @@ def test_every_operation_is_on_one_of_the_two_lists():
     ],
     ids=[
         *("deproject depth", "deproject K", "deproject lens", "median", "mean", "resize", "nearest", "fill"),
+        *("bilateral", "median filter"),
         *("undistort", "undistort by surface", "lidar"),
         *("range", "range K", "to disparity", "from disparity"),
     ],

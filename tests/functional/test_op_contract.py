@@ -207,6 +207,7 @@ class Example:
 EXAMPLES = [
     Example("ball_query", one_cloud, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
     Example("ball_query", with_queries, ("index", "row", "row"), {"radius": 0.03, "max_neighbors": 5}),
+    Example("bilateral_filter", depth_alone, ("row",), {"max_jump": 0.3, "sigma_depth": 0.2}),
     Example("box_mask", one_cloud, ("row",), {"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}),
     Example("chamfer_distance", two_clouds, ("cloud",)),
     Example("chamfer_distance", two_clouds_with_normals, ("cloud",), {"norm": "l1", "squared": False}),
@@ -242,6 +243,8 @@ EXAMPLES = [
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("knn", in_six_dimensions, ("index", "row"), {"k": 4}),
     Example("knn", one_cloud, ("index", "row"), {"k": 4, "exclude_self": True}),
+    Example("median_filter", depth_alone, ("row",), {"reach": 2}),
+    Example("median_filter", depth_alone, ("row",), {"max_jump": 0.3}),
     Example("neighborhood_covariance", with_queries, ("row", "row", "row"), {"radius": 0.05, "max_neighbors": 12}),
     Example("pack_colors", color_image, ("row",)),
     Example("polygon_mask", in_a_plane, ("row",), {"polygon": [[0.0, 0.0], [0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]}),

@@ -18,6 +18,10 @@ ROOT = Path(__file__).parents[2]
 # Operation -> the test that holds it to an oracle, and what others call it.
 PEERS = {
     "ball_query": ("functional/test_neighbors.py", "PyTorch3D `ops.ball_query`; Open3D `hybrid_search`"),
+    "bilateral_filter": (
+        "functional/depth/test_window_filters.py",
+        "kornia `bilateral_blur`; OpenCV `bilateralFilter`; PCL `FastBilateralFilter`",
+    ),
     "box_mask": ("functional/test_selection.py", "Open3D `crop`; PCL `CropBox`"),
     "chamfer_distance": ("functional/test_metrics.py", "PyTorch3D `loss.chamfer_distance`"),
     "core_point_mask": ("functional/test_clusters.py", "scikit-learn `DBSCAN.core_sample_indices_`"),
@@ -61,6 +65,7 @@ PEERS = {
         "PyG `knn_interpolate`; Open3D-ML `three_interpolate`",
     ),
     "knn": ("functional/test_neighbors.py", "torch-cluster `knn`; PyTorch3D `knn_points`; Open3D `knn_search`"),
+    "median_filter": ("functional/depth/test_window_filters.py", "OpenCV `medianBlur`; PCL `MedianFilter`"),
     "neighborhood_covariance": (
         "functional/test_neighborhoods.py",
         "Open3D `estimate_covariances`; PyTorch3D `estimate_pointcloud_local_coord_frames`",

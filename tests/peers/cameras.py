@@ -35,6 +35,18 @@ KORNIA = Section(
             by(lambda a: a[..., :2], lambda b: b),
         ),
         Call(
+            "kornia.filters.bilateral_blur(depth[:, None] + (depth[:, None] == 0), (5, 5), 0.01, (1.5, 1.5))",
+            "F.bilateral_filter(depth + (depth == 0), reach=2, sigma_pixels=1.5, sigma_depth=0.01, max_jump=1.0)",
+            "never across an edge (`max_jump`) nor from a hole; nothing beyond the image, where kornia mirrors it",
+            by(lambda a: a[:, 0, 2:-2, 2:-2], lambda b: b[:, 2:-2, 2:-2], 1e-5),
+        ),
+        Call(
+            "kornia.filters.median_blur(depth[:, None] + (depth[:, None] == 0), 3)",
+            "F.median_filter(depth + (depth == 0))",
+            "of the readings in the window; holes stay holes",
+            by(lambda a: a[:, 0, 1:-1, 1:-1], lambda b: b[:, 1:-1, 1:-1], 0),
+        ),
+        Call(
             "kornia.geometry.project_points(points + 0.5, K[0].float())",
             "F.project_points(points + 0.5, intrinsics=K[:1])[0]",
             "depth beside the pixels; a point that is not in front has none (NaN)",
@@ -176,6 +188,17 @@ OPENCV = Section(
             "cv2.resize(depth[0].numpy(), (16, 12))",
             "F.resize_depth(depth, size=(12, 16))",
             "(height, width); depth is never blended across an edge",
+        ),
+        Call(
+            "cv2.medianBlur((depth[0] + (depth[0] == 0)).numpy(), 5)",
+            "F.median_filter(depth[:1] + (depth[:1] == 0), reach=2)",
+            "any number of readings in a window; its border repeats the image",
+            by(lambda a: a[2:-2, 2:-2], lambda b: b[0, 2:-2, 2:-2], 0),
+        ),
+        Call(
+            "cv2.bilateralFilter(depth[0].numpy(), 5, 0.01, 1.5)",
+            "F.bilateral_filter(depth, reach=2, sigma_pixels=1.5, sigma_depth=0.01)",
+            "a square window, exact weights, nothing across edges or from holes",
         ),
         Call(
             "cv2.inpaint(image, mask, 3, cv2.INPAINT_NS)",

@@ -554,6 +554,12 @@ PCL = Section(
             "F.ransac_circle(points * torch.tensor([1.0, 1.0, 0.0]), distance=0.01)",
             "",
         ),
+        Call(
+            "FastBilateralFilter.setSigmaS(1.5), setSigmaR(0.01)",
+            "pcdata.BilateralFilterDepth(sigma_pixels=1.5, sigma_depth=0.01)(frame)",
+            "of depth images, before they become points",
+        ),
+        Call("MedianFilter.setWindowSize(3)", "pcdata.MedianFilterDepth()(frame)", "likewise"),
         Call("TransformationEstimationSVD", "F.fit_paired_points(points, moved)", ""),
         Call(
             "GeneralizedIterativeClosestPoint.align",

@@ -241,6 +241,12 @@ EXAMPLES: dict[str, list[Example]] = {
         T.RandomVoxelSample(voxel_size=(0.05, 0.1, 0.3), origin=(0.02, 0.0, 0.01), min_points=2),
     ),
     "RemoveDuplicates": _of(T.RemoveDuplicates(), make=cloud_with_repeats),
+    "BilateralFilterDepth": _of(
+        T.BilateralFilterDepth(),
+        T.BilateralFilterDepth(reach=1, sigma_pixels=0.7, sigma_depth=0.2, max_jump=0.5),
+        make=frame_with_counts,
+    ),
+    "MedianFilterDepth": _of(T.MedianFilterDepth(), T.MedianFilterDepth(reach=2, max_jump=0.5), make=frame_with_counts),
     "RemoveFlyingPixels": _of(
         T.RemoveFlyingPixels(),
         T.RemoveFlyingPixels(tolerance=0.2, min_neighbors=2),
