@@ -15,6 +15,9 @@ from pcdata.functional.rows import counts_from_ptr
 
 # Kernels number the pixels of an image, with a margin around it, in 63 bits.
 _MOST_PIXELS = 2**31 - 1
+# An image has lines of missing pixels where every so many-th point is before one. Depth that was moved to the image of
+# another camera, and is sparser there, has 0.2 and more; other holes are rarely one pixel wide.
+_LINED = 0.05
 
 
 @dataclass(frozen=True)
@@ -92,3 +95,14 @@ def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.devi
             f"{name}[{wrong[0]}] is not rigid: rotation^T rotation is off the identity by {float(off[wrong[0]]):.2g}; "
             "a window of a scaled or sheared cloud proves nothing, so pass grid=None"
         )
+
+
+def is_lined(pixel_index: Tensor, size: tuple[int, int]) -> bool:
+    """Say whether lines of single missing pixels run through an image of points on pixels (n,)."""
+    if len(pixel_index) == 0:
+        return False
+    there = torch.zeros(size, dtype=torch.bool, device=pixel_index.device)
+    there.view(-1)[pixel_index] = True
+    across = there[:, :-2] & ~there[:, 1:-1] & there[:, 2:]
+    down = there[:-2] & ~there[1:-1] & there[2:]
+    return int(across.sum()) + int(down.sum()) > _LINED * len(pixel_index)

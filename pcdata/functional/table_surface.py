@@ -15,21 +15,15 @@ from pcdata.contracts.numbers import checked_length, checked_positive
 from pcdata.errors import ConfigError, NoPlaneError, ShapeError
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.image_clusters import linked_pixels
-from pcdata.functional.image_grid import ImageGrid, checked_grid
+from pcdata.functional.image_grid import ImageGrid, checked_grid, is_lined
 from pcdata.functional.neighbors import knn
 from pcdata.functional.planes import fit_planes
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
-from pcdata.functional.selection import plane_axes
+from pcdata.functional.surface_fit import fit_surface
 
-# Points of a cloud that the surface is fitted to.
-_SAMPLE = 1 << 15
-_ROUNDS = 8  # of fitting and choosing inliers again; real tables settle in 4 to 6
-# Standard deviations within which points are the table's own, for the fit: 1.2 % of normal noise lies outside.
-_OWN = 2.5
-# A median of absolute deviations times this is a standard deviation, of normal noise.
-_MAD = 1.4826
-_LEAST_NOISE = 0.05  # of the distance: real tables are no flatter, whatever a noise-free renderer shows
-_MOST_SPREAD = 3.0  # distances from the plane that the search for its noise may go
+# Of the distance: what makers of depth cameras allow theirs within its range, and more than the good ones have.
+_WORST_NOISE = 0.02
+_MOST_CLUTTER = 0.5  # of what lies within the noise; more, and the surface is not what most of it is about
 _WINDOW = 9  # points whose median is a point's height: itself and the pixels around it
 _EXCHANGES = [
     *((1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3)),
@@ -40,11 +34,13 @@ _EXCHANGES = [
 class TableSurface(NamedTuple):
     """What :func:`table_surface` found in B clouds of N points."""
 
-    table: Tensor  # (N,) bool: the points of the table itself
+    table: Tensor  # (N,) bool: the points of the table itself, and crumbs
+    flat: Tensor  # (N,) bool: those of them within its noise, which hull and planes are made of
     height: Tensor  # (N,) float32 above its surface, on the side that the normal points to
     noise: Tensor  # (B,) float64 standard deviation of height at the table's median distance from the viewpoint
     disparity_noise: Tensor  # (B,) float64 the same of 1 / distance from the viewpoint; NaN where that is not known
     planes: Tensor  # (B, 4) float64, refitted to the table itself
+    believed: Tensor  # (B,) bool: False where no table was measured, and the rest is that of the plane as given
 
 
 def _checked_viewpoint(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
@@ -115,6 +111,7 @@ def _middle_of_nine(values: list[Tensor]) -> Tensor:
     cut=checked_positive,
     min_height=checked_positive,
     min_size=checked_length,
+    max_noise=checked_length,
     grid=checked_grid,
     steps=(window_medians, linked_pixels, fit_planes),
     gradient=False,
@@ -129,6 +126,7 @@ def table_surface(
     cut: float = 2.5,
     min_height: float = 8.0,
     min_size: float = 0.02,
+    max_noise: float | None = None,
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> TableSurface:
@@ -140,17 +138,23 @@ def table_surface(
     suspected to stand on the table where the median height of the points around it (the 3 x 3 pixels of ``grid``, else
     the 9 nearest) exceeds ``cut`` times the noise there. Connected suspects are something where they cover at least
     ``min_size`` squared at more than ``min_height`` times the noise; the rest is an edge, a crumb or a reflection, and
-    counts as table. So does what is below it by less than ``distance``, or than the cut where that is more.
+    counts as table. So does what is below it, unless by more than ``distance`` and, by medians, than the cut.
+
+    A measured surface is not believed where half of what lies within its noise is clutter that crosses it, or where the
+    noise is more than a depth camera has: 2 % of the way to it, ``max_noise``, or ``distance`` itself where the
+    viewpoint is not known. Then the table is what is nearer than ``distance`` to the plane as given, on both sides;
+    heights are over that plane, and its noise is NaN.
 
     Args:
         points: the clouds, in any unit of length.
         ptr: row pointers.
         planes: (B, 4), one per cloud, as :func:`supporting_plane` finds them; normals toward what stands on them.
-        distance: where the table is looked for at first; its noise may be more.
+        distance: where the table is looked for at first; what a viewpoint explains may be more.
         viewpoint: where the sensor stood, (3,), (B, 3), or (N, 3) for every point; None = the same noise everywhere.
         cut: standard deviations of single points; medians vary by less than half as much.
         min_height: standard deviations that something must rise to.
         min_size: edge of a square as large as what it must cover.
+        max_noise: the most standard deviation of 1 / distance from the viewpoint that is believed; None = any.
         grid: the depth image the points still lie on; it says which points are around a point and which are connected.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
@@ -168,17 +172,22 @@ def table_surface(
     reach = points.new_ones(len(points), dtype=torch.float64)
     if viewpoint is not None:
         reach = (points.double() - viewpoint).norm(dim=1).clamp(min=distance)
-    height, noise, typical, sides = [], [], [], []
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
-        own, sigma, far = _heights(points[start:stop], reach[start:stop], planes[b], distance, f"cloud {b}")
-        height.append(own)
-        noise.append(sigma)
-        typical.append(far)
+    fits, sides = [], []
+    for b, (start, stop) in enumerate(_bounds(ptr)):
+        fits.append(fit_surface(points[start:stop], reach[start:stop], planes[b], distance, f"cloud {b}"))
         sides.append(math.nan)
         if viewpoint is not None and stop > start:
-            side = abs(float((viewpoint[start:stop] @ planes[b, :3] + planes[b, 3]).median()))
-            sides[-1] = side if side > distance else math.nan
-    heights, sigmas = torch.cat(height), torch.tensor(noise, dtype=torch.float64, device=points.device)
+            aside = abs(float((viewpoint[start:stop] @ planes[b, :3] + planes[b, 3]).median()))
+            sides[-1] = aside if aside > distance else math.nan
+    heights = torch.cat([fit.height for fit in fits])
+    sigmas, typical, clutter, side = (
+        torch.tensor(values, dtype=torch.float64, device=points.device)
+        for values in (*zip(*((fit.noise, fit.typical, fit.clutter) for fit in fits)), sides)
+    )
+    worst = distance if viewpoint is None else _WORST_NOISE
+    believed = (clutter <= _MOST_CLUTTER) & (sigmas <= worst)
+    if max_noise is not None:
+        believed &= ~(sigmas / side > max_noise)  # NaN is not known to be more
     cloud = cloud_of_rows(ptr)
     rise = window_medians((heights / (sigmas[cloud] * reach)).float(), points, ptr, grid, backend=backend)
     suspect = rise > cut
@@ -188,88 +197,33 @@ def table_surface(
     covered = torch.zeros(num_parts, dtype=torch.float64, device=points.device).index_add_(0, part, high.double())
     something = torch.zeros_like(suspect)
     something[suspect] = (covered >= min_size**2)[part]
-    below = heights < -torch.clamp(cut * sigmas[cloud] * reach, min=distance)
+    below = (rise < -cut) & (heights < -distance)
     table = ~(something | below)
-    refitted = fit_planes(points, ptr, table, backend=backend).to(points.device)
-    refitted = torch.where(refitted[:, :1].isnan(), planes, refitted)  # those of a line
+    own = table & (heights.abs() < cut * sigmas[cloud] * reach)
+    if not bool(believed.all()):
+        x, y, z = points.double().unbind(1)
+        nx, ny, nz, offset = planes[cloud].unbind(1)
+        over_plane = ((nx * x + ny * y) + nz * z) + offset
+        heights = torch.where(believed[cloud], heights, over_plane)
+        table = torch.where(believed[cloud], table, over_plane.abs() < distance)
+        own = torch.where(believed[cloud], own, table)
+    refitted = fit_planes(points, ptr, own, backend=backend).to(points.device)
+    # Those of a line stay, and those that are not believed.
+    refitted = torch.where(believed[:, None] & ~refitted[:, :1].isnan(), refitted, planes)
     turned = (refitted[:, :3] * planes[:, :3]).sum(1, keepdim=True) < 0
     return TableSurface(
         table,
+        own,
         heights.float(),
-        sigmas * torch.tensor(typical, dtype=torch.float64, device=points.device),
-        sigmas / torch.tensor(sides, dtype=torch.float64, device=points.device),
+        torch.where(believed, sigmas * typical, math.nan),
+        torch.where(believed, sigmas / side, math.nan),
         torch.where(turned, -refitted, refitted),
+        believed,
     )
 
 
 def _bounds(ptr: Tensor) -> list[tuple[int, int]]:
     return list(pairwise(ptr.tolist()))
-
-
-def _heights(
-    points: Tensor, reach: Tensor, plane: Tensor, distance: float, where: str
-) -> tuple[Tensor, float, float]:  # (n,) float64, noise, median reach of the table
-    """Return heights above the surface of second order that a cloud's table is, and their noise per unit of reach."""
-    # Sums of columns, in one order: a product of matrices depends on how its library finds them in memory.
-    x, y, z = points.double().unbind(1)
-    nx, ny, nz, offset = plane.unbind()
-    flat_height = ((nx * x + ny * y) + nz * z) + offset
-    flat = [(x * axis[0] + y * axis[1]) + z * axis[2] for axis in plane_axes(plane).unbind(1)]
-    step = max(1, math.ceil(len(points) / _SAMPLE))
-    near = flat_height[::step].abs() < distance
-    if int(near.sum()) < 3:
-        raise NoPlaneError(
-            f"table_surface: {where}: the plane has {int(near.sum())} points nearer than distance={distance:g}; is it "
-            "in the coordinates of the cloud?"
-        )
-    # Beyond the points that it is fitted to, the surface goes on level: parabolas would leave.
-    scaled = []
-    for along in flat:
-        own = along[::step][near]
-        lower, upper = own.min(), own.max()
-        scaled.append(((along - lower) / ((upper - lower) / 2).clamp(min=distance) - 1).clamp(-1, 1))
-    some = [along[::step] for along in scaled]
-    height, weight = flat_height[::step], 1 / reach[::step]
-    typical = float(reach[::step][near].median())
-    least = _LEAST_NOISE * distance / typical
-    surface, sigma = plane.new_zeros(6), math.inf
-    off = height.abs()
-    for _ in range(_ROUNDS):
-        spread = max(float((off * weight)[near].median()) * _MAD, least)
-        surface = _fitted([along[near] for along in some], height[near], weight[near] / spread, distance)
-        off = (height - _on(surface, some)).abs()
-        before, sigma = sigma, max(float((off * weight)[near].median()) * _MAD, least)
-        near = (off * weight < _OWN * sigma) & (off < _MOST_SPREAD * distance)
-        if abs(sigma - before) < 1e-3 * sigma or int(near.sum()) < 3:
-            break
-    return flat_height - _on(surface, scaled), sigma, typical
-
-
-def _fitted(flat: list[Tensor], height: Tensor, weight: Tensor, distance: float) -> Tensor:
-    """Return the six coefficients of the surface that fits weighted heights best.
-
-    A bend of one distance over half the table's length is as likely as not; level and slopes are as good as free.
-    """
-    terms = [weight, *(term * weight for term in _terms(flat))]
-    target = height * weight
-    products = torch.stack([torch.stack([(one * other).sum() for other in terms]) for one in terms])
-    stiff = torch.tensor([1e-6] * 3 + [1.0] * 3, dtype=torch.float64, device=height.device) / distance**2
-    moments = torch.stack([(one * target).sum() for one in terms])
-    return torch.cholesky_solve(moments[:, None], torch.linalg.cholesky(products + torch.diag(stiff)))[:, 0]
-
-
-def _terms(flat: list[Tensor]) -> list[Tensor]:
-    """Return what a surface of second order is made of, besides a constant."""
-    s, t = flat
-    return [s, t, s * s, s * t, t * t]
-
-
-def _on(surface: Tensor, flat: list[Tensor]) -> Tensor:
-    """Return the heights of a surface."""
-    height = surface[0].expand(flat[0].shape)
-    for coefficient, term in zip(surface[1:], _terms(flat)):
-        height = height + coefficient * term
-    return height
 
 
 def point_areas(points: Tensor, ptr: Tensor, grid: ImageGrid | None) -> Tensor:  # (N,) float64
@@ -301,10 +255,24 @@ def _connected(
     own, own_ptr = points[suspect], ptr_after_mask(suspect, ptr)
     if not len(own):
         return own_ptr.new_zeros(0), 0
-    if grid is not None:
-        part = linked_pixels(own, own_ptr, grid.pixel_index[suspect], grid.size, reach, 1, backend=backend)
-    else:
+    if grid is None:
         part = dbscan(own, own_ptr, eps=reach / 2, min_points=1)
+    else:
+        pixel = grid.pixel_index[suspect]
+        part = torch.cat(
+            [
+                linked_pixels(
+                    own[first:last],
+                    own_ptr.new_tensor([0, last - first]),
+                    pixel[first:last],
+                    grid.size,
+                    reach,
+                    1 + is_lined(grid.pixel_index[start:stop], grid.size),
+                    backend=backend,
+                )
+                for (first, last), (start, stop) in zip(_bounds(own_ptr), _bounds(ptr))
+            ]
+        )
     count = torch.stack([one.max() + 1 if len(one) else part.new_zeros(()) for one in part.split(_sizes(own_ptr))])
     offset = torch.cat([count.new_zeros(1), count.cumsum(0)])
     return part + offset[cloud_of_rows(own_ptr)], int(offset[-1])

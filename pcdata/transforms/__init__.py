@@ -29,7 +29,7 @@ from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWo
 from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.object_facts import ObjectFacts, describe_objects, label_image
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
-from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning
+from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning, UnmeasuredTableWarning
 from pcdata.transforms.random_apply import RandomApply, RandomOneOf
 from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_jitter import RandomColorDrop, RandomColorJitter, RandomJitter, RandomPointDropout
@@ -123,6 +123,7 @@ __all__ = [
     "Transform",
     "TurnDepth",
     "Undistort",
+    "UnmeasuredTableWarning",
     "VoxelDownsample",
     "VoxelSample",
     "describe_objects",

@@ -33,6 +33,8 @@ from pcdata.transforms.found_planes import plane_facts
 _LEAST_RISE = math.radians(5)
 # From here on a plane is rather a wall than a table that a pose is wrong about.
 _WALL = math.radians(60)
+# Standard deviation of 1/z, in 1/m, that no depth camera at a table has: seven times a Kinect's, 2 cm at 1 m.
+_WORST_SENSOR = 0.02
 # Up, more or less, of a camera that is held upright, in its own axes (x right, y down, z forward): it looks level or
 # down. A wall that faces it scores low whatever the angle.
 _LIKELY_UP = (0.0, -1.0, -0.3)
@@ -40,6 +42,10 @@ _LIKELY_UP = (0.0, -1.0, -0.3)
 
 class TiltedPlaneWarning(PcdataWarning):
     """A table that is not level: its pose, the stated up, or the choice of the plane is wrong."""
+
+
+class UnmeasuredTableWarning(PcdataWarning):
+    """A table whose own noise could not be measured, so it was cut as a slab."""
 
 
 class RemovePlane(RemoveTransform):
@@ -69,11 +75,13 @@ class RemovePlane(RemoveTransform):
 
     Warns:
         TiltedPlaneWarning: the plane leans away from up by more than ``tilt_alarm``.
+        UnmeasuredTableWarning: what lies about the plane is no table that could be measured, so it is cut as a slab;
+            ``meta["planes"]`` and the history tell so.
     """
 
     runs_statistics = True
     decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
-    version = 3
+    version = 4
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000
@@ -122,14 +130,23 @@ class RemovePlane(RemoveTransform):
             planes=planes,
             distance=self.distance,
             viewpoint=data.viewpoint_per_point(),
+            max_noise=_WORST_SENSOR,
             grid=data.image_grid(),
         )
-        found = {"noise": surface.noise, "disparity_noise": surface.disparity_noise}
-        return {**self._apart(data, surface.planes, surface.table, surface.height), **found}
+        names = ("noise", "disparity_noise", "believed")
+        found = {name: getattr(surface, name) for name in names}
+        return {**self._apart(data, surface.planes, surface.flat, surface.table, surface.height), **found}
 
-    def _apart(self, data: PointCloud, planes: Tensor, own: Tensor, height: Tensor | None = None) -> Params:
+    def _apart(
+        self,
+        data: PointCloud,
+        planes: Tensor,
+        own: Tensor,  # (N,) points of the plane itself
+        gone: Tensor | None = None,  # (N,) what goes with them; None = they alone
+        height: Tensor | None = None,
+    ) -> Params:
         """Say which rows stay beside the points of each cloud's plane, by their height above it."""
-        keep = negated(own)
+        keep = negated(own if gone is None else gone)
         if self.keep != "both":
             for b, plane in enumerate(planes.cpu()):
                 self._require_upper_side(data, b, plane)
@@ -224,11 +241,27 @@ class RemovePlane(RemoveTransform):
             for name in ("noise", "disparity_noise"):
                 if name in params and math.isfinite(value := float(params[name][b])):
                     found[name] = value
+            if "believed" in params:
+                found["cut"] = self.cut if bool(params["believed"][b]) else "slab"
+                self._warn_of_slab(data, b, found["cut"])
             if self.up is not None:
                 found["tilt"] = self._tilt(plane)
                 self._warn_of_tilt(data, b, found["tilt"])
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
         return super().transform(data, params).with_meta(entries)
+
+    def _warn_of_slab(self, data: PointCloud, b: int, cut: str) -> None:
+        """Say that the table could not be measured."""
+        if cut == self.cut:
+            return
+        warnings.warn(
+            f"RemovePlane: cloud {b}{sample_name(data, b)}: cut='measured' found no table to measure: what lies about "
+            "the plane is clutter, or noisier than a depth camera is, so all that is closer to it than "
+            f"distance={self.distance:g} went instead; crop to the table before, or say which plane it is by up and "
+            "max_tilt",
+            UnmeasuredTableWarning,
+            stacklevel=2,
+        )
 
     def _warn_of_tilt(self, data: PointCloud, b: int, tilt: float) -> None:
         """Say by how much a table leans, and what that mostly comes from."""

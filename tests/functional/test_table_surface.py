@@ -133,6 +133,61 @@ def test_heights_are_judged_by_the_lower_median_of_the_pixels_around():
         assert float(found[row]) == around[(len(around) - 1) // 2]
 
 
+def with_clutter(above: int, below: int) -> Tensor:
+    """A level table of 6000 points with a noise of 2 mm, and so many points of walls within 4 cm of its level."""
+    table = rectangle(**TABLE, count=6000, noise=0.002)
+    walls = torch.rand(above + below, 3, generator=seeded(1)) - torch.tensor([0.5, 0.5, 0.0])
+    walls[:, 2] = (walls[:, 2] * 0.04) * torch.cat([torch.ones(above), -torch.ones(below)])
+    return torch.cat([table, walls])
+
+
+def test_clutter_that_crosses_a_table_is_not_its_noise():
+    for side in (0, 3000, 9000):  # 0, a third and the half of what lies within its noise
+        found = table_surface(with_clutter(side, side), planes=LEVEL)
+        assert bool(found.believed[0])
+        assert float(found.noise[0]) == pytest.approx(0.002, rel=0.15)
+    # What is on one side alone may be things that stand on it: it moves the median, but not without limit.
+    found = table_surface(with_clutter(6000, 0), planes=LEVEL)
+    assert 0.0018 < float(found.noise[0]) < 0.004
+
+
+def test_a_surface_that_is_mostly_clutter_is_not_believed_and_the_plane_is_taken_as_given():
+    points = with_clutter(60_000, 60_000)
+    found = table_surface(points, planes=LEVEL)
+    assert not bool(found.believed[0])
+    assert bool((found.table == (points[:, 2].abs() < 0.01)).all())
+    assert torch.equal(found.height, points[:, 2])
+    assert torch.equal(found.planes, LEVEL)
+    assert bool(found.noise.isnan().all())
+
+
+@pytest.mark.parametrize("limit", [0.003, 0.006])
+def test_noise_that_no_sensor_has_is_not_believed(limit):
+    points, _, _ = seen_table(noise=0.004, low=0.05)
+    found = table_surface(points, planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of(), max_noise=limit)
+    assert bool(found.believed[0]) == (limit > 0.004)
+
+
+def test_lines_of_missing_pixels_do_not_make_crumbs_of_things():
+    points, table, _ = seen_table(noise=0.001, low=0.05)
+    pixel = torch.arange(len(points))
+    there = (pixel // SIZE[1] % 4 > 0) & (pixel % SIZE[1] % 5 > 0)
+    found = table_surface(
+        points[there], planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of(pixel[there]), distance=0.01
+    )
+    assert float((found.table != table[there]).float().mean()) < 0.01
+
+
+def test_crumbs_go_with_the_table_and_are_no_part_of_its_surface():
+    points, _, _ = seen_table(noise=0.001, blocks=False)
+    points[5000:5002] *= 0.5
+    found = table_surface(points, planes=FACING, viewpoint=(0.0, 0.0, 0.0), grid=grid_of())
+    assert bool(found.table.all())
+    assert not bool(found.flat[5000:5002].any())
+    assert 0.97 < float(found.flat.float().mean()) < 1
+    torch.testing.assert_close(found.planes, FACING, atol=1e-3, rtol=0)
+
+
 def test_planes_that_are_none_are_refused():
     points = rectangle(**TABLE)
     with pytest.raises(NoPlaneError, match="normal that is not zero"):
