@@ -48,14 +48,14 @@ def region_contacts(
     turn = normal[b] - normal[a]
     angle = torch.where(found[a] & found[b], length(turn), 0.0)
     lean = dot(turn, mean[b] - mean[a])
-    concave = torch.where(lean < 0, angle, 0.0)
+    concave, convex = torch.where(lean < 0, angle, 0.0), torch.where(lean > 0, angle, 0.0)
     half_down = torch.where(second - first == 1, 0.0, 0.5).to(torch.float64)
     half_right = 0.5 - half_down
     step = (middle[a] + right[a] * half_right) + down[a] * half_down
     step = step - ((middle[b] - right[b] * half_right) - down[b] * half_down)
     gap = step.abs() / noise
     bent = (concave - limits.angle_from) / (limits.angle_full - limits.angle_from)
-    apart = (gap - limits.gap_from) / (limits.gap_full - limits.gap_from)
+    apart = (gap / torch.where(convex > limits.rim, 2.0, 1.0) - limits.gap_from) / (limits.gap_full - limits.gap_from)
     return Contacts(first, second, torch.maximum(bent, apart).clamp(0, 1))
 
 

@@ -49,6 +49,9 @@ class Limits(NamedTuple):
     gap_full: float = 9.4
     # Square metres: a region's smooth inside covers 1.6 cm2; 60 pixels of a Kinect at 0.85 m.
     seed_area: float = 1.6e-4
+    # Only contacts look at it. Over an edge that is convex by 25 degrees a step must be twice as large: windows of few
+    # pixels reach over rims and edges, and the planes fitted there miss each other.
+    rim: float = chord(25)
 
 
 # Levels of creases that regions are flooded through, from smooth to full.
