@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,27 @@ def _store(kind: str, pattern: str) -> tuple[str, Callable[[Path], Any]]:
     return f"ds/shards/00000/{pattern}", read
 
 
+def _at_url(pattern: str) -> tuple[str, Callable[[Path], Any]]:
+    """Stream the dataset from a server, which gives its bytes in ranges."""
+
+    def read(folder: Path) -> Any:
+        import fsspec
+
+        from pcdata import CachedCloudDataset, StreamedCloudDataset
+        from pcdata.io.store import url_dataset
+
+        for known in url_dataset._FETCHED.values():  # the small files too are to be asked for again
+            shutil.rmtree(known, ignore_errors=True)
+        url_dataset._FETCHED.clear()
+        server = fsspec.filesystem("memory")
+        server.store.clear()
+        server.put(f"{folder / 'ds'}/", "/bucket/set/", recursive=True)
+        stream = StreamedCloudDataset(CachedCloudDataset("memory://bucket/set"), batch_size=2, shuffle_buffer=0)
+        return [_told(cloud) for batch in stream for cloud in batch]
+
+    return f"ds/{pattern}", read
+
+
 def _foreign(pattern: str, *names: str) -> tuple[str, Callable[[Path], Any]]:
     """Read the first of the names that the file has."""
 
@@ -171,6 +193,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "depth_png": _depth("*.png"),
     "depth_tiff": _depth("*.tiff"),
     "h5_dataset": ("ds/shards/00000/clouds.h5", _dataset),
+    "h5_store": _store("hdf5", "clouds.h5"),
     "h5_foreign": _foreign("*.h5", "pc", "data/pc"),
     "intrinsics_json": _capture("cap/intrinsics.json"),
     "label_png": _image("labels", "*.png"),
@@ -180,6 +203,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "meta_mat": ("meta.mat", _meta),
     "npy_foreign": _foreign("*.npy", ""),
     "npz_dataset": ("ds/shards/00000/clouds/*.npz", _dataset),
+    "npz_store": _store("npz", "clouds/*.npz"),
     "npz_foreign": _foreign("*.npz", "pc"),
     "pcd_ascii": _cloud("pcd"),
     "pcd_binary": _cloud("pcd"),
@@ -194,6 +218,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "pose_npy": _capture("cap/poses/*.npy"),
     "pose_txt": _capture("cap/poses/*.txt"),
     "pt_dataset": ("ds/shards/00000/clouds/*.pt", _dataset),
+    "pt_store": _store("pt", "clouds/*.pt"),
     "robomimic_hdf5": _recording("*.hdf5"),
     "robot_poses_csv": _robot("*.csv"),
     "robot_poses_yaml": _robot("*.yaml"),
@@ -202,12 +227,14 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "tsdf_npz": ("v.npz", _volume),
     "webdataset_dataset": ("ds/shards/00000/*.tar", _joined_dataset),
     "webdataset_store": _store("webdataset", "*.tar"),
+    "webdataset_stream": _at_url("shards/00000/*.tar"),
+    "webdataset_url": _at_url("**/*[nvy]"),  # .json, .tsv, .npy: what is fetched when it is opened
     "zarr_foreign": _foreign("a.zarr/data/pc/*", "data/pc"),
 }
 
 # Formats that unpack: a small file may stand for much more.
 PACKED = {
     "bag", "color_jpg", "color_png", "confidence_png", "depth_png", "depth_tiff", "h5_dataset", "h5_foreign",
-    "label_png", "maniskill_h5", "mask_png", "meta_mat", "npz_dataset", "npz_foreign", "pcd_binary_compressed",
-    "robomimic_hdf5", "zarr_foreign",
+    "h5_store", "label_png", "maniskill_h5", "mask_png", "meta_mat", "npz_dataset", "npz_foreign", "npz_store",
+    "pcd_binary_compressed", "robomimic_hdf5", "zarr_foreign",
 }  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import struct
@@ -122,7 +123,11 @@ def _write_datasets(folder: Path) -> None:
             made = _new(folder, f"{kind}_dataset", "compact" if compact else "plain")
             text = f"depth: [Deproject]\noutput: {{format: {kind}, compact: {str(compact).lower()}}}\n"
             build_dataset(config_from_yaml(text), _TwoCaptures(), made / "ds")
+    for kind in ("npz", "h5", "pt", "packed", "webdataset"):
         shutil.copytree(folder / f"{kind}_dataset", folder / f"{kind}_store")
+    if importlib.util.find_spec("fsspec") is not None:
+        for kind in ("stream", "url"):
+            shutil.copytree(folder / "webdataset_dataset", folder / f"webdataset_{kind}")
     for reader in ("manifest", "dataset_index", "shard_table"):
         shutil.copytree(folder / "npz_dataset" / "none", folder / reader / "npz")
 

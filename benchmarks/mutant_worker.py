@@ -87,6 +87,7 @@ def work(reader: str, seeds: list[str], first: int, last: int, seed: int, floor:
     """Read mutants one after another and write a line of JSON for each; the parent watches."""
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as scratch:
+        tempfile.tempdir = scratch  # this process ends without what readers delete at their end
         copies = []
         for index, folder in enumerate(forms(reader, [Path(path) for path in seeds])):
             shutil.copytree(folder, Path(scratch) / str(index))

@@ -35,12 +35,15 @@ class ProgressBar:
             raise KeyboardInterrupt
         is_first = self.done_before < 0
         if is_first:
-            self.done_before = done - 1
+            self.done_before = max(done - 1, 0)
+            if not done:  # told when the work begins
+                self.started = time.perf_counter()
         if not sys.stderr.isatty():
             now = time.perf_counter()
             if is_first or done >= total or now - self.told >= _SELDOM:
                 self.told = now
-                print(f"{self.what} {done}/{total} {sample_id} {self._speed(done, total, now)}", file=sys.stderr)
+                words = [f"{self.what} {done}/{total}", sample_id, self._speed(done, total, now)]
+                print(" ".join(word for word in words if word), file=sys.stderr)
             return
         if self.bar is None:
             from tqdm import tqdm
@@ -67,6 +70,8 @@ class ProgressBar:
         """Return the seconds so far, the rate, and the time left at that rate."""
         seconds = now - self.started
         rate = (done - self.done_before) / max(seconds, 1e-9)
+        if done == self.done_before:
+            return ""
         left = "" if done >= total or rate <= 0 else f", {_in_words((total - done) / rate)} left"
         return f"{seconds:.1f} s, {rate:.3g}/s{left}"
 

@@ -90,8 +90,8 @@ def _split(arguments: argparse.Namespace) -> int:
             _write_card(arguments.dataset)
     if arguments.no_check:
         return 0
-    with ProgressBar("leaks") as progress:
-        report = check_leaks(arguments.dataset, path=arguments.file, progress=progress)
+    with ProgressBar("leaks") as progress, ProgressBar("compare", unit="pair") as comparing:
+        report = check_leaks(arguments.dataset, path=arguments.file, progress=progress, comparing=comparing)
     print(f"\n{leaks_text(report)}")
     return int(not report.is_clean)
 

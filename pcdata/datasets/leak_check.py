@@ -17,8 +17,8 @@ from pcdata.datasets.near_duplicates import (
     candidates,
     descriptor,
     duplicate_distance,
-    thinned_rows,
-    thinning,
+    thinned,
+    thinnings,
 )
 from pcdata.datasets.splits import Splits
 from pcdata.errors import ConfigError
@@ -53,7 +53,13 @@ class LeakReport:
         return not self.leaks and not self.episodes
 
 
-def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress: Progress | None = None) -> LeakReport:
+def check_leaks(
+    folder: str | Path,
+    *,
+    path: str | Path | None = None,
+    progress: Progress | None = None,
+    comparing: Progress | None = None,
+) -> LeakReport:
     """Look for near duplicates across the splits of a dataset: copies, also shuffled, thinned out, noisy or moved.
 
     Every cloud is read once for its descriptor, and again where another split has one that is nearly alike; memory
@@ -63,6 +69,7 @@ def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress:
         folder: the dataset.
         path: of the splits; None = in the dataset.
         progress: called after every cloud that was read for its descriptor.
+        comparing: called when there are pairs to compare point by point, and after each with the id of its first.
 
     Raises:
         CacheError: the dataset or its splits are damaged, or do not fit together.
@@ -75,25 +82,24 @@ def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress:
         raise ConfigError(f"split: {folder} has the one split {splits.names[0]!r}, which shares nothing with another")
     part_of = splits.part_of()
     parts = [np.array([row for row, one in enumerate(ids) if part_of[one] == name], np.int64) for name in splits.names]
-    descriptors = np.zeros((len(ids), SIZE), np.float32)
-    counts = np.zeros(len(ids), np.int64)
-    unit, too_small = "m", []
+    counts = dataset.manifest.index.num_points
+    draw = seeded(0)
+    times = thinned(counts, draw)
+    descriptors, halves, unit = np.zeros((len(ids), SIZE), np.float32), [np.zeros((0, SIZE), np.float32)], "m"
     for row, sample_id in enumerate(ids):
         cloud = dataset._load(row)
         unit = str(cloud.unit)
-        points = cloud.points.numpy()
-        counts[row] = len(points)
-        if len(points) < FEWEST:
-            too_small.append(sample_id)
-        descriptors[row] = descriptor(points.astype(np.float64))
+        points = cloud.points.numpy().astype(np.float64)
+        descriptors[row] = descriptor(points)
+        halves += [one[None] for one in thinnings(points, int(times[row]), draw)]
         if progress is not None:
             progress(row + 1, len(ids), sample_id)
-    draw = seeded(0)
-    thinnings = [thinning(_points(dataset, row), draw) for row in thinned_rows(counts, draw).tolist()]
-    leaks, compared = [], 0
+    pairs = [*candidates(descriptors, counts, parts, np.concatenate(halves))]
+    if comparing is not None and pairs:
+        comparing(0, len(pairs), "")
+    leaks = []
     kept: tuple[int, Surface] | None = None  # a cloud is compared with several others in a row
-    for row, other in candidates(descriptors, counts, parts, np.array(thinnings).reshape(-1, SIZE)):
-        compared += 1
+    for number, (row, other) in enumerate(pairs):
         points = _points(dataset, other)
         if kept is None or kept[0] != row:
             kept = row, Surface(_points(dataset, row), unit == "m")
@@ -103,7 +109,10 @@ def check_leaks(folder: str | Path, *, path: str | Path | None = None, progress:
         distance = duplicate_distance(points, surface)
         if distance is not None:
             leaks.append(Leak(ids[row], ids[other], (part_of[ids[row]], part_of[ids[other]]), distance))
-    return LeakReport(leaks, _torn_episodes(dataset, part_of), len(ids), compared, too_small, unit)
+        if comparing is not None:
+            comparing(number + 1, len(pairs), ids[row])
+    too_small = [ids[row] for row in np.flatnonzero(counts < FEWEST).tolist()]
+    return LeakReport(leaks, _torn_episodes(dataset, part_of), len(ids), len(pairs), too_small, unit)
 
 
 def _points(dataset: CachedCloudDataset, row: int) -> NDArray[np.float64]:

@@ -51,6 +51,7 @@ _BESIDE = 3.0  # distances of neighbors: how far beside a point the next one of 
 # Of points of which one in n is kept, none of the next 6 n is with a chance of exp(-6), far below what may be missing.
 _KEPT, _COUNTED = 6.0, 24
 _MOST = 2048  # points of a cloud that are looked up
+_DESCRIBED = 4096  # points that a cloud is described by: more of them make few candidates fewer
 _ALIGNED = 192  # points that are brought onto the other cloud
 _STEPS = 24  # of the alignment, at most
 _SNAPS = 4  # times that what is nearly aligned is judged on the way
@@ -60,21 +61,25 @@ _FIT = 8  # neighbors that a local plane is fitted to
 
 def descriptor(points: Points) -> NDArray[np.float32]:  # (SIZE,)
     """Return what is alike for near duplicates; all zero where there are too few points."""
-    return _described(points) if len(points) >= FEWEST else np.zeros(SIZE, np.float32)
+    return _described(_some(points, _DESCRIBED)) if len(points) >= FEWEST else np.zeros(SIZE, np.float32)
 
 
-def thinning(points: Points, draw: torch.Generator) -> NDArray[np.float32]:  # (SIZE,)
-    """Return how the descriptor of a random half of a cloud differs, for points whose noise is 1."""
-    half = points[torch.randperm(len(points), generator=draw, device="cpu").numpy()[: len(points) // 2]]
-    return np.asarray((_described(half) - _described(points)) * np.sqrt(len(points)), np.float32)
+def thinnings(points: Points, count: int, draw: torch.Generator) -> list[NDArray[np.float32]]:  # of (SIZE,)
+    """Return how the descriptors of so many random halves of a cloud differ, for points whose noise is 1."""
+    points = _some(points, _DESCRIBED)
+    whole, size = descriptor(points), len(points)
+    halves = [points[torch.randperm(size, generator=draw, device="cpu").numpy()[: size // 2]] for _ in range(count)]
+    return [np.asarray((_described(half) - whole) * np.sqrt(size), np.float32) for half in halves]
 
 
-def thinned_rows(counts: NDArray[np.int64], draw: torch.Generator) -> NDArray[np.int64]:
-    """Return which clouds :func:`thinning` should be asked of, some several times where they are few."""
+def thinned(counts: NDArray[np.int64], draw: torch.Generator) -> NDArray[np.int64]:  # (N,)
+    """Return how many :func:`thinnings` should be asked of each cloud: several where clouds are few."""
     filled = np.flatnonzero(counts >= FEWEST)
     if 0 < len(filled) < _HALVES:
-        return np.sort(np.resize(filled, _HALVES))
-    return np.sort(filled[torch.randperm(len(filled), generator=draw, device="cpu").numpy()[:_HALVES]])
+        rows = np.resize(filled, _HALVES)
+    else:
+        rows = filled[torch.randperm(len(filled), generator=draw, device="cpu").numpy()[:_HALVES]]
+    return np.bincount(rows, minlength=len(counts))
 
 
 def _described(points: Points) -> NDArray[np.float32]:
@@ -102,15 +107,16 @@ def candidates(
     descriptors: NDArray[np.float32],  # (N, SIZE)
     counts: NDArray[np.int64],  # (N,) points
     parts: Sequence[NDArray[np.int64]],  # rows of each part
-    thinnings: NDArray[np.float32],  # (M, SIZE)
+    halves: NDArray[np.float32],  # (M, SIZE) of thinnings
 ) -> Iterator[tuple[int, int]]:
     """Yield pairs of rows of different parts that could be near duplicates, those of the smaller part in turn."""
     filled = [part[counts[part] >= FEWEST] for part in parts]
+    counts = np.minimum(counts, _DESCRIBED)
     known = np.concatenate(filled)
     if not len(known):
         return
     spaces = [
-        (_compared(descriptors[:, :size], known, thinnings[:, :size], most), count, share)
+        (_compared(descriptors[:, :size], known, halves[:, :size], most), count, share)
         for size, most, count, share in _SPACES
     ]
     order = sorted(range(len(filled)), key=lambda number: len(filled[number]))
@@ -126,14 +132,12 @@ def candidates(
             yield from sorted(pairs)
 
 
-def _compared(
-    values: NDArray[Any], known: NDArray[np.int64], thinnings: NDArray[Any], most: int
-) -> NDArray[np.float64]:
+def _compared(values: NDArray[Any], known: NDArray[np.int64], halves: NDArray[Any], most: int) -> NDArray[np.float64]:
     """Return descriptors along the directions that tell clouds from copies best, where copies differ by 1."""
     from scipy.linalg import eigh
 
-    values, thinnings = values.astype(np.float64), thinnings.astype(np.float64)
-    within = thinnings.T @ thinnings / len(thinnings)
+    values, halves = values.astype(np.float64), halves.astype(np.float64)
+    within = halves.T @ halves / len(halves)
     within[np.diag_indices_from(within)] *= 1 + _RIDGE
     within[np.diag_indices_from(within)] += _LEAST_NOISE
     centered = values[known] - values[known].mean(0)
