@@ -122,6 +122,18 @@ class VolumeTooLargeError(PcdataError, MemoryError):
     """A volume would need more memory than it was allowed."""
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Say whether the memory of the machine did not suffice: Python's error, or what PyTorch raises in its place.
+
+    Its allocator for the CPU raises a plain ``RuntimeError``, which its text alone tells (c10/core/impl/alloc_cpu.cpp).
+    """
+    if isinstance(error, PcdataError):  # a limit that somebody set, or told in words
+        return False
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    return isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error)
+
+
 class BackendError(PcdataError, RuntimeError):
     """A named backend is absent or cannot keep the contract for this call."""
 

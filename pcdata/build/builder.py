@@ -21,6 +21,7 @@ from pcdata.build.shard_work import Job
 from pcdata.build.source_state import captures_digest
 from pcdata.build.tally import Tally, all_failed, most_bad
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
+from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note
 from pcdata.files.urls import is_in_process, is_url, path_of
 from pcdata.io.sources.capture_source import CaptureSource, check_apart, checked_ids, episodes_of, skipped_of
@@ -254,11 +255,13 @@ def _finished(job: Job, shards: range, note: Note, *, retry_quarantined: bool) -
         del done[shard]
         job.folder.forget(shard)
     if bad:
-        note(f"{len(bad)} finished shards are built anew, to try their quarantined captures again")
+        note(f"built anew: {counted(len(bad), 'finished shard')}, to try their quarantined captures again")
     elif doubtful:
-        note(f"{len(doubtful)} finished shards are built anew, since captures of them ran out of memory or time")
+        note(
+            f"built anew: {counted(len(doubtful), 'finished shard')}, since captures of them ran out of memory or time"
+        )
     if changed:
-        note(f"{len(changed)} finished shards are built anew, since a file of their captures has changed")
+        note(f"built anew: {counted(len(changed), 'finished shard')}, since a file of their captures has changed")
     if mine := [shard for shard in shards if shard in done]:
         note(f"{len(mine)} of {len(shards)} shards were finished before")
     return done

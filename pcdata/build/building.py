@@ -23,6 +23,7 @@ from pcdata.build.plan import FILE_NAME as PLAN
 from pcdata.build.plan import Plan
 from pcdata.build.records import ShardRecord
 from pcdata.errors import CacheError
+from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note
 
 RECORDS, SHARDS = "records", "shards"
@@ -125,9 +126,9 @@ class Building(ABC):
     def _refused(self, different: Sequence[str], num_finished: int) -> CacheError:
         """Return the error of a build that is refused for another that is unfinished."""
         return CacheError(
-            f"{self.target}: an unfinished build with {num_finished} finished shards is there ({self.kept_at}), which "
-            f"differs in its {', '.join(different)}; finish it with its own settings, choose another {self.place}, or "
-            "start over, which deletes it: --restart"
+            f"{self.target}: an unfinished build with {counted(num_finished, 'finished shard')} is there "
+            f"({self.kept_at}), which differs in its {', '.join(different)}; finish it with its own settings, choose "
+            f"another {self.place}, or start over, which deletes it: --restart"
         )
 
     @abstractmethod

@@ -23,6 +23,7 @@ from pcdata.build.records import ShardRecord
 from pcdata.errors import CacheError, write_fault
 from pcdata.files.interrupts import shielded
 from pcdata.files.opening import read_bytes
+from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note, claimed, hidden_folder, living_claims, scratch_beside
 from pcdata.files.syncing import sync_folder, sync_tree
 from pcdata.files.whole_folders import check_replaceable, prepared, put_into_place
@@ -116,7 +117,7 @@ class BuildingFolder(Building):
                 raise self._refused(different, records)
             self._empty()
             if records:
-                note(f"deleted the {records} finished shards of an unfinished build of {self.target}")
+                note(f"deleted {counted(records, 'finished shard')} of an unfinished build of {self.target}")
         write_json(self.path / PLAN, plan.to_json())
 
     def _plan_there(self) -> bytes | None:

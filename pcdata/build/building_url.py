@@ -33,6 +33,7 @@ from pcdata.build.records import MOST_BYTES as MOST_RECORD
 from pcdata.build.records import ShardRecord
 from pcdata.errors import CacheError
 from pcdata.files.interrupts import shielded
+from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note, scratch_beside
 from pcdata.files.strict_json import json_object
 from pcdata.files.url_writing import WritableUrl
@@ -67,12 +68,12 @@ class BuildingUrl(Building):
         sizes = self.target.sizes()
         if not sizes or self._placing.begun() is not None:
             return
-        if not overwrite:
-            raise CacheError(f"{self.target} exists already; choose another URL, or allow overwriting (--overwrite)")
         if DATASET not in sizes:
             raise CacheError(f"{self.target} is not a pcdata dataset, so it is not overwritten; choose another URL")
         with tempfile.TemporaryDirectory(prefix="pcdata-") as folder:
             told_foreign(self.target, foreign_names(sizes, Path(folder), self._placing.manifest(Path(folder))))
+        if not overwrite:
+            raise CacheError(f"{self.target} exists already; choose another URL, or allow overwriting (--overwrite)")
 
     def prepared(self, overwrite: bool, note: Note) -> object:
         self.check_target(overwrite)
@@ -132,7 +133,7 @@ class BuildingUrl(Building):
                 )
             left = self.kept_at.sizes()
             if records := [name for name in left if name.startswith(f"{RECORDS}/")]:
-                note(f"deleted the {len(records)} finished shards of an unfinished build of {self.target}")
+                note(f"deleted {counted(len(records), 'finished shard')} of an unfinished build of {self.target}")
             self.kept_at.remove(left)
         elif different:
             records = [name for name in self.kept_at.sizes() if name.startswith(f"{RECORDS}/")]

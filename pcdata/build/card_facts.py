@@ -12,6 +12,7 @@ from pcdata.build.card_answers import UNKNOWN, CardAnswers
 from pcdata.build.origins import OTHERS
 from pcdata.datasets.splits import FILE_NAME as SPLITS
 from pcdata.datasets.splits import Splits
+from pcdata.files.sample_names import counted
 from pcdata.io.store.cloud_record import cloud_from_record
 from pcdata.io.store.manifest import FILE_NAME, Manifest
 from pcdata.io.store.shards import Shards, hash_of
@@ -68,8 +69,9 @@ class CardFacts:
             return self.answers.description
         fields = ", ".join(self.first.fields())
         return (
-            f"{len(self.manifest.samples):,} samples of point clouds ({fields}) in the frame {self.first.frame_id} "
-            f"[{self.first.unit}], made by pcdata {self.manifest.versions.get('pcdata', UNKNOWN)}."
+            f"{counted(len(self.manifest.samples), 'sample')} of point clouds ({fields}) in the frame "
+            f"{self.first.frame_id} [{self.first.unit}], "
+            f"made by pcdata {self.manifest.versions.get('pcdata', UNKNOWN)}."
         )
 
     @property
@@ -90,7 +92,7 @@ class CardFacts:
             counts[words] = counts.get(words, 0) + int(origin.get("samples", 0))
         if len(counts) < 2:
             return next(iter(counts), UNKNOWN)
-        return "; ".join(f"{words} ({count:,} samples)" for words, count in counts.items())
+        return "; ".join(f"{words} ({counted(count, 'sample')})" for words, count in counts.items())
 
     def missing(self) -> list[str]:
         """Name what is not known, each with the way to say it."""

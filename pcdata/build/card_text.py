@@ -10,7 +10,8 @@ from typing import Any
 
 from pcdata.build.card_answers import UNKNOWN
 from pcdata.build.card_facts import CardFacts
-from pcdata.build.origins import OTHERS, counted
+from pcdata.build.origins import OTHERS, joined
+from pcdata.files.sample_names import counted
 from pcdata.validation.step_losses import PERCENTILES
 from pcdata.yaml_nodes import yaml_text
 
@@ -140,7 +141,7 @@ def _coordinates(facts: CardFacts) -> list[str]:
 
 def _by_frames(facts: CardFacts) -> list[dict[str, Any]]:
     """Return the origins of the samples, whatever they say of sensor and depth."""
-    return counted(
+    return joined(
         {name: value for name, value in origin.items() if name not in ("sensor", "depth")}
         for origin in facts.manifest.origins
     )
@@ -173,7 +174,7 @@ def _splits(facts: CardFacts) -> list[str]:
 def _left_out(facts: CardFacts) -> list[str]:
     parts = ["## Left out"]
     for word, left in (("dropped", facts.manifest.skipped), ("quarantined", facts.manifest.quarantined)):
-        parts.append(f"{len(left):,} captures were {word}{'.' if not left else ':'}")
+        parts.append(f"{word.capitalize()}: {counted(len(left), 'capture')}.")
         if left:
             rows = [*itertools.islice(left.items(), _SHOWN)]
             parts.append(_table(("capture", "why"), rows))
@@ -189,8 +190,8 @@ def _files(facts: CardFacts) -> list[str]:
         raw = "stay in the source, under the ids of the samples"
     words = (
         f"Clouds are stored as {as_markdown(manifest.format)}, compression {as_markdown(manifest.compression)}, in "
-        f"{manifest.index.num_shards:,} shards; depth images, color and calibration {raw}. `python load.py` loads them "
-        "batch by batch, `pcdata verify` hashes every file again."
+        f"{counted(manifest.index.num_shards, 'shard')}; depth images, color and calibration {raw}. `python load.py` "
+        "loads them batch by batch, `pcdata verify` hashes every file again."
     )
     return ["## Files", words]
 

@@ -52,7 +52,7 @@ def _depth(provenance: Mapping[str, Any]) -> str:
     return ""
 
 
-def counted(origins: Iterable[Origin]) -> list[dict[str, Any]]:
+def joined(origins: Iterable[Origin]) -> list[dict[str, Any]]:
     """Join equal origins, with their number as ``samples``, in the order in which they first come."""
     kinds: dict[str, dict[str, Any]] = {}
     for origin in origins:
@@ -64,7 +64,7 @@ def counted(origins: Iterable[Origin]) -> list[dict[str, Any]]:
 
 def commonest(origins: Iterable[Origin]) -> list[dict[str, Any]]:
     """Join equal origins; of more than 50 kinds the rest is one entry: ``others``, their number, and ``samples``."""
-    kinds = counted(origins)
+    kinds = joined(origins)
     kept = {id(kind) for kind in sorted(kinds, key=lambda kind: -kind["samples"])[:_MOST]}
     rest = [kind["samples"] for kind in kinds if id(kind) not in kept]
     shown = [kind for kind in kinds if id(kind) in kept]

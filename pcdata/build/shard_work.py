@@ -17,11 +17,11 @@ from typing import Protocol
 from pcdata.build.building import SHARD, SIGNALS, Building
 from pcdata.build.capture_work import CaptureWork, keep_raw
 from pcdata.build.config import BuildConfig
-from pcdata.build.origins import Origin, counted
+from pcdata.build.origins import Origin, joined
 from pcdata.build.plan import Plan
 from pcdata.build.records import BuiltSample, ShardRecord
 from pcdata.build.source_state import captures_digest
-from pcdata.errors import DTypeError, FrameError, ShapeError, add_note
+from pcdata.errors import DTypeError, FrameError, ShapeError, add_note, is_out_of_memory
 from pcdata.files.inputs import Inputs
 from pcdata.imports import ImportedFile, imported_files
 from pcdata.io.sources.capture_source import CaptureSource, inputs_of
@@ -114,7 +114,7 @@ class _ShardWork:
                     {name: self.quarantined[name] for name in order},
                     told,
                     folder.sizes_on_disk(scratch / SHARD),
-                    counted(self.origins),
+                    joined(self.origins),
                 )
                 folder.commit(scratch, record)
                 return record
@@ -175,7 +175,8 @@ def error_in_words(error: BaseException) -> str:
     """Return what a record says of an error: its type, the step that raised it, and its first line."""
     lines = str(error).splitlines()
     step = getattr(error, "step", None)
-    head = f"{type(error).__name__} in {step}" if step else type(error).__name__
+    kind = MemoryError.__name__ if is_out_of_memory(error) else type(error).__name__
+    head = f"{kind} in {step}" if step else kind
     return f"{head}: {lines[0]:.500}" if lines else head
 
 

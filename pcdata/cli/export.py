@@ -78,6 +78,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from pcdata.exports.export_record import FILE_NAME
     from pcdata.exports.export_source import is_built
     from pcdata.exports.targets import target_named
+    from pcdata.files.sample_names import counted
     from pcdata.report.inspection_text import skipped_text
 
     options: dict[str, Any] = dict(arguments.set)
@@ -122,9 +123,9 @@ def _export(arguments: argparse.Namespace) -> None:
             **options,
         )
     kept = f", {report.kept} were there" if report.kept else ""
-    print(f"export  {report.folder}  ({report.target}: {report.written} samples written{kept})")
+    print(f"export  {report.folder}  ({report.target}: {counted(report.written, 'sample')} written{kept})")
     if report.left_out:
-        print(skipped_text(report.left_out, "samples", FILE_NAME))
+        print(skipped_text(report.left_out, "sample", FILE_NAME))
     for note in report.notes:
         print(f"note    {note}")
 

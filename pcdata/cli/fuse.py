@@ -44,6 +44,7 @@ def add_to(commands: Any) -> None:
 
 def _fuse(arguments: argparse.Namespace) -> None:
     out = _checked_target(arguments)  # before the work, not after
+    from pcdata.files.sample_names import counted
     from pcdata.io import write_ply, write_volume
     from pcdata.io.sources.capture_source import check_apart
     from pcdata.structures import TSDFVolume
@@ -73,7 +74,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
         cloud = volume.extract_points(min_weight=least)
         write_ply(out, cloud)
         what = f"cloud of {cloud.num_points:,} points"
-    views = f"{volume.num_views} views of {len(source)} captures"
+    views = f"{counted(volume.num_views, 'view')} of {counted(len(source), 'capture')}"
     print(f"fuse  {out}  ({what} in frame {volume.frame_id!r}, from {views})")
 
 

@@ -15,7 +15,7 @@ from pcdata.cli.printable import printable_output
 from pcdata.cli.signals import signals_interrupt
 from pcdata.cli.threads import wait_asleep
 from pcdata.cli.warning_lines import warnings_in_one_line
-from pcdata.errors import ConfigError, PcdataError, near_matches
+from pcdata.errors import ConfigError, PcdataError, is_out_of_memory, near_matches
 
 _NOTHING_LEFT = "nothing half-written was left behind"
 
@@ -65,10 +65,12 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:  # "pcdata inspect ... | head" has read enough
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the flush at exit
         return 0
-    except (OSError, MemoryError) as error:
-        if arguments.debug or signals.current.first is not None:
+    except (OSError, MemoryError, RuntimeError) as error:
+        starved = is_out_of_memory(error)
+        if arguments.debug or signals.current.first is not None or not (starved or isinstance(error, OSError)):
             raise
-        print(f"pcdata: {error if str(error) else 'not enough memory'}", file=sys.stderr)
+        told = str(error).splitlines()[0] if str(error) else ""
+        print(f"pcdata: {'not enough memory: ' * starved}{told}".removesuffix(": "), file=sys.stderr)
         return 1
     return verdict or 0
 
@@ -105,14 +107,18 @@ def _refuse_url(arguments: argparse.Namespace) -> None:
 
 
 def _refuse_replacing(arguments: argparse.Namespace) -> None:
-    """Refuse a report or a picture among what is read: it could replace a file there, or be taken for one of them."""
-    for written in ("json", "figure"):
+    """Refuse what is written among what is read: it could replace a file there, or be taken for one of them."""
+    for written in ("json", "figure", "out"):
         place = getattr(arguments, written, None)
-        for read in ("path", "source"):
-            if isinstance(place, str) and place != "-" and isinstance(path := getattr(arguments, read, None), str):
-                from pcdata.io.sources.capture_source import check_apart
+        if not isinstance(place, str) or place == "-" or (written == "out" and hasattr(arguments, "out_may_be_url")):
+            continue
+        for read in ("path", "source", "images", "poses"):
+            given = getattr(arguments, read, None)
+            for path in given if isinstance(given, list) else [given]:
+                if isinstance(path, str):
+                    from pcdata.io.sources.capture_source import check_apart
 
-                check_apart(f"--{written}", place, path)
+                    check_apart(f"--{written}", place, path)
 
 
 def _tell_what_is_needed(words: Sequence[str], message: str) -> None:

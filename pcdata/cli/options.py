@@ -175,10 +175,12 @@ def open_captures(path: str, arguments: argparse.Namespace, limit: int | None = 
 
 def tell_skipped(skipped: dict[str, str]) -> None:
     """Say on stderr how many captures were left out, and which and why for the first."""
+    from pcdata.files.sample_names import counted
+
     for sample_id, reason in list(skipped.items())[:20]:
         print(f"left out {sample_id}: {reason}", file=sys.stderr)
     if len(skipped) > 20:
-        print(f"left out {len(skipped)} captures in all", file=sys.stderr)
+        print(f"left out {counted(len(skipped), 'capture')} in all", file=sys.stderr)
 
 
 def attribute_of(flag: str) -> str:

@@ -20,6 +20,7 @@ class ProgressBar:
         self.unit = unit
         self.bar: Any = None
         self.started = self.told = time.perf_counter()
+        self.first = 0, self.started  # how many were done when the first was told, and when that was
         self.done_before = -1  # by a command that was stopped; -1: not known yet
 
     def __enter__(self) -> ProgressBar:
@@ -38,6 +39,7 @@ class ProgressBar:
             self.done_before = max(done - 1, 0)
             if not done:  # told when the work begins
                 self.started = time.perf_counter()
+            self.first = done, time.perf_counter()
         if not sys.stderr.isatty():
             now = time.perf_counter()
             if is_first or done >= total or now - self.told >= _SELDOM:
@@ -67,13 +69,19 @@ class ProgressBar:
             self.bar.write(printable(line), file=terminal(sys.stderr))
 
     def _speed(self, done: int, total: int, now: float) -> str:
-        """Return the seconds so far, the rate, and the time left at that rate."""
-        seconds = now - self.started
-        rate = (done - self.done_before) / max(seconds, 1e-9)
+        """Return the seconds so far, the rate, and the time left.
+
+        What is left is told by what came after the first sample, which waits for workers to start.
+        """
+        seconds, since_first = now - self.started, done - self.first[0]
         if done == self.done_before:
             return ""
-        left = "" if done >= total or rate <= 0 else f", {_in_words((total - done) / rate)} left"
-        return f"{seconds:.1f} s, {rate:.3g}/s{left}"
+        if done >= total:
+            return f"{seconds:.1f} s, {(done - self.done_before) / max(seconds, 1e-9):.3g}/s"
+        if not since_first:
+            return f"{seconds:.1f} s"
+        rate = since_first / max(now - self.first[1], 1e-9)
+        return f"{seconds:.1f} s, {rate:.3g}/s, {_in_words((total - done) / rate)} left"
 
 
 def _in_words(seconds: float) -> str:

@@ -125,6 +125,7 @@ def export_dataset(
         _continue(run, plan, folder)
         return report
     if not overwrite and not is_free(folder):
+        check_only_export(folder)  # what may never be replaced is not advised to be
         raise CacheError(
             f"{folder} exists already; choose another folder, finish an interrupted export (--continue), or replace it "
             "(--overwrite)"

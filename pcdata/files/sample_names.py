@@ -32,6 +32,11 @@ _Token = tuple[int, int | Decimal, str]  # numbers before texts
 _Key = tuple[_Token, ...]
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 capture", "2,000 captures"."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def in_order(names: Iterable[str]) -> list[str]:
     """Sort names as a person counts: 2 before 10, ``frame_2_left`` before ``frame_10_left``; ties by the text.
 

@@ -114,10 +114,9 @@ class UrlFolder:
             try:
                 system, root = fsspec.core.url_to_fs(self.url, **self._options)
             except ImportError as cause:
-                raise MissingExtraError(
-                    f"{self._where}: {self}: {cause}: run pip install with that name; for s3:// run "
-                    'pip install "pcdata[remote]"'
-                ) from cause
+                kind = self.url.partition(":")[0]
+                way = 'pip install "pcdata[remote]"' if kind in ("s3", "s3a") else "install the package that it names"
+                raise MissingExtraError(f"{self._where}: {self}: {kind}:// cannot be opened: {cause}; {way}") from cause
             except (ValueError, TypeError) as cause:
                 raise ConfigError(f"{self._where}: {self}: fsspec cannot open such a URL: {cause}") from cause
             self._opened = os.getpid(), system, root.rstrip("/")
@@ -167,7 +166,10 @@ class UrlFolder:
             except PcdataError:
                 raise
             except FileNotFoundError as cause:
-                raise self._failed(name, "the file is missing; check the URL, or copy it again") from cause
+                why = "the file is missing; check the URL, or copy it again"
+                if "bucket does not exist" in str(cause):  # as S3 and Google say it
+                    why = "there is no such bucket; check the URL, or make one with the tool of the store"
+                raise self._failed(name, why) from cause
             except Exception as cause:  # every file system has errors of its own
                 fault = cause
                 if isinstance(cause, _FINAL) or "Credential" in type(cause).__name__ or _is_full(cause):

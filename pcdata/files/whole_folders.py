@@ -68,9 +68,9 @@ def check_replaceable(folder: Path, overwrite: bool, owned: Owned) -> None:
     """
     if is_free(folder):
         return
+    owned(folder)  # first: what may never be replaced is not advised to be
     if not overwrite:
         raise CacheError(f"{folder} exists already; choose another folder, or allow overwriting (--overwrite)")
-    owned(folder)
 
 
 def prepared(folder: Path, overwrite: bool, owned: Owned, note: Note) -> object:

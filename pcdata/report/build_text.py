@@ -7,6 +7,7 @@ from statistics import median
 from typing import Any
 
 from pcdata.build import BuildConfig, BuildReport, outlook
+from pcdata.files.sample_names import counted
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.report.inspection_text import left_out_texts, size_in_words
 from pcdata.report.plain_table import text_table
@@ -25,9 +26,9 @@ def build_text(report: BuildReport) -> str:
             rows.append([name, min(left), round(median(left)), max(left)])
     seconds = sum(sample.seconds for sample in report.samples)
     as_clouds = sum(sample.entered_at == "cloud" for sample in report.samples)
-    head = f"{len(report.samples)} samples in {seconds:.1f} s"
+    head = f"{counted(len(report.samples), 'sample')} in {seconds:.1f} s"
     if as_clouds:
-        head += f"; {as_clouds} captures were clouds already and entered at the first step that takes one"
+        head += f"; clouds already, which entered at the first step that takes one: {counted(as_clouds, 'capture')}"
     if report.num_finished < report.num_shards:
         head += f"; {report.num_finished} of {report.num_shards} shards are finished, the rest is others' work"
     tables = [head, text_table(["points after", "fewest", "median", "most"], rows)] if rows else [head]
@@ -42,18 +43,21 @@ def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, **
     plan = outlook(config, source, folder, **asked)
     tries_again = bool(asked.get("retry_quarantined"))
     rows = [
-        ["captures", f"{plan.num_samples:,} in {plan.num_shards:,} shards of {plan.shard_size:,}"],
+        ["captures", f"{plan.num_samples:,} in {counted(plan.num_shards, 'shard')} of {plan.shard_size:,}"],
         ["read", "unknown" if plan.bytes_to_read is None else size_in_words(plan.bytes_to_read)],
         ["format", f"{config.output.format}, compression {config.output.compression}"],
         ["steps", ", ".join(type(step).__name__ for step in config.pipeline.split()[0].steps) or "none"],
         ["identity", plan.identity[:16]],
-        ["kept" if tries_again else "finished", f"{plan.num_finished:,} shards, {size_in_words(plan.bytes_finished)}"],
-        ["to do", f"{plan.num_to_do:,} shards" + ("" if asked.get("part") is None else " of this job")],
+        [
+            "kept" if tries_again else "finished",
+            f"{counted(plan.num_finished, 'shard')}, {size_in_words(plan.bytes_finished)}",
+        ],
+        ["to do", counted(plan.num_to_do, "shard") + ("" if asked.get("part") is None else " of this job")],
     ]
     if plan.num_finished:
         rows.append(["about", f"{size_in_words(plan.bytes_finished / plan.num_finished * plan.num_shards)} in the end"])
     if plan.quarantined:
-        captures = f"{len(plan.quarantined)} captures"
+        captures = counted(len(plan.quarantined), "capture")
         rows.append(["tried again", captures] if tries_again else ["quarantined", f"{captures} so far"])
     if plan.replaces:
         rows.append(["replaces", "the dataset that is there, once this is built"])

@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 from pcdata.datasets import CachedCloudDataset, Splits
+from pcdata.files.sample_names import counted
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.writers.writers import WRITERS
 from pcdata.report.capture_facts import capture_facts
@@ -22,11 +23,11 @@ _COUNTS = ("dropped", "doubled", "interpolated", "missing")  # of a stream
 
 
 def skipped_text(
-    skipped: Mapping[str, str], what: str = "captures", listed_in: str = "dataset.json", how: str = "left out"
+    skipped: Mapping[str, str], what: str = "capture", listed_in: str = "dataset.json", how: str = "left out"
 ) -> str:
     """Tell which captures, or others, were left out: how many for each kind of reason, and the first with their own."""
     kinds = Counter(reason.partition(":")[0] for reason in skipped.values())
-    head = f"{len(skipped)} {what} {how}: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    head = f"{counted(len(skipped), what)} {how}: " + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     lines = [f"  {sample_id}: {reason}" for sample_id, reason in list(skipped.items())[:_SKIPPED_SHOWN]]
     more = len(skipped) - len(lines)
     return "\n".join([head, *lines, *([f"  and {more} more; {listed_in} lists them all"] if more else [])])
@@ -63,7 +64,7 @@ def dataset_text(folder: str | Path) -> str:
 def left_out_texts(skipped: Mapping[str, str], quarantined: Mapping[str, str]) -> list[str]:
     """Tell which captures a dataset lacks: those that somebody left out, and those that failed."""
     parts = [skipped_text(skipped)] if skipped else []
-    return parts + ([skipped_text(quarantined, how="failed twice and are quarantined")] if quarantined else [])
+    return parts + ([skipped_text(quarantined, how="failed twice, now quarantined")] if quarantined else [])
 
 
 def capture_text(source: CaptureSource, words: Sequence[str] = ()) -> str:
@@ -178,7 +179,7 @@ def _rates(rates: Sequence[float]) -> str:
 def _left_out(skipped: Mapping[str, str]) -> list[str]:
     lines = [f"{sample_id}: {reason}" for sample_id, reason in list(skipped.items())[:3]]
     more = len(skipped) - len(lines)
-    return [f"{len(skipped)} captures", *lines, *([f"and {more} more"] if more else [])] if skipped else []
+    return [counted(len(skipped), "capture"), *lines, *([f"and {more} more"] if more else [])] if skipped else []
 
 
 def _named(names: Iterable[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pcdata.datasets.leak_check import LeakReport
 from pcdata.datasets.splits import Splits
+from pcdata.files.sample_names import counted
 from pcdata.report.plain_table import text_table
 
 _SHOWN = 20  # pairs, in a summary
@@ -27,8 +28,9 @@ def splits_in_words(splits: Splits) -> str:
 
 def leaks_text(report: LeakReport) -> str:
     """Tell what is in two splits, with numbers and what to do."""
-    small = f"; {len(report.too_small)} clouds have too few points to be compared" if report.too_small else ""
-    head = f"leaks    {len(report.leaks)} near duplicates across splits among {report.num_samples} samples{small}"
+    small = f"; too few points to be compared: {counted(len(report.too_small), 'cloud')}" if report.too_small else ""
+    found, among = counted(len(report.leaks), "near duplicate"), counted(report.num_samples, "sample")
+    head = f"leaks    {found} across splits among {among}{small}"
     rows = [
         [f"{one.first} ({one.splits[0]})", f"{one.second} ({one.splits[1]})", f"{one.distance:.3g} {report.unit}"]
         for one in report.leaks[:_SHOWN]

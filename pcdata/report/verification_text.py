@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pcdata.build.verification import DatasetFault, DatasetVerdict
+from pcdata.files.sample_names import counted
 from pcdata.report.plain_table import text_table
 
 _SHOWN = 5  # samples of a file
@@ -10,7 +11,7 @@ _SHOWN = 5  # samples of a file
 
 def verification_text(verdict: DatasetVerdict) -> str:
     """Tell every fault, the samples that it spoils, and what to do."""
-    looked = f"{verdict.folder}: {verdict.num_files:,} files of {verdict.num_bytes:,} bytes were hashed"
+    looked = f"{verdict.folder}: hashed {counted(verdict.num_files, 'file')} of {verdict.num_bytes:,} bytes"
     notes = [f"note: {text}" for text in verdict.notes]
     if not verdict.faults:
         return "\n".join([f"{looked}; all are what was written", *notes])
@@ -19,7 +20,7 @@ def verification_text(verdict: DatasetVerdict) -> str:
     bad = any(fault.kind != "foreign" for fault in verdict.faults)
     return "\n".join(
         [
-            f"{looked}; {len(verdict.faults)} are not what was written, which spoils {spoiled} samples",
+            f"{looked}; not what was written: {len(verdict.faults)}, which spoils {counted(spoiled, 'sample')}",
             "",
             text_table(["what", "file", "why", "samples"], rows),
             *(["", "copy the damaged and missing files again, or build the dataset again"] if bad else []),

@@ -207,11 +207,15 @@ def test_random_noise_on_the_depth_is_refused_since_no_cloud_could_be_stored(tmp
     assert not (tmp_path / "dataset").exists()
 
 
-def test_an_existing_folder_is_refused_with_both_ways_out(tmp_path, source, configure):
+def test_an_existing_folder_is_refused_with_the_ways_out_that_there_are(tmp_path, source, configure):
+    build_dataset(configure(), source, tmp_path / "set")
+    with pytest.raises(CacheError, match=r"exists already.*another folder.*--overwrite"):
+        build_dataset(configure(), source, tmp_path / "set")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years")
-    with pytest.raises(CacheError, match=r"exists already.*another folder.*--overwrite"):
-        build_dataset(configure(), source, tmp_path / "out")
+    for place in (tmp_path / "out", tmp_path / "out" / "thesis.tex"):  # --overwrite would not help
+        with pytest.raises(CacheError, match=r"is not a pcdata dataset.*choose another folder$"):
+            build_dataset(configure(), source, place)
     assert (tmp_path / "out" / "thesis.tex").read_text() == "years"
 
 

@@ -15,11 +15,13 @@ from pathlib import Path
 import fsspec
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
-from pcdata import CachedCloudDataset
+from pcdata import CachedCloudDataset, StreamedCloudDataset, collate_packed
 from pcdata.build import build_dataset, outlook
 from pcdata.build.building_url import BuildingUrl
 from pcdata.build.placing_at_url import PlacingAtUrl
+from pcdata.build.verification import verify_dataset
 from pcdata.errors import CacheError, ConfigError
 from pcdata.files import urls
 from pcdata.files.url_writing import WritableUrl
@@ -118,12 +120,42 @@ def test_a_build_at_a_url_has_the_bytes_of_one_in_a_folder(url, tmp_path, form):
     assert os.listdir(tmp_path / "scratch") == []
 
 
-@IN_MEMORY
-def test_what_was_built_at_a_url_is_read_where_it_is(url):
+def test_what_was_built_at_a_url_is_read_where_it_is(url, tmp_path):
     build(url, "webdataset")
-    data = CachedCloudDataset(url)
-    assert [data[n].num_points for n in (0, 10)] == [20, 30]
-    assert data.manifest.identity == outlook(config_of("webdataset"), Counted(), url).identity
+    build(tmp_path / "plain", "webdataset")
+    there, plain = CachedCloudDataset(url, seed=3), CachedCloudDataset(tmp_path / "plain", seed=3)
+    assert there.manifest.identity == outlook(config_of("webdataset"), Counted(), url).identity
+    # The datasets are read in this process before their copies, which come by fork, read too.
+    for workers in (0, 2):
+        how = {"num_workers": workers, "multiprocessing_context": "fork" if workers else None}
+        for make in (
+            lambda data, how: DataLoader(data, batch_size=4, collate_fn=collate_packed, **how),
+            lambda data, how: DataLoader(
+                StreamedCloudDataset(data, batch_size=4), batch_size=None, collate_fn=collate_packed, **how
+            ),
+        ):
+            read, wanted = [*make(there, how)], [*make(plain, how)]
+            assert sum(batch.num_clouds for batch in wanted) == 11
+            assert [batch.num_clouds for batch in read] == [batch.num_clouds for batch in wanted]
+            assert all(torch.equal(one.points, other.points) for one, other in zip(read, wanted))
+
+
+def test_another_format_at_a_url_is_refused_at_once_and_read_from_a_copy_as_the_message_says(url, tmp_path):
+    build(url, "hdf5")
+    with pytest.raises(CacheError, match=r"format hdf5 is read from folders alone: copy the dataset to one, or build"):
+        CachedCloudDataset(url)
+    for name, content in objects(url).items():
+        path = tmp_path / "copy" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    assert verify_dataset(tmp_path / "copy").faults == []
+    assert [cloud.num_points for cloud in CachedCloudDataset(tmp_path / "copy")] == [*range(20, 31)]
+
+
+@pytest.mark.parametrize("url", ["s3"], indirect=True)
+def test_a_missing_bucket_is_told(url):
+    with pytest.raises(CacheError, match=r"there is no such bucket; check the URL, or make one"):
+        build("s3://nobody-has-made-this/set")
 
 
 def test_a_file_url_is_a_folder(tmp_path):
@@ -223,7 +255,7 @@ def test_another_build_in_the_way_is_refused_with_the_way_out(url, tmp_path):
     with pytest.raises(CacheError, match="one of several jobs cannot restart"):
         build(url, source=Counted(12), restart=True, part=(0, 2))
     report = build(url, source=Counted(12), restart=True)
-    assert any(note.startswith("deleted the 3 finished shards") for note in report.notes)
+    assert any(note.startswith("deleted 3 finished shards") for note in report.notes)
     assert objects(url) == plain(tmp_path, source=Counted(12))
 
 

@@ -180,9 +180,9 @@ def test_sensors_that_differ_are_listed_with_the_samples_of_each(tmp_path):
     config = config_from_yaml("cloud: [Center]\noutput: {format: npz, shard_size: 2}")
     build_dataset(config, Several("abcdef"), tmp_path / "set")
     text = (tmp_path / "set" / "README.md").read_text()
-    told = "sensor D435, serial 0 (3 samples); sensor D435, serial 1 (2 samples); UNKNOWN (1 samples)"
+    told = "sensor D435, serial 0 (3 samples); sensor D435, serial 1 (2 samples); UNKNOWN (1 sample)"
     assert f"| sensor | {told} |" in text
-    assert "read exactly, in the steps of 1 mm that it was stored in (5 samples); UNKNOWN (1 samples)" in text
+    assert "read exactly, in the steps of 1 mm that it was stored in (5 samples); UNKNOWN (1 sample)" in text
     assert "| 6 | base/centered | m | base | none | points float32 |" in text
     assert any("sensor" in line for line in write_card(tmp_path / "set"))  # one is not known
     assert (tmp_path / "set" / "README.md").read_text() == text

@@ -15,7 +15,16 @@ import torch
 from pcdata import CachedCloudDataset
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.build.tally import most_bad
-from pcdata.errors import CacheError, CaptureError, ConfigError, FrameError, PcdataError, TooFewPointsError
+from pcdata.errors import (
+    CacheError,
+    CaptureError,
+    ConfigError,
+    FrameError,
+    PcdataError,
+    TooFewPointsError,
+    VolumeTooLargeError,
+    is_out_of_memory,
+)
 from pcdata.io.store.manifest import Manifest
 from tests.build.test_builder import FORMATS, Clouds, cloud, tree
 
@@ -235,23 +244,40 @@ def test_errors_of_every_kind_keep_it(tmp_path, moody):
         build_dataset(config_from_yaml(CONFIG), source, tmp_path / "out")
 
 
-def test_three_captures_that_lack_memory_stop_the_build_and_are_tried_again(tmp_path, moody):
+def torch_error() -> RuntimeError:
+    """What PyTorch raises where memory does not suffice."""
+    with pytest.raises(RuntimeError) as caught:
+        torch.zeros(1 << 42)
+    return RuntimeError(str(caught.value))  # without its traceback
+
+
+@pytest.mark.parametrize("starved", [MemoryError, torch_error])
+def test_three_captures_that_lack_memory_stop_the_build_and_are_tried_again(tmp_path, moody, starved):
     config, ids = config_from_yaml(CONFIG), [f"c{n}" for n in range(10)]
     build_dataset(config, moody(), tmp_path / "calm")
-    source = moody(**{name: [MemoryError(), MemoryError(), ""] for name in ids[5:9]})
+    source = moody(**{name: [starved(), starved(), ""] for name in ids[5:9]})
     for file in source.folder.iterdir():
         file.unlink()
     with pytest.raises(CacheError, match="memory does not suffice for 'c8'"):
         build_dataset(config, source, tmp_path / "out")
     report = build_dataset(config, source, tmp_path / "out")
     assert not report.quarantined
-    assert any("built anew, since captures of them ran out of memory" in note for note in report.notes)
+    assert any("built anew: " in note and "captures of them ran out of memory" in note for note in report.notes)
     assert tree(tmp_path / "out") == tree(tmp_path / "calm")
 
 
 def test_one_capture_that_lacks_memory_is_quarantined(tmp_path, moody):
-    report = build_dataset(config_from_yaml(CONFIG), moody(c4=[MemoryError()]), tmp_path / "out")
-    assert report.quarantined == {"c4": "MemoryError"}
+    report = build_dataset(config_from_yaml(CONFIG), moody(c4=[MemoryError()], c5=[torch_error()]), tmp_path / "out")
+    assert report.quarantined["c4"] == "MemoryError"
+    assert report.quarantined["c5"].startswith("MemoryError: ")
+    assert "tried to allocate" in report.quarantined["c5"]
+
+
+def test_what_torch_raises_where_memory_is_short_is_told_from_other_errors():
+    assert is_out_of_memory(torch_error())
+    assert is_out_of_memory(MemoryError())
+    assert not is_out_of_memory(RuntimeError("shapes do not fit"))
+    assert not is_out_of_memory(VolumeTooLargeError("more than the limit"))
 
 
 def test_quarantined_captures_are_tried_again_and_the_other_shards_kept(tmp_path, moody):

@@ -126,7 +126,7 @@ def test_another_build_in_the_way_is_refused_with_the_ways_out(tmp_path):
         build(tmp_path / "out", source=Counted(7))
     assert tree(tmp_path) == before
     report = build(tmp_path / "out", "pt", restart=True)
-    assert any("deleted the 2 finished shards" in note for note in report.notes)
+    assert any("deleted 2 finished shards" in note for note in report.notes)
     assert os.listdir(tmp_path) == ["out"]
 
 
@@ -186,7 +186,7 @@ def test_only_shards_of_captures_that_changed_are_built_anew(tmp_path):
     write_ply(tmp_path / "in" / "c1.ply", cloud(50))
     report = build_dataset(config, open_source(tmp_path / "in"), tmp_path / "out")
     assert report.notes == [
-        "1 finished shards are built anew, since a file of their captures has changed",
+        "built anew: 1 finished shard, since a file of their captures has changed",
         "1 of 3 shards were finished before",
     ]
     assert CachedCloudDataset(tmp_path / "out")[1].num_points == 50
@@ -219,7 +219,7 @@ def test_a_large_file_with_other_content_of_the_same_size_and_time_is_told_by_it
         go_on(hash_captures=not hash_captures)
     found = outlook(config, open_source(tmp_path / "in"), tmp_path / "out", hash_captures=hash_captures)
     assert found.num_finished == 1 - hash_captures
-    told = "1 finished shards are built anew, since a file of their captures has changed"
+    told = "built anew: 1 finished shard, since a file of their captures has changed"
     assert (told in go_on(hash_captures=hash_captures).notes) is hash_captures
 
 

@@ -114,7 +114,7 @@ def test_the_command_names_what_is_wrong_and_exits_with_1(datasets, tmp_path, ca
     assert main(["verify", str(tmp_path / "set"), "--workers", "2"]) == 1
     out = capsys.readouterr().out
     assert "shards/00000/clouds/s1.npz" in out
-    assert "which spoils 1 samples" in out
+    assert "which spoils 1 sample" in out
     assert main(["verify", str(tmp_path)]) == 1
     with pytest.raises(ConfigError, match="workers must be 1 or more"):
         verify_dataset(tmp_path / "set", workers=0)

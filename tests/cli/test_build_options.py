@@ -77,6 +77,40 @@ def test_faults_of_what_is_set_name_the_path(capsys, config, captures, tmp_path,
     assert words in err
 
 
+@pytest.mark.parametrize("inside", ["", "shards/00000", "dataset.json"])
+def test_a_dataset_as_source_is_told_apart_from_captures(capsys, config, captures, tmp_path, inside):
+    assert run(capsys, "build", config, "--source", captures, "--out", tmp_path / "set")[0] == 0
+    for command in (("build", config, "--out", tmp_path / "new", "--source"), ("validate",)):
+        code, out, err = run(capsys, *command, tmp_path / "set" / inside)
+        assert code == 1
+        told = next(line for line in (out + err).splitlines() if "open_source" in line)
+        assert re.search(r"dataset that 'pcdata build' wrote.* built from \(captures\).*pcdata inspect .*/set$", told)
+        assert "robomimic" not in out + err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["calib", "refine", "CAPTURES", "--calibration", "c.yaml", "--out", "CAPTURES/new.yaml"],
+        ["calib", "intrinsics", "CAPTURES", "--board", "chessboard:8x6:0.03", "--out", "CAPTURES/new.yaml"],
+        ["calib", "hand-eye", "CAPTURES/poses.yaml", "--out", "CAPTURES/poses.yaml"],
+        ["convert", "CAPTURES", "--to", "folder", "--out", "CAPTURES/new"],
+        ["export", "CAPTURES", "--to", "dp3", "--out", "CAPTURES"],
+        ["build", "CONFIG", "--source", "CAPTURES", "--out", "CAPTURES/new"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_nothing_is_written_among_what_is_read(capsys, config, captures, words):
+    before = tree(captures)
+    code, out, err = run(
+        capsys, *(word.replace("CAPTURES", str(captures)).replace("CONFIG", str(config)) for word in words)
+    )
+    assert (code, out) == (2, "")
+    assert re.search(r"would become part of them; choose a place outside|is what is read; choose another file", err)
+    assert tree(captures) == before
+
+
 def test_a_dry_run_tells_and_writes_nothing(capsys, config, captures, tmp_path):
     call = ["build", config, "--source", captures, "--out", tmp_path / "out", "--set", "output.shard_size=2"]
     before = sorted(tmp_path.rglob("*"))
@@ -87,7 +121,7 @@ def test_a_dry_run_tells_and_writes_nothing(capsys, config, captures, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
     assert run(capsys, *call, "--num-shards", 2, "--shard-index", 1)[0] == 0
     _, out, _ = run(capsys, *call, "--dry-run")
-    assert re.search(r"^finished +1 shards, ", out, re.MULTILINE)
+    assert re.search(r"^finished +1 shard, ", out, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -118,11 +152,11 @@ def test_a_dry_run_tells_what_the_options_change(capsys, config, captures, tmp_p
         assert code == 0
         return dict(re.split("  +", line, maxsplit=1) for line in out.splitlines() if "  " in line)
 
-    assert dry("--num-shards", 2, "--shard-index", 1)["to do"] == "1 shards of this job"
+    assert dry("--num-shards", 2, "--shard-index", 1)["to do"] == "1 shard of this job"
     assert "2 of 2 shards are not finished" in dry("--finalize")["in the way"]
     assert "no captures of it are quarantined" in dry("--retry-quarantined")["in the way"]
     assert run(capsys, *call, "--num-shards", 2, "--shard-index", 0)[0] == 0
-    assert dry()["finished"].startswith("1 shards")
+    assert dry()["finished"].startswith("1 shard,")
     assert dry("--restart")["to do"] == "2 shards"
     assert "--restart deletes it" in dry("--format", "pt")["in the way"]
     assert "in the way" not in dry("--format", "pt", "--restart")
@@ -141,7 +175,7 @@ def test_a_dry_run_of_a_retry_tells_what_is_kept_and_what_is_tried_again(capsys,
     _, out, _ = run(capsys, *call, "--retry-quarantined", "--dry-run")
     told = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines() if "  " in line)
     assert told["kept"].startswith("3 shards, ")
-    assert (told["to do"], told["tried again"]) == ("1 shards", "1 captures")
+    assert (told["to do"], told["tried again"]) == ("1 shard", "1 capture")
     assert "once this is built" in told["replaces"]
     assert "in the way" not in told
     code, out, err = run(capsys, *call, "--retry-quarantined", "--workers", 0)

@@ -76,7 +76,7 @@ def test_captures_are_chosen_and_combined_as_everywhere(capture, tmp_path, capsy
     words = ["--skip", "001", "--limit", "3", "--metres-per-unit", "0.0001", "--option", "frame_id='base'"]
     assert main(["convert", str(capture), "--to", "folder", "--out", str(out), *words]) == 0
     assert open_source(out).ids == ["000", "002", "003"]
-    assert "1 captures left out" in capsys.readouterr().out
+    assert "1 capture left out" in capsys.readouterr().out
     smooth = ["--temporal", "2", "--option", "temporal.alpha=0.5"]
     assert main(["convert", str(capture), "--to", "folder", "--out", str(tmp_path / "smooth"), *smooth]) == 0
     smoothed = open_source(capture, temporal={"num_frames": 2, "alpha": 0.5})

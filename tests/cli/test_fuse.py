@@ -65,7 +65,7 @@ def test_min_weight_and_left_out_captures_are_heeded(capsys, captures, tmp_path)
     assert fuse(captures, tmp_path / "two.ply", "--skip", "1") == 0
     assert "from 2 views of 2 captures" in capsys.readouterr().out
     assert fuse(captures, tmp_path / "one.ply", "--limit", "1") == 0
-    assert "from 1 views of 1 captures" in capsys.readouterr().out
+    assert "from 1 view of 1 capture" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_the_commands_to_go_on_have_the_options_that_were_given(rig, capsys):
     path = f"'{rig}'"
     assert f"pcdata validate {path} --kind rig --skip 001 --limit=2\n" in out
     assert f"pcdata convert {path} --kind rig --skip 001 --skip-refused --limit=2 --to " in out
-    assert "left out  1 captures" in out
+    assert "left out  1 capture" in out
 
 
 def test_json_says_the_same_to_a_file_or_alone_on_the_output(rig, capsys, tmp_path):

@@ -174,7 +174,7 @@ def test_a_copy_in_another_split_is_told_with_its_distance_and_ends_the_command_
     table.write_text("sample,split,scene\n" + "".join(f"{one},{'ab'[one == 'copy']},{one}\n" for one in ids))
     assert main(["split", str(folder), "--named-by", "column:split", "--table", str(table)]) == 1
     told = capsys.readouterr().out
-    assert "leaks    1 near duplicates across splits among 8 samples; 1 clouds have too few points" in told
+    assert "leaks    1 near duplicate across splits among 8 samples; too few points to be compared: 1 cloud" in told
     assert "copy (b) shows the same as c1 (a): 0 m apart" in told
     (leak,) = check_leaks(folder).leaks
     assert (leak.first, leak.second, leak.splits) == ("copy", "c1", ("b", "a"))

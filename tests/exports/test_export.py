@@ -350,7 +350,7 @@ def test_the_command_exports_captures(capsys, capture_folder, tmp_path):
     options = ["--set", "any_size=true", "--set", "label_offset=1"]
     code, text, _ = run(capsys, capture_folder, "--to", "graspnet", "--out", out, *options)
     assert code == 0
-    assert f"export  {out}  (graspnet: 1 samples written)" in text
+    assert f"export  {out}  (graspnet: 1 sample written)" in text
     delivered = open_source(out).load("0")
     assert torch.equal(delivered.depth, frame().depth)
     assert torch.equal(delivered.mask, frame().mask)
@@ -402,8 +402,8 @@ def test_the_command_tells_what_it_leaves_out(capsys, tmp_path):
     assert "all others fit; leave out what does not fit with --skip-bad" in err
     code, out, _ = run(capsys, tmp_path / "*" / "view0", *options, "--skip-bad")
     assert code == 0
-    assert "1 samples written" in out
-    assert "1 samples left out: 1 CaptureError" in out
+    assert "1 sample written" in out
+    assert "1 sample left out: 1 CaptureError" in out
     record = json.loads((tmp_path / "out" / FILE_NAME).read_text())
     assert len(record["left_out"]) == 1
 

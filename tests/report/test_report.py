@@ -46,11 +46,13 @@ def test_build_text_gives_fewest_median_and_most_of_every_step():
 
 def test_build_text_says_which_captures_skipped_the_depth_section():
     samples = [BuiltSample("a", "cloud", [("Crop", 3)], 0.0), BuiltSample("b", "depth", [("Deproject", 3)], 0.0)]
-    assert "1 captures were clouds already" in build_text(BuildReport(Path("x"), samples))
+    assert "clouds already, which entered at the first step that takes one: 1 capture" in build_text(
+        BuildReport(Path("x"), samples)
+    )
 
 
 def test_build_text_of_a_pipeline_without_steps_is_still_a_report():
-    assert build_text(BuildReport(Path("x"), [BuiltSample("a", "cloud", [], 0.1)])).startswith("1 samples")
+    assert build_text(BuildReport(Path("x"), [BuiltSample("a", "cloud", [], 0.1)])).startswith("1 sample in")
 
 
 def test_capture_text_of_a_cloud_file_tells_its_extent(tmp_path):

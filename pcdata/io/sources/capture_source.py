@@ -187,7 +187,7 @@ def check_apart(where: str, target: str | os.PathLike[str], source: Any) -> None
     paths, pattern = _places_of(source)
     for path in paths:
         real = Path(os.path.realpath(Path(path).expanduser()))
-        if place == real and real.is_file():
+        if place == real and not real.is_dir():
             raise ConfigError(f"{where}: {place} is what is read; choose another file")
         if place.is_relative_to(real):
             raise ConfigError(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pcdata.errors import CaptureError, PcdataError
+from pcdata.errors import CacheError, CaptureError, PcdataError
 from pcdata.files.opening import open_input
 from pcdata.files.sample_names import name_some
+from pcdata.files.whole_folders import DATASET, EXPORT
 from pcdata.io.images.reading import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from pcdata.io.sources.demonstration_file import opened
 from pcdata.io.sources.hand_eye_names import hand_eye_folders, hand_eye_tool
@@ -44,6 +46,8 @@ _FILES: dict[str, tuple[str, tuple[bytes, ...]]] = {
 
 def unknown_layout(path: Path) -> CaptureError:
     """Return the error that tells how a path of no known layout is read; where nothing can be told, all layouts."""
+    if told := _written_here(path):
+        return CaptureError(f"open_source: {path}: {told}")
     if path.is_file() and (fault := _fault_of_file(path)):
         return CaptureError(f"open_source: {path}: {fault}")
     start = f"open_source: {path}: no known layout; found {_contents(path)}."
@@ -52,6 +56,29 @@ def unknown_layout(path: Path) -> CaptureError:
             return CaptureError(f"{start} {told}. docs/captures.md lists the layouts")
     known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
     return CaptureError(f"{start} The layouts and what each needs:\n{known}")
+
+
+def _written_here(path: Path) -> str:
+    """Say that a path is, or is in, what a command of pcdata wrote; "" = it is not."""
+    from pcdata.io.store.manifest import Manifest
+
+    for folder in (path, *list(path.absolute().parents)[:_DEEPEST]):
+        name = shlex.quote(os.fspath(folder))
+        where = "is" if folder == path else f"is in {name},"
+        if (folder / EXPORT).is_file():
+            return (
+                f"{where} an export that 'pcdata export' wrote for a model's own loader; give the captures themselves"
+            )
+        if not (folder / DATASET).is_file() or not Manifest.is_one(folder):
+            continue
+        source = ""
+        with suppress(CacheError):
+            source = str(Manifest.read(folder).source.get("path", ""))
+        return (
+            f"{where} a dataset that 'pcdata build' wrote: clouds, of which every step is done. Give the captures that "
+            f"it was built from{f' ({source})' if source else ''}; what it holds is told by: pcdata inspect {name}"
+        )
+    return ""
 
 
 def _fault_of_file(path: Path) -> str:

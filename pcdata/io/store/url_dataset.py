@@ -57,6 +57,11 @@ def opened_folder(
     return _FETCHED[known], server
 
 
+def is_read_at_urls(form: str) -> bool:
+    """Say whether datasets of a format are read where they are, at a URL."""
+    return getattr(STORES[form].at_url, "__func__", None) is not getattr(Store.at_url, "__func__", None)
+
+
 def fetch(server: UrlFolder, folder: Path, name: str) -> Path:
     """Copy a small file of a dataset to the same place below a folder, unless it is there; return its path.
 
@@ -80,6 +85,7 @@ class UrlShards(Shards):
 
     def __init__(self, server: UrlFolder, folder: Path, form: str, index: SampleIndex) -> None:
         super().__init__(folder, form, index)
+        STORES[form].at_url(server, FOLDER)  # refuses now what could not be read later
         self.server = server
         self._held: dict[int, int] = {}  # shard -> how many of its samples
 

@@ -101,7 +101,7 @@ def test_what_a_step_refuses_is_quarantined_too(capture: Path, tmp_path: Path) -
 
 def test_a_summary_of_thousands_stays_short() -> None:
     told = skipped_text({str(number): "PoseError: lost" for number in range(5000)})
-    assert told.splitlines()[0] == "5000 captures left out: 5000 PoseError"
+    assert told.splitlines()[0] == "5,000 captures left out: 5000 PoseError"
     assert told.splitlines()[-1] == "  and 4980 more; dataset.json lists them all"
     assert len(told.splitlines()) == 22
 
@@ -127,7 +127,7 @@ def test_the_command_line_leaves_out_and_tells(capture: Path, config: Path, tmp_
     assert "--max-bad" in capsys.readouterr().err
     assert main([*build, str(tmp_path / "a")]) == 3
     out = capsys.readouterr().out
-    assert "2 captures failed twice and are quarantined: 1 PoseError, 1 NoReadingError" in out
+    assert "2 captures failed twice, now quarantined: 1 PoseError, 1 NoReadingError" in out
     assert "  2: PoseError: " in out
     assert main(["inspect", str(tmp_path / "a")]) == 0
     assert "4: NoReadingError" in capsys.readouterr().out
