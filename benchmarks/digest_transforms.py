@@ -155,6 +155,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomOneOf": [
         Example(lambda: step("RandomOneOf", steps=[step("RandomFlip"), step("RandomPointDropout")], weights=(1.0, 2.0)))
     ],
+    "RandomShuffle": _of("RandomShuffle", {}),
     "RandomShear": _of("RandomShear", {}, {"low": 0.1, "high": 0.3, "about": "centroid"}),
     "RandomTurnDepth": _of("RandomTurnDepth", {}),
     "TurnDepth": _of("TurnDepth", {}, {"quarter_turns": 2}),

@@ -146,6 +146,40 @@ def closest_rotation(linear: Tensor) -> Tensor:
     return left @ right
 
 
+def slerp(first: Tensor, second: Tensor, share: Tensor | float) -> Tensor:
+    """Return the (..., 4) unit quaternions at a share of the shorter way from one rotation to another, at even speed.
+
+    Source: Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
+    """
+    first, second = torch.broadcast_tensors(first.double(), second.double())
+    first, second = (one / one.norm(dim=-1, keepdim=True) for one in (first, second))
+    way = multiplied(second, first * first.new_tensor([1.0, -1.0, -1.0, -1.0]))
+    share = torch.as_tensor(share, dtype=torch.float64, device=first.device)[..., None]
+    part = quaternion_from_rotation_vector(share * rotation_vector_from_quaternion(_nonnegative(way)))
+    return multiplied(part, first)
+
+
+def mean_rotation(rotation: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the (..., 3, 3) rotation nearest to (..., N, 3, 3) rotations: least weighted squares of the matrices.
+
+    Args:
+        rotation: one or more.
+        weights: (..., N), not negative; None = all alike.
+
+    Raises:
+        ConfigError: there are none, or weights that are negative or all 0.
+
+    Source: Markley et al., Averaging quaternions, Journal of Guidance, Control, and Dynamics 30(4), 2007.
+    """
+    quaternion = quaternion_from_rotation(rotation)
+    given = quaternion.new_ones(()) if weights is None else weights.double()
+    share = given.expand(quaternion.shape[:-1])
+    if not share.shape[-1] or bool((share < 0).any()) or not bool((share.sum(-1) > 0).all()):
+        raise ConfigError("mean_rotation: needs rotations and weights from 0 on, of which some are above 0")
+    spread = torch.einsum("...n,...ni,...nj->...ij", share, quaternion, quaternion)
+    return rotation_from_unit_quaternion(_nonnegative(torch.linalg.eigh(spread).eigenvectors[..., -1]))
+
+
 def _nonnegative(quaternion: Tensor) -> Tensor:
     """Return the one of q and -q whose first component that is not 0 is positive."""
     sign = quaternion.sign()

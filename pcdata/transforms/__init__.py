@@ -15,6 +15,7 @@ from pcdata.transforms.downsample import (
     RandomFarthestPointSample,
     RandomPointCount,
     RandomSample,
+    RandomShuffle,
     VoxelDownsample,
 )
 from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTransform, SpatialTransform
@@ -101,6 +102,7 @@ __all__ = [
     "RandomScale",
     "RandomSensorNoise",
     "RandomShear",
+    "RandomShuffle",
     "RandomTranslation",
     "RandomTurnDepth",
     "RandomVoxelSample",

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.rows import group_first, ptr_after_mask, ptr_from_counts
-from pcdata.functional.sampling import farthest_point_sample
+from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
 from pcdata.rng import Streams, seeded
 from pcdata.sensors import SensorProfile
@@ -255,6 +255,17 @@ class RandomSample(_Sample):
                 drawn = torch.randperm(have, generator=seeded(seed), device="cpu")[:count]
             rows.append(start + drawn.to(cloud.device))
         return rows
+
+
+class RandomShuffle(SelectTransform):
+    """Put the points of every cloud in random order: for models that look at the first points alone."""
+
+    is_random = True
+    decides_by = "count"
+
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
+        """Draw a permutation of each cloud."""
+        return random_sample_index(cloud.ptr, cloud.counts.tolist(), streams.seeds())
 
 
 class RandomPointCount(RandomSample):

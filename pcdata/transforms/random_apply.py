@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,14 +12,14 @@ from torch import nn
 
 from pcdata.errors import ConfigError, ReplayError
 from pcdata.rng import Streams
-from pcdata.structures import PointCloud
+from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_types import Fraction, NonNegative
 
 
 class _Chance(Transform, abstract=True):
-    """Run a step that is drawn for each cloud, or none: ``chosen`` in the params says which, by :meth:`_step`."""
+    """Run a step that is drawn for each cloud or capture, or none: ``chosen`` in the params says which."""
 
     is_random = True
 
@@ -34,11 +35,16 @@ class _Chance(Transform, abstract=True):
         raise NotImplementedError
 
     def check_fields(self) -> None:
-        """Require steps from clouds to clouds."""
-        for step in self._choices():
-            if not (step.takes is PointCloud and step.gives is PointCloud):
-                raise ConfigError(f"{type(self).__name__}: {type(step).__name__} does not turn clouds into clouds")
-        self.keeps_clouds = all(step.keeps_clouds for step in self._choices())  # type: ignore[misc]
+        """Require steps from clouds to clouds, or from captures to captures."""
+        steps = self._choices()
+        takes = DepthFrame if any(step.takes is DepthFrame for step in steps) else PointCloud
+        what = "captures into captures" if takes is DepthFrame else "clouds into clouds"
+        for step in steps:
+            # A chain without steps leaves either as it is.
+            if step.parts() and not (step.takes is takes and step.gives is takes):
+                raise ConfigError(f"{type(self).__name__}: {type(step).__name__} does not turn {what}")
+        self.takes = self.gives = takes  # type: ignore[misc]
+        self.keeps_clouds = all(step.keeps_clouds for step in steps)  # type: ignore[misc]
 
     def parts(self) -> list[Transform]:
         """The steps that may be run, or their parts."""
@@ -58,10 +64,10 @@ class _Chance(Transform, abstract=True):
         within = in_a_row([step], entries, stop - 1)
         return None if within is None else (Decision(entries[stop - 1], stop - 1, within[0]), within[1])
 
-    def replayed(self, data: PointCloud, decided: Decisions) -> PointCloud:
-        """Repeat what happened to each cloud."""
+    def replayed(self, data: Any, decided: Decisions) -> Any:
+        """Repeat what happened to each cloud, or to the capture."""
         self.check_input(data)
-        clouds, choices = data.unbatch(), []
+        clouds, choices = _parts_of(data), []
         for b, decision in enumerate(decided.of_clouds):
             chosen = decided.told(b).get("chosen")
             if not self._is_choice(chosen):
@@ -75,20 +81,36 @@ class _Chance(Transform, abstract=True):
         seeds = decided.values("seed", like=torch.empty(0, dtype=torch.int64, device="cpu"))
         dtype = torch.bool if isinstance(choices[0], bool) else torch.int64
         params = {"chosen": torch.tensor(choices, dtype=dtype, device="cpu"), "seed": seeds}
-        return self.recorded(data, PointCloud.cat(clouds), params, decided.streams().here())
+        return self.recorded(data, _joined(clouds), params, decided.streams().here())
 
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
+    def transform(self, data: Any, params: Params) -> Any:
         """Run the chosen steps and pack all clouds again."""
-        clouds = data.unbatch()
+        clouds = _parts_of(data)
         for b, (chosen, seed) in enumerate(zip(params["chosen"].tolist(), params["seed"].tolist(), strict=True)):
             step = self._step(chosen)
             if step is not None:
                 clouds[b] = step(clouds[b], generator=Streams([seed]))
-        return PointCloud.cat(clouds)
+        return _joined(clouds)
+
+
+def _parts_of(data: Any) -> list[Any]:
+    return data.unbatch() if isinstance(data, PointCloud) else [data]
+
+
+def _joined(parts: list[Any]) -> Any:
+    if isinstance(parts[0], PointCloud):
+        return PointCloud.cat(parts)
+    (capture,) = parts
+    return replace(capture)  # never the input itself
 
 
 class RandomApply(_Chance):
-    """Apply a step to each cloud with a probability."""
+    """Apply a step to each cloud, or to a capture, with a probability.
+
+    Args:
+        step: from clouds to clouds, or from captures to captures.
+        probability: that it is applied.
+    """
 
     step: Transform
     probability: Fraction = 0.5
@@ -102,19 +124,19 @@ class RandomApply(_Chance):
     def _step(self, chosen: Any) -> Transform | None:
         return self.step if chosen else None
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+    def make_params(self, data: Any, streams: Streams) -> Params:
         """Draw, per cloud, whether it is chosen and the seed of what happens to it then."""
         chosen = streams.uniform(0.0, 1.0) < self.probability
         return {"chosen": chosen, "seed": streams.seeds()}
 
 
 class RandomOneOf(_Chance):
-    """Apply one of several steps to each cloud, drawn by their weights.
+    """Apply one of several steps to each cloud, or to a capture, drawn by their weights.
 
-    Whatever is drawn, clouds stay in their frame and unit. An empty chain, ``Compose([])``, leaves the cloud as it is.
+    Whatever is drawn, clouds stay in their frame and unit. An empty chain, ``Compose([])``, leaves all as it is.
 
     Args:
-        steps: from clouds to clouds; a chain counts as one.
+        steps: from clouds to clouds, or from captures to captures; a chain counts as one.
         weights: of each step, as parts of their sum; None = all alike.
     """
 
@@ -158,7 +180,7 @@ class RandomOneOf(_Chance):
                 f"RandomOneOf: weights must be {len(steps)} numbers, one for each step, not all 0, got {self.weights}"
             )
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+    def make_params(self, data: Any, streams: Streams) -> Params:
         """Draw, per cloud, a number of a step and the seed of what happens to it then."""
         weights = torch.tensor(self.weights or [1.0] * len(self.steps), dtype=torch.float64, device="cpu")
         ends = weights.cumsum(0)

@@ -98,3 +98,32 @@ def test_an_order_of_axes_that_is_none_is_refused(axes):
         rotations.rotation_from_euler(torch.zeros(3), axes)
     with pytest.raises(ConfigError, match="axes must be an order of 'xyz'"):
         rotations.euler_from_rotation(torch.eye(3), axes)
+
+
+def test_between_two_rotations_are_those_of_scipy(known):
+    quaternions = rotations.quaternion_from_rotation(matrices(known))
+    first, second = known[:-1], known[1:]
+    unique = torch.from_numpy((first.inv() * second).magnitude()) < math.pi - 1e-3  # of half a turn there are two ways
+    for share in (0.0, 0.2, 0.5, 0.9, 1.0):
+        found = rotations.slerp(quaternions[:-1], -3.0 * quaternions[1:], share)
+        expected = first * Rotation.from_rotvec(share * (first.inv() * second).as_rotvec())
+        found = rotations.rotation_from_quaternion(found)
+        torch.testing.assert_close(found[unique], matrices(expected)[unique], atol=1e-7, rtol=0)
+    assert int(unique.sum()) > 100
+
+
+def test_the_mean_rotation_is_that_of_scipy():
+    some = Rotation.random(40, random_state=5)
+    near = Rotation.from_rotvec(0.4 * some.as_rotvec())
+    weights = np.random.default_rng(1).random(40)
+    for given in (None, weights):
+        found = rotations.mean_rotation(matrices(near), None if given is None else torch.from_numpy(given))
+        np.testing.assert_allclose(found.numpy(), near.mean(given).as_matrix(), atol=1e-12)
+    both = rotations.mean_rotation(torch.stack([matrices(near), matrices(near).flip(0)]))
+    torch.testing.assert_close(both[0], both[1])
+    torch.testing.assert_close(rotations.mean_rotation(matrices(near)[:1]), matrices(near)[0])
+    for wrong in (-weights, 0 * weights):
+        with pytest.raises(ConfigError, match="mean_rotation: needs rotations and weights"):
+            rotations.mean_rotation(matrices(near), torch.from_numpy(wrong))
+    with pytest.raises(ConfigError, match="needs rotations"):
+        rotations.mean_rotation(matrices(near)[:0])

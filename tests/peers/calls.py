@@ -40,6 +40,7 @@ class Section:
     calls: tuple[Call, ...]
     modules: Mapping[str, str] = field(default_factory=dict)  # name in their expressions -> module; none = only read
     setup: str = ""  # makes what their expressions name
+    missing: tuple[tuple[str, str], ...] = ()  # what is not here, and why or what to do
 
 
 def names() -> Names:

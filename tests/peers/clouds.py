@@ -203,6 +203,14 @@ OPEN3D = Section(
             same(0),
         ),
         Call(
+            "sorted(row for row in pcd.hidden_point_removal([0.1, 0.1, 1.0], 50.0)[1] if row < 200)",
+            "torch.nonzero(~F.hidden_point_mask(points, viewpoint=(0.1, 0.1, 1.0), radius_factor=50.0 / "
+            "float((points.double() - torch.tensor([0.1, 0.1, 1.0])).norm(dim=1).max())))[:, 0]",
+            "the radius as a multiple of the distance to the farthest point; hidden points are marked; a viewpoint for "
+            "each cloud; as a step: `RemoveHiddenPoints`",
+            same(0),
+        ),
+        Call(
             "other_pcd.select_by_index(list(range(10)), invert=True)",
             "others[10:]",
             "rows and masks of torch; `cloud.select` for all fields",
@@ -423,6 +431,42 @@ PYG = Section(
             "pcdata.RandomFlip(probability=(0.5, 0, 0))(cloud, generator=generator)",
             "likewise",
         ),
+        Call(
+            "RandomShear(0.2)(data)",
+            "pcdata.RandomShear(low=-0.2, high=0.2)(cloud, generator=generator)",
+            "normals stay at right angles; a range for each entry",
+        ),
+        Call(
+            "LinearTransformation(matrix)(data)",
+            "cloud.transformed(torch.diag(torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=torch.float64))[None])",
+            "4x4, on column vectors as theirs; normals, poses and viewpoints follow",
+        ),
+        Call(
+            "RemoveDuplicatedEdges, RemoveIsolatedNodes on points",
+            "pcdata.Compose([pcdata.RemoveDuplicates(), pcdata.RemoveRadiusOutliers(min_neighbors=1, radius=0.05)])"
+            "(cloud)",
+            "of points, as steps",
+        ),
+        Call(
+            "RandomNodeSplit-like shuffling of rows",
+            "pcdata.RandomShuffle()(cloud, generator=generator)",
+            "a permutation of each cloud, seeded per sample",
+        ),
+        Call(
+            "ComposeFilters, Data.subgraph(mask)",
+            "cloud.select(points[:, 2] > 0.05, F.ptr_from_counts([int((points[:, 2] > 0.05).sum())]))",
+            "any rows; by values of a field: `KeepValues`",
+        ),
+        Call(
+            "Distance()(data).edge_attr",
+            "F.radius_neighbors(points, ptr, radius=0.05, exclude_self=True)[1]",
+            "distances come with the neighbors",
+        ),
+        Call(
+            "Cartesian(norm=False)(data).edge_attr",
+            "(lambda index: points[index] - points[:, None])(F.knn(points, ptr, k=6, exclude_self=True)[0])",
+            "offsets to the neighbors, (N, k, 3)",
+        ),
         Call("KNNGraph(k=6)(data).edge_index", "F.knn(points, ptr, k=6, exclude_self=True)[0]", "a table, not pairs"),
         Call(
             "RadiusGraph(0.05)(data).edge_index",
@@ -443,6 +487,11 @@ PYG = Section(
         Call("ToDense(300)(data)", "cloud.padded(300)", "fields and a mask"),
         Call("fps(pos, batch, ratio=0.5)", "F.farthest_point_sample(points, ptr, ratio=0.5)", "as in torch-cluster"),
     ),
+    missing=(
+        ("`NormalizeRotation`, `NormalizeFeatures`, `AddPositionalEncoding`-like features", "left to the model"),
+        ("`SamplePoints`, `FaceToEdge`, `GenerateMeshNormals`", "of meshes"),
+        ("`ToUndirected`, `AddSelfLoops`, `GCNNorm`, `RandomLinkSplit` and the like", "of graphs"),
+    ),
 )
 
 PCL = Section(
@@ -461,6 +510,12 @@ PCL = Section(
             "pcdata.CropWorkspace(frame='base', lower=(0, 0, 0), upper=(0.1, 0.1, 0.1), "
             "frame_from_box=tuple(map(tuple, pose.tolist())))(cloud)",
             "the pose of the box in the frame",
+        ),
+        Call(
+            "FrustumCulling.setCameraPose, setHorizontalFOV, setVerticalFOV",
+            "pcdata.CropFrustum(frame='base', frame_from_camera=tuple(map(tuple, torch.eye(4).tolist())), fx=60.0, "
+            "fy=60.0, cx=31.5, cy=23.5, size=(48, 64), near=0.01, far=2.0)(cloud)",
+            "a camera of OpenCV's axes, with any lens; `F.frustum_mask` for cameras of many clouds",
         ),
         Call(
             "CropHull (2D)",
@@ -640,7 +695,55 @@ MMDETECTION3D = Section(
             "cells as (x, y, z), of any sign; `F.voxel_downsample` for the points of each",
         ),
         Call(
-            "PolarMix, LaserMix", "pcdata.transforms.mixing.mix_scenes(cloud, cloud)", "whole scenes, labels kept apart"
+            "PolarMix, LaserMix",
+            "pcdata.mix_scenes(cloud, cloud)",
+            "whole scenes, labels kept apart; partners drawn in a dataset: `MixedCloudDataset`",
         ),
+        Call(
+            "PointShuffle",
+            "pcdata.RandomShuffle()(cloud, generator=generator)",
+            "",
+        ),
+        Call(
+            "RandomChoice(transforms=[...], prob=[0.3, 0.7])",
+            "pcdata.RandomOneOf(steps=[pcdata.RandomFlip(), pcdata.RandomShear()], weights=(0.3, 0.7))"
+            "(cloud, generator=generator)",
+            "per cloud; weights need not add up to 1",
+        ),
+        Call(
+            "RandomApply(transforms=[...], prob=0.5)",
+            "pcdata.RandomApply(step=pcdata.RandomJitter(), probability=0.5)(cloud, generator=generator)",
+            "per cloud",
+        ),
+        Call(
+            "GlobalRotScaleTrans(translation_std=[0.1, 0.1, 0.1])",
+            "pcdata.RandomTranslation(max_offset=(0.1, 0.1, 0.1))(cloud, generator=generator)",
+            "uniform, not Gaussian",
+        ),
+        Call(
+            "IndoorPatchPointSample(num_points=64, block_size=0.1)",
+            "pcdata.Compose([pcdata.RandomColumn(size=0.1, min_points=10), pcdata.RandomSample(num_points=64, "
+            "if_short='repeat')])(cloud, generator=generator)",
+            "the column, then the points",
+        ),
+        Call(
+            "NormalizePointsColor(color_mean=[0.5, 0.5, 0.5])",
+            "cloud.with_fields(colors=cloud.colors - 0.5)",
+            "colors are in [0, 1] here, not to 255",
+        ),
+        Call(
+            "MultiViewWrapper",
+            "pcdata.MergeViews()(pcdata.ToFrame(frame='base')(pcdata.Deproject()(frame)))",
+            "a capture has its views from the start",
+        ),
+    ),
+    missing=(
+        (
+            "`ObjectSample`, `ObjectNoise`, `BackgroundPointsFilter`, `ObjectRangeFilter`, `ObjectNameFilter`",
+            "steps on 3D boxes; objects are labels of points here (`ClusterObjects`, `SplitObjects`, `KeepValues`, "
+            "`MixedCloudDataset`), a box is a signal (`CropWorkspace`)",
+        ),
+        ("`RandomShiftScale`, `Resize3D`, `PhotoMetricDistortion3D`", "steps on images for detection in images"),
+        ("mixing by sectors (`PolarMix`, `LaserMix`)", "of spinning lidars; whole scenes are mixed here"),
     ),
 )

@@ -126,6 +126,21 @@ SCIPY = Section(
             same(1e-9),
         ),
         Call(
+            "transform.Rotation.from_euler('xyz', [[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]]).mean().as_matrix()",
+            "pcdata.geometry.rotations.mean_rotation(pcdata.geometry.rotations.rotation_from_euler(torch.tensor("
+            "[[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]], dtype=torch.float64), 'xyz'))",
+            "weights, batches",
+            same(1e-9),
+        ),
+        Call(
+            "transform.Slerp([0, 1], transform.Rotation.from_rotvec([[0.2, 0, 0], [1, 0, 0]]))(0.25).as_quat()"
+            "[[3, 0, 1, 2]]",
+            "pcdata.geometry.rotations.slerp(*pcdata.geometry.rotations.quaternion_from_rotation_vector(torch.tensor("
+            "[[0.2, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)), 0.25)",
+            "quaternions, w first; between two",
+            same(1e-9),
+        ),
+        Call(
             "transform.Rotation.align_vectors((moved - moved.mean(0)).numpy(), (points - points.mean(0)).numpy())[0]"
             ".as_matrix()",
             "F.fit_paired_points(points, moved).matrix[0, :3, :3]",
@@ -218,6 +233,30 @@ TORCHIO = Section(
             "pcdata.RandomApply(step=pcdata.RandomJitter(), probability=0.3)(cloud, generator=generator)",
             "per cloud",
         ),
+        Call(
+            "OneOf({RandomFlip(): 0.3, RandomNoise(): 0.7})",
+            "pcdata.RandomOneOf(steps=[pcdata.RandomFlip(), pcdata.RandomJitter()], weights=(0.3, 0.7))"
+            "(cloud, generator=generator)",
+            "per cloud; steps that keep frame and unit",
+        ),
+        Call(
+            "RandomAffine(scales=(0.9, 1.1, 1, 1, 0.8, 1.2), isotropic=False, center='image')",
+            "pcdata.RandomScale(low=(0.9, 1.0, 0.8), high=(1.1, 1.0, 1.2), per_axis=True, about='centroid')"
+            "(cloud, generator=generator)",
+            "`degrees_xyz`, `min_offset`, `RandomShear` for the others",
+        ),
+        Call("Lambda(function)", "cloud.with_fields(colors=cloud.colors ** 2)", "or a step of your own"),
+        Call(
+            "Crop, CropOrPad",
+            "pcdata.CropWorkspace(frame='base', lower=(0, 0, 0), upper=(0.1, 0.1, 0.1), max_drop=0.9)(cloud)",
+            "`max_drop`: an error, or a warning, where more goes",
+        ),
+        Call(
+            "RandomAnisotropy, Resample",
+            "pcdata.VoxelDownsample(voxel_size=(0.02, 0.02, 0.05))(cloud)",
+            "an edge for each axis",
+        ),
+        Call("Mask(mask)", "pcdata.KeepValues(field='labels', values=(1, 2))(cloud)", "by a field of the points"),
         Call("RandomNoise(std=0.01)", "pcdata.RandomJitter(sigma=0.01)(cloud, generator=generator)", ""),
         Call(
             "RemapLabels({2: 1, 5: 1})",
@@ -235,5 +274,17 @@ TORCHIO = Section(
             "cloud.transformed(cloud.source_from_cloud).points",
             "every motion, back to the frame that was read; `cloud.to_frame` names another",
         ),
+    ),
+    missing=(
+        (
+            "`include`, `exclude`",
+            "what a step changes follows from the kind of each field, so that none is left behind; "
+            "`cloud.with_fields(colors=None)` takes one out",
+        ),
+        (
+            "`RandomElasticDeformation`",
+            "bends objects, which no pose or grasp follows; `RandomShear` and `RandomScale(per_axis=True)` are affine",
+        ),
+        ("`RandomMotion`, `RandomGhosting`, `RandomSpike`, `RandomBiasField`", "artifacts of MRI"),
     ),
 )

@@ -63,6 +63,9 @@ def page() -> str:
             f"| `{_cell(call.theirs)}` | `{_cell(call.ours)}` | {call.differs.replace('|', chr(92) + '|')} |"
             for call in section.calls
         ]
+        if section.missing:
+            lines += ["", "Not here:", ""]
+            lines += [f"- {what}: {why}" for what, why in section.missing]
     return "\n".join(lines) + "\n"
 
 

@@ -165,6 +165,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "NormalizeWorkspace": _of(T.NormalizeWorkspace(frame="base", **BOX)),
     "RandomApply": [
         Example(T.RandomApply(step=T.RandomRotation())),
+        *_of(T.RandomApply(step=T.RandomSensorNoise(sensor="realsense_d435")), make=frame_with_counts),
         Example(T.RandomApply(step=T.RandomPointDropout(), probability=0.8)),
         Example(T.RandomApply(step=T.Compose([T.RandomFlip(), T.RandomScale()]), probability=0.7)),
         Example(T.RandomApply(step=T.RemovePlane(), probability=0.4)),
@@ -187,6 +188,10 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomOcclusion": _of(T.RandomOcclusion(), T.RandomOcclusion(low=0.5, high=1.0)),
     "RandomOneOf": [
         Example(T.RandomOneOf(steps=[T.RandomRotation(), T.RandomScale()])),
+        *_of(
+            T.RandomOneOf(steps=[T.RandomTurnDepth(quarter_turns=(1, 3)), T.MaskDepth(near=0.7), T.Compose([])]),
+            make=frame_with_counts,
+        ),
         Example(
             T.RandomOneOf(
                 steps=[T.RandomPointDropout(), T.Compose([]), T.Compose([T.RandomRotation(), T.RemovePlane()])],
@@ -230,6 +235,7 @@ EXAMPLES: dict[str, list[Example]] = {
             high=((0.0, 0.0, 0.6), (0.1, 0.0, 0.2), (0.0, 0.0, 0.0)),
         ),
     ),
+    "RandomShuffle": _of(T.RandomShuffle()),
     "RandomTranslation": _of(
         T.RandomTranslation(),
         T.RandomTranslation(max_offset=(0.1, 0.0, 0.3)),

@@ -11,7 +11,15 @@ from pcdata import transforms as T
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError
 from pcdata.rng import seeded
 from pcdata.structures import DepthFrame, PointCloud
-from tests.factories import assert_same, cloud_in_base, cloud_in_camera, differences, frame_with_counts, tree
+from tests.factories import (
+    assert_same,
+    cloud_in_base,
+    cloud_in_camera,
+    differences,
+    frame_with_counts,
+    tabletop_frame,
+    tree,
+)
 from tests.messages import told
 from tests.transforms.examples import ALL
 
@@ -203,10 +211,21 @@ def test_whether_a_cloud_is_chosen_shifts_no_later_draw():
     assert factors[0] == factors[1]
 
 
-def test_random_apply_works_on_clouds_only():
-    for step in (T.MaskDepth(), T.Deproject()):
-        with pytest.raises(ConfigError, match=f"RandomApply: {type(step).__name__} does not turn clouds into clouds"):
-            T.RandomApply(step=step)
+def test_random_apply_takes_what_its_step_takes_and_gives():
+    with pytest.raises(ConfigError, match="RandomApply: Deproject does not turn captures into captures"):
+        T.RandomApply(step=T.Deproject())
+    noise = T.RandomApply(step=T.RandomSensorNoise(sensor="realsense_d435"), probability=0.5)
+    chain = T.Compose([noise, T.Deproject(), T.RandomApply(step=T.RandomFlip())])
+    frame, drawn = tabletop_frame(2), set()
+    for seed in range(8):
+        result = chain(frame, generator=seeded(seed))
+        noisy = bool((noise(frame, generator=seeded(seed)).depth != frame.depth).any())
+        assert noisy == any(entry["step"] == "RandomSensorNoise" for entry in result.history[0])
+        assert_same(chain.replay(frame, list(result.history)), result)
+        drawn.add(noisy)
+    assert drawn == {False, True}
+    with pytest.raises(ConfigError, match=r"step 2, RandomApply, takes a DepthFrame"):
+        T.Compose([T.Deproject(), noise])
     with pytest.raises(ConfigError, match=r"RandomApply\.probability"):
         T.RandomApply(step=T.Center(), probability=1.5)
     with pytest.raises(ConfigError, match=r"RandomApply\.step: .*instance of Transform"):
