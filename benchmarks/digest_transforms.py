@@ -159,6 +159,7 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomShear": _of("RandomShear", {}, {"low": 0.1, "high": 0.3, "about": "centroid"}),
     "RandomTurnDepth": _of("RandomTurnDepth", {}),
     "TurnDepth": _of("TurnDepth", {}, {"quarter_turns": 2}),
+    "RandomElastic": _of("RandomElastic", {}),
     "RandomFarthestPointSample": _of("RandomFarthestPointSample", {"num_points": 32, "color_weight": 0.1}),
     "RandomFlip": _of("RandomFlip", {}, {"probability": (0.5, 0.5, 0.5), "about": "centroid"}),
     "RandomJitter": _of("RandomJitter", {}, {"sigma": 0.0001, "clip": None}),

@@ -60,6 +60,7 @@ _HOMES = {
         "RandomCuboid",
         "BilateralFilterDepth",
         "MedianFilterDepth",
+        "RandomElastic",
         "RandomFarthestPointSample",
         "RandomFlip",
         "RandomJitter",

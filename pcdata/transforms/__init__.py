@@ -33,6 +33,7 @@ from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOu
 from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning, UnmeasuredTableWarning
 from pcdata.transforms.random_apply import RandomApply, RandomOneOf
 from pcdata.transforms.random_column import RandomColumn
+from pcdata.transforms.random_elastic import RandomElastic
 from pcdata.transforms.random_jitter import RandomColorDrop, RandomColorJitter, RandomJitter, RandomPointDropout
 from pcdata.transforms.random_motions import (
     RandomFlip,
@@ -90,6 +91,7 @@ __all__ = [
     "RandomColorJitter",
     "RandomColumn",
     "RandomCuboid",
+    "RandomElastic",
     "RandomFarthestPointSample",
     "RandomFlip",
     "RandomJitter",

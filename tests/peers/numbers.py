@@ -245,6 +245,11 @@ TORCHIO = Section(
             "(cloud, generator=generator)",
             "`degrees_xyz`, `min_offset`, `RandomShear` for the others",
         ),
+        Call(
+            "RandomElasticDeformation(num_control_points=7, max_displacement=7.5)",
+            "pcdata.RandomElastic(wavelength=0.2, max_offset=0.01)(cloud, generator=generator)",
+            "a lattice in metres, not a number of control points; refused where it could fold; poses do not follow",
+        ),
         Call("Lambda(function)", "cloud.with_fields(colors=cloud.colors ** 2)", "or a step of your own"),
         Call(
             "Crop, CropOrPad",
@@ -280,10 +285,6 @@ TORCHIO = Section(
             "`include`, `exclude`",
             "what a step changes follows from the kind of each field, so that none is left behind; "
             "`cloud.with_fields(colors=None)` takes one out",
-        ),
-        (
-            "`RandomElasticDeformation`",
-            "bends objects, which no pose or grasp follows; `RandomShear` and `RandomScale(per_axis=True)` are affine",
         ),
         ("`RandomMotion`, `RandomGhosting`, `RandomSpike`, `RandomBiasField`", "artifacts of MRI"),
     ),

@@ -174,6 +174,10 @@ EXAMPLES: dict[str, list[Example]] = {
     "RandomColorDrop": _of(T.RandomColorDrop(), T.RandomColorDrop(probability=0.5, color=(0.5, 0.5, 0.5))),
     "RandomColumn": _of(T.RandomColumn(size=0.15, min_points=3)),
     "RandomCuboid": _of(T.RandomCuboid(), T.RandomCuboid(low=0.1, high=(0.2, 0.3, 0.4), keep="inside")),
+    "RandomElastic": [
+        Example(T.RandomElastic(), displacement=0.01 * math.sqrt(3)),
+        Example(T.RandomElastic(wavelength=0.5, max_offset=0.05), displacement=0.05 * math.sqrt(3)),
+    ],
     "RandomFarthestPointSample": _of(
         T.RandomFarthestPointSample(num_points=32),
         T.RandomFarthestPointSample(num_points=100, if_short="repeat", color_weight=0.1, balance_labels=True),
