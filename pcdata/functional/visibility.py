@@ -15,8 +15,9 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_image_size, checked_places, checked_positive
 from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import projected
+from pcdata.functional.voxels import numbered_rows
 
-_FLAT = 1e-9  # as a part of a set's extent: thinner than this it has a dimension less
+_FLAT = 1e-7  # as a part of a set's extent: thinner than this it has a dimension less
 
 
 def _checked_near(where: str, name: str, arguments: Mapping[str, Any]) -> float:
@@ -108,39 +109,39 @@ def hidden_point_mask(
     assert isinstance(viewpoint, Tensor)  # and makes it (B, 3)
     if radius_factor < 1:
         raise ConfigError(f"hidden_point_mask: radius_factor must be 1 or more, got {radius_factor}")
+    group, number = numbered_rows(points, ptr)  # equal points of a cloud
     bounds, eyes = ptr.tolist(), viewpoint.double().cpu().numpy()
-    rows = points.detach().double().cpu().numpy()
-    hidden = np.ones(len(rows), dtype=np.bool_)
+    rows, groups = points.detach().double().cpu().numpy(), group.cpu().numpy()
+    visible = np.zeros(number, dtype=np.bool_)
     for eye, start, stop in zip(eyes, bounds[:-1], bounds[1:], strict=True):
-        hidden[start:stop] = _hidden(rows[start:stop] - eye, radius_factor)
-    return torch.from_numpy(hidden).to(points.device)
+        visible[groups[start:stop][_seen(rows[start:stop] - eye, radius_factor)]] = True
+    return torch.from_numpy(~visible[groups]).to(points.device)
 
 
-def _hidden(rays: NDArray[np.float64], radius_factor: float) -> NDArray[np.bool_]:
-    """Decide about the points of one cloud, (n, 3) from the eye."""
-    own, number = np.unique(rays, axis=0, return_inverse=True)
-    distance = np.sqrt((own * own).sum(1))
-    away = distance > 0
-    hidden = np.zeros(len(own), dtype=np.bool_)
-    if away.any():
-        ray, length = own[away], distance[away, None]
-        flipped = ray * (2 * radius_factor * length.max() / length - 1)
-        corners = _hull_corners(np.concatenate([flipped, np.zeros((1, 3))]))
-        hidden[away] = ~np.isin(np.arange(len(ray)), corners)
-    return hidden[number.reshape(-1)]
+def _seen(rays: NDArray[np.float64], radius_factor: float) -> NDArray[np.int64]:
+    """Return rows of one cloud, (n, 3) from the eye, that are visible; of equal ones, one at least."""
+    distance = np.sqrt((rays * rays).sum(1))
+    away, near = np.flatnonzero(distance > 0), np.flatnonzero(distance == 0)
+    if not len(away):
+        return near
+    length = distance[away, None]
+    flipped = rays[away] * (2 * radius_factor * length.max() / length - 1)
+    corners = _hull_corners(np.concatenate([flipped, np.zeros((1, 3))]))
+    return np.concatenate([near, away[corners[corners < len(away)]]])
 
 
 def _hull_corners(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the corners of the convex hull of (n, 3) points, which may lie in a plane or on a line."""
     from scipy.spatial import ConvexHull, QhullError
 
-    _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
-    dimensions = int((extents > _FLAT * max(extents[0], np.finfo(np.float64).tiny)).sum()) if len(points) > 1 else 0
+    centered = points - points.mean(0)
+    squares, axes = np.linalg.eigh(centered.T @ centered)
+    dimensions = int((squares > _FLAT**2 * squares[2]).sum())
     while dimensions > 1:
         try:
-            places = points if dimensions == 3 else points @ axes[:dimensions].T
+            places = points if dimensions == 3 else points @ axes[:, 3 - dimensions :]
             return ConvexHull(places).vertices.astype(np.int64)
         except QhullError:  # flat to its eyes
             dimensions -= 1
-    along = points @ axes[0]
+    along = points @ axes[:, 2]
     return np.array([along.argmin(), along.argmax()], dtype=np.int64)
