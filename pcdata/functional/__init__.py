@@ -31,14 +31,13 @@ from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_
 from pcdata.functional.paired_points import PairedMotion, fit_paired_points
 from pcdata.functional.plane_segments import segment_planes, supporting_plane
 from pcdata.functional.planes import ransac_plane
+from pcdata.functional.ranges import deproject_ranges, render_ranges
 from pcdata.functional.rectangles import smallest_rectangle
 from pcdata.functional.rendering import (
     RenderedPoints,
     RenderedTriangles,
-    deproject_ranges,
     depth_normals,
     render_points,
-    render_ranges,
     render_triangles,
 )
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, near_matches
@@ -15,6 +15,8 @@ from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.neighbors import checked_radius, finder, nearest_rows
 
 _ROWS = 1 << 21  # neighbors whose offsets are alive at once
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
+_OF_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # where each entry of the matrix lies among them
 
 
 @op(
@@ -62,19 +64,45 @@ def neighborhood_covariance(
     assert ptr is not None  # @op fills it
     own = {} if queries is None else {"queries": queries.detach(), "queries_ptr": queries_ptr}
     index, _ = finder(points, ptr, grid, backend)(max_neighbors, **own, radius=radius)
-    centers = (points if queries is None else queries).detach().double()
+    centers = (points if queries is None else queries).detach()
+    carries = torch.is_grad_enabled() and points.requires_grad
+    return neighborhood_shapes(points, index, centers, backend="torch" if carries else backend)
+
+
+@inner
+def neighborhood_shapes(
+    points: Tensor,  # (N, 3) float32
+    index: Tensor,  # (Q, K) int64 neighbors; N = missing, and those come last
+    centers: Tensor,  # (Q, 3) float32
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # mean (Q, 3) float32, covariance (Q, 3, 3) float64, count (Q,) int64
+    """Return mean and covariance of neighbors that were found; sums are in float64, in their order."""
     wide = torch.cat([points.double(), points.new_zeros(1, 3, dtype=torch.float64)])
+    count = (index < len(points)).sum(1)
+    at_once = max(1, _ROWS // max(1, index.shape[1]))
     parts = []
-    for rows, center in zip(index.split(max(1, _ROWS // max_neighbors)), centers.split(max(1, _ROWS // max_neighbors))):
-        found = (rows < len(points))[..., None]
+    for rows, center in zip(index.split(at_once), centers.double().split(at_once)):
+        found = rows < len(points)
         # Offsets from the query keep all digits however far the cloud lies from the origin.
-        offset = torch.where(found, wide[rows] - center[:, None], 0.0)
-        number = found.sum(1).clamp(min=1)
-        mean = offset.sum(1) / number
-        offset = torch.where(found, offset - mean[:, None], 0.0)
-        parts.append(((center + mean) * (found.any(1)), offset.mT @ offset / number[..., None]))
-    mean, covariance = (torch.cat(values) for values in zip(*parts)) if parts else (centers, centers[:, :, None] * 0.0)
-    return mean.float(), covariance.expand(-1, 3, 3), (index < len(points)).sum(1)
+        offset = torch.where(found[..., None], wide[rows] - center[:, None], 0.0)
+        number = found.sum(1).clamp(min=1)[:, None]
+        mean = _summed(offset) / number
+        offset = torch.where(found[..., None], offset - mean[:, None], 0.0)
+        square = _summed(torch.stack([offset[..., i] * offset[..., j] for i, j in _ENTRIES], dim=-1)) / number
+        parts.append((torch.where(found.any(1)[:, None], center + mean, 0.0).float(), square[:, _OF_MATRIX]))
+    if not parts:
+        return centers.float(), centers.new_zeros(0, 3, 3, dtype=torch.float64), count
+    mean, square = (torch.cat(values) for values in zip(*parts))
+    return mean, square.reshape(-1, 3, 3), count
+
+
+def _summed(values: Tensor) -> Tensor:
+    """Sum (Q, K, ...) over K one after another: the same bits on every backend."""
+    total, *others = values.unbind(1)
+    for other in others:
+        total = total + other
+    return total
 
 
 # Name -> what it is of the eigenvalues a >= b >= c. Weinmann et al., ISPRS Journal 105, 2015; surface variation: Pauly

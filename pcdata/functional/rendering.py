@@ -1,4 +1,4 @@
-"""Points, triangles and spinning lidars as images: who is in front at every pixel.
+"""Points and triangles as images: who is in front at every pixel.
 
 Source: the z-buffer is Catmull's, 1974; rays against triangles Moeller & Trumbore, 1997.
 """
@@ -6,7 +6,7 @@ Source: the z-buffer is Catmull's, 1974; rays against triangles Moeller & Trumbo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_image_size, checked_positive
-from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import pixel_rays, project_points, projected
 from pcdata.functional.rows import cloud_of_rows
 
@@ -84,14 +83,23 @@ def render_points(
     width = point_size * focal / torch.where(visible, z, 1.0).double()[:, None]
     half = width.clamp(1.0, float(_LARGEST)) / 2
     boxes = _Boxes.about(at - half, at + half, visible, view, size)
-    image = torch.full((len(intrinsics) * size[0] * size[1],), _EMPTY, dtype=torch.int64, device=points.device)
-    keys = _keys(z)
-    for rows, target in boxes.pixels():
+    return in_front(z, boxes.pixels(), (len(intrinsics), *size))
+
+
+def in_front(
+    depth: Tensor,  # (N,) float32
+    targets: Iterable[tuple[Tensor, Tensor]],  # rows and a pixel of each, int64, counted over all images
+    shape: tuple[int, int, int],  # (V, H, W)
+) -> RenderedPoints:
+    """Return the row with the least positive depth of all that a pixel is a target of, the first of equals."""
+    image = torch.full((math.prod(shape),), _EMPTY, dtype=torch.int64, device=depth.device)
+    keys = _keys(depth)
+    for rows, target in targets:
         image.scatter_reduce_(0, target, keys[rows], "amin")
-    image = image.reshape(len(intrinsics), *size)
+    image = image.reshape(shape)
     found = image != _EMPTY
-    depth = torch.where(found, (image >> _INDEX_BITS).int().view(torch.float32), 0.0)
-    return RenderedPoints(depth, torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(points)))
+    least = torch.where(found, (image >> _INDEX_BITS).int().view(torch.float32), 0.0)
+    return RenderedPoints(least, torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(depth)))
 
 
 @inner
@@ -219,113 +227,6 @@ class _Boxes(NamedTuple):
             for column in range(int(self.across[left].max()) if len(left) else 0):
                 left = left[self.across[left] > column]
                 yield left, self.first[left] + (row * self.width + column)
-
-
-@inner
-def least_at_pixels(
-    value: Tensor,  # (N,) float32
-    pixel: Tensor,  # (N,) int64, -1 = nowhere
-    num_pixels: int,
-    *,
-    backend: str = "auto",
-) -> tuple[Tensor, Tensor]:  # least (P,) float32, index (P,) int64
-    """Return the row with the least positive value at every pixel, the first of equals; value 0 and N where none is."""
-    image = torch.full((num_pixels,), _EMPTY, dtype=torch.int64, device=value.device)
-    somewhere = pixel >= 0
-    image.scatter_reduce_(0, pixel[somewhere], _keys(value)[somewhere], "amin")
-    found = image != _EMPTY
-    least = torch.where(found, (image >> _INDEX_BITS).int().view(torch.float32), 0.0)
-    return least, torch.where(found, image & ((1 << _INDEX_BITS) - 1), len(value))
-
-
-@op(
-    points="N 3",
-    ptr="ptr N V",
-    size=checked_image_size,
-    steps=(least_at_pixels,),
-    gradient=False,
-)
-def render_ranges(
-    points: Tensor,  # (N, 3) float32 metres in the frame of the lidar: x forward, y left, z up
-    ptr: Tensor | None = None,  # (V+1,)
-    *,
-    size: tuple[int, int],  # (beams, columns of a turn)
-    elevations: tuple[float, float] = (-0.4363, 0.0524),
-    backend: str = "auto",
-) -> RenderedPoints:
-    """Render every cloud as the range image of a spinning lidar: at each pixel the nearest point's distance.
-
-    Row 0 looks up most. Rows are equal steps of the elevation from ``elevations[1]`` down to ``elevations[0]``, their
-    centers at both ends; column 0 is straight back and columns turn clockwise seen from above (left to right as the
-    sensor looks), their centers half a step in. Points between rows belong to the nearest one; those more than half a
-    step beyond the outer rows, and those at distance 0, are left out. Ranges are float32, 0 = nothing.
-
-    Args:
-        points: the clouds.
-        ptr: row pointers of the points.
-        size: beams and columns.
-        elevations: of the lowest and highest beam in radians; the default is that of an HDL-64E.
-        backend: which body to run.
-
-    Raises:
-        ConfigError: a size below one pixel, or elevations that do not ascend within a quarter turn.
-
-    Source: Milioto et al., RangeNet++, 2019, section III-A, with beams at pixel centers.
-    """
-    assert ptr is not None
-    beams, columns = size
-    low, high = _checked_elevations("render_ranges", elevations)
-    x, y, z = points.double().unbind(-1)
-    flat = torch.hypot(x, y)
-    ranges = torch.hypot(flat, z)
-    step = (high - low) / max(1, beams - 1)
-    row = ((high - torch.atan2(z, flat)) / step + 0.5).floor()
-    column = ((math.pi - torch.atan2(y, x)) * (columns / (2 * math.pi))).floor().remainder(columns)
-    distance = ranges.float()
-    inside = (row >= 0) & (row < beams) & (distance > 0)
-    target = (cloud_of_rows(ptr) * beams + torch.where(inside, row, 0.0).long()) * columns + column.long()
-    pixels = (len(ptr) - 1) * beams * columns
-    seen, index = least_at_pixels(distance, torch.where(inside, target, -1), pixels, backend=backend)
-    shape = (len(ptr) - 1, beams, columns)
-    return RenderedPoints(seen.reshape(shape), index.reshape(shape))
-
-
-@op(ranges="V H W : depth")
-def deproject_ranges(
-    ranges: Tensor,  # (V, H, W) float32 metres along the beam, 0 = no reading
-    *,
-    elevations: tuple[float, float] = (-0.4363, 0.0524),
-    backend: str = "auto",
-) -> tuple[Tensor, Tensor, Tensor]:  # points (M, 3) float32, ptr (V+1,), pixel_index (M,) int64
-    """Turn the range images of a spinning lidar into points, at the centers of their pixels: x forward, y left, z up.
-
-    The way back of :func:`render_ranges`: a cloud of one point per pixel comes back to half a pixel.
-
-    Raises:
-        CaptureError: a negative range.
-        ConfigError: elevations that do not ascend within a quarter turn.
-    """
-    views, beams, columns = ranges.shape
-    low, high = _checked_elevations("deproject_ranges", elevations)
-    row = torch.arange(beams, dtype=torch.float64, device=ranges.device)[:, None]
-    column = torch.arange(columns, dtype=torch.float64, device=ranges.device)
-    elevation = high - row * ((high - low) / max(1, beams - 1))
-    azimuth = math.pi - (column + 0.5) * (2 * math.pi / columns)
-    directions = torch.stack(
-        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin().expand(-1, columns)], dim=-1
-    )
-    valid = ranges > 0
-    points = (directions.expand(views, -1, -1, -1)[valid] * ranges[valid].double()[:, None]).float()
-    counts = valid.sum(dim=(1, 2))
-    ptr = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    return points, ptr, valid.flatten(1).nonzero()[:, 1]
-
-
-def _checked_elevations(where: str, elevations: tuple[float, float]) -> tuple[float, float]:
-    low, high = elevations
-    if not -math.pi / 2 <= low < high <= math.pi / 2:
-        raise ConfigError(f"{where}: elevations must ascend within -pi/2 .. pi/2 radians, got {elevations}")
-    return float(low), float(high)
 
 
 @op(

@@ -11,6 +11,7 @@ from torch import Tensor
 from pcdata.errors import CaptureError, DTypeError, FrameError, ShapeError
 from pcdata.functional.rendering import render_points, render_triangles
 from pcdata.functional.rows import transform_points
+from pcdata.functional.shading import shaded
 from pcdata.geometry import rigid
 from pcdata.structures.camera import Camera
 from pcdata.structures.depth_frame import DepthFrame
@@ -39,10 +40,25 @@ class _Front(NamedTuple):
     """What is in front, and the points of the cloud that make it up: one, or the corners of a triangle."""
 
     depth: Tensor  # (V, H, W)
-    item: Tensor  # (V, H, W) int64 point or triangle in front
-    found: Tensor  # (V, H, W) bool
-    rows: Tensor  # (P, K) of the cloud, for the pixels that were found
-    mixing: Tensor  # (P, K) float32, sum 1
+    item: Tensor  # (V, H, W) int64 point or triangle in front, at least num_items where nothing is
+    num_items: int
+    corners: Tensor | None = None  # (T, 3) points of the triangles
+    weights: Tensor | None = None  # (V, H, W, 3) float32 of the corners
+
+    def of(self, values: Tensor, *, as_bytes: bool = False) -> Tensor:  # (V, H, W, 3)
+        """Mix values (N, 3) of the points at every pixel."""
+        weights = None if self.weights is None else self.weights.flatten(0, 2)
+        item = self.item.flatten()
+        mixed = shaded(values, item, self.num_items, self.corners, weights, as_bytes=as_bytes)
+        return mixed.reshape(*self.item.shape, 3)
+
+    def nearest_point(self) -> tuple[Tensor, Tensor]:
+        """Return which pixels (V, H, W) see something, and the point that each of them (P,) sees nearest."""
+        found = self.item < self.num_items
+        front = self.item[found]
+        if self.corners is None or self.weights is None:
+            return found, front
+        return found, self.corners[front].gather(1, self.weights[found].argmax(1, keepdim=True))[:, 0]
 
 
 def render(
@@ -95,20 +111,18 @@ def render(
         rigid.check_rigid(f"{where}: world_from_camera", world_from_camera)
         matrix = rigid.invert_rigid(world_from_camera.double())
     front = _front(shown, camera, matrix, point_size)
-    depth, found, rows, mixing = front.depth, front.found, front.rows, front.mixing
+    depth = front.depth
     normals = colors = labels = None
     if cloud.normals is not None:
-        mixed = torch.nn.functional.normalize((cloud.normals[rows] * mixing[..., None]).sum(1), dim=-1)
-        turns = matrix[:, :3, :3].float()[found.nonzero()[:, 0]]
-        normals = depth.new_zeros(*depth.shape, 3)
-        normals[found] = (turns @ mixed[..., None])[..., 0]
+        mixed = torch.nn.functional.normalize(front.of(cloud.normals), dim=-1)
+        turned = matrix[:, None, None, :3, :3].float() @ mixed[..., None]
+        normals = turned[..., 0]
     if cloud.colors is not None:
-        colors = torch.zeros(*depth.shape, 3, dtype=torch.uint8, device=depth.device)
-        mixed = (cloud.colors[rows] * mixing[..., None]).sum(1)
-        colors[found] = (255 * mixed).round().clamp(0, 255).to(torch.uint8)
+        colors = front.of(cloud.colors, as_bytes=True)
     if cloud.labels is not None:
+        found, rows = front.nearest_point()
         labels = torch.full(depth.shape, -1, dtype=torch.int64, device=depth.device)
-        labels[found] = cloud.labels[rows.gather(1, mixing.argmax(1, keepdim=True))[:, 0]]
+        labels[found] = cloud.labels[rows]
     frame = DepthFrame(
         depth=depth,
         camera=camera,
@@ -123,20 +137,24 @@ def render(
 def _front(shown: PointCloud | SurfaceMesh, camera: Camera, matrix: Tensor, point_size: float) -> _Front:
     """Render what is shown in all views at once; matrix (V, 4, 4) leads to the cameras."""
     cloud = shown.vertices if isinstance(shown, SurfaceMesh) else shown
-    views = camera.num_views
+    views, points = camera.num_views, cloud.points
     starts = torch.arange(views + 1, dtype=torch.int64, device=matrix.device)
-    points = transform_points(cloud.points.repeat(views, 1), starts * cloud.num_points, matrix)
+    if views > 1 or cloud.frame_id != CAMERA_FRAME:
+        points = transform_points(points.repeat(views, 1), starts * cloud.num_points, matrix)
     k, lens, size = camera.intrinsics, camera.distortion, camera.size
     if isinstance(shown, SurfaceMesh):
         total = len(shown.triangles)
         corners = points.reshape(views, -1, 3)[:, shown.triangles].flatten(0, 1)
         seen = render_triangles(corners, starts * total, intrinsics=k, distortion=lens, size=size)
-        found = seen.triangle_index < len(corners)
-        index = torch.where(found, seen.triangle_index % max(1, total), total)
-        return _Front(seen.depth, index, found, shown.triangles[index[found]], seen.weights[found])
+        index = _within_view(seen.triangle_index, total, views)
+        return _Front(seen.depth, index, total, shown.triangles, seen.weights)
     total = cloud.num_points
     spots = render_points(points, starts * total, intrinsics=k, distortion=lens, size=size, point_size=point_size)
-    found = spots.point_index < len(points)
-    index = torch.where(found, spots.point_index % max(1, total), total)
-    rows = index[found][:, None]
-    return _Front(spots.depth, index, found, rows, torch.ones_like(rows, dtype=torch.float32))
+    return _Front(spots.depth, _within_view(spots.point_index, total, views), total)
+
+
+def _within_view(index: Tensor, total: int, views: int) -> Tensor:
+    """Number the items of each view from 0 on: those of all follow one another; ``total`` is nothing."""
+    if views == 1:
+        return index
+    return torch.where(index < views * total, index % max(1, total), total)

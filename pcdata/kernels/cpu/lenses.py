@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth.undistortion import undistortion_map
+from pcdata.geometry import radial_lenses
 from pcdata.geometry.lens import CONVERGED, MAX_STEPS
 from pcdata.kernels.cpu.native import call, room, room_for
 
@@ -17,6 +18,15 @@ def unbent(target: Tensor, twelve: Tensor, after: bool, fold: float) -> Tensor:
     solved = room(target.shape, torch.float64)
     lens = torch.cat([twelve.double(), twelve.new_tensor([float(after), fold], dtype=torch.float64)])
     call("pc_unbend", target.double().contiguous(), len(target), lens, MAX_STEPS, CONVERGED, solved)
+    return solved
+
+
+@kernel("fisheye_rays", "cpu")
+def fisheye_rays(xy: Tensor, coefficients: Tensor, largest: float) -> Tensor:
+    """Take the steps of some rays side by side."""
+    solved = room(xy.shape, torch.float64)
+    arrays = xy.double().contiguous(), len(xy), coefficients.double().contiguous()
+    call("pc_unbend_fisheye", *arrays, largest, radial_lenses.MAX_STEPS, radial_lenses.CONVERGED, solved)
     return solved
 
 

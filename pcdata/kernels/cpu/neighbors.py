@@ -15,6 +15,7 @@ from torch import Tensor
 # The operations must be registered before their kernels.
 import pcdata.functional.clusters
 import pcdata.functional.neighbor_index
+import pcdata.functional.neighborhoods
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
@@ -233,6 +234,17 @@ def estimate_normals(
     most = _reachable(max_neighbors, points)
     call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(radius), *_grid_arguments(grid), normals)
     return normals
+
+
+@kernel("neighborhood_shapes", "cpu")
+def neighborhood_shapes(points: Tensor, index: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum up one neighborhood after another."""
+    queries, k = index.shape
+    mean, covariance = room_for(((queries, 3), torch.float32), ((queries, 3, 3), torch.float64))
+    counts = room(queries, torch.int64)
+    arrays = points.detach().contiguous(), len(points), index.contiguous(), queries, k, centers.contiguous()
+    call("pc_neighborhood_shapes", *arrays, mean, covariance, counts)
+    return mean, covariance, counts
 
 
 def _neighbors(

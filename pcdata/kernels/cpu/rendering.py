@@ -1,13 +1,17 @@
-"""Points and triangles projected, and who is in front at every pixel."""
+"""Points and triangles projected, who is in front at every pixel, and what it looks like."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+import pcdata.functional.shading  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth.deproject import check_camera
+from pcdata.functional.ranges import pixel_borders, pixel_turns
 from pcdata.functional.rendering import RenderedPoints
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.geometry.lens import plain_lenses
 from pcdata.kernels.cpu.native import call, room, room_for
 
@@ -58,15 +62,56 @@ def render_points(
     return RenderedPoints(depth, index)
 
 
-@kernel("least_at_pixels", "cpu")
-def least_at_pixels(value: Tensor, pixel: Tensor, num_pixels: int) -> tuple[Tensor, Tensor]:
-    """Keep the least key of every pixel, whichever thread brings it."""
-    if len(value) > _MAX_ROWS:
-        found: tuple[Tensor, Tensor] = INNER["least_at_pixels"].reference(value, pixel, num_pixels)
+@kernel("render_ranges", "cpu")
+def render_ranges(
+    *, points: Tensor, ptr: Tensor, size: tuple[int, int], elevations: tuple[float, float]
+) -> RenderedPoints:
+    """Place and draw in one pass."""
+    borders = pixel_borders("render_ranges", size, elevations)
+    if len(points) > _MAX_ROWS:
+        found: RenderedPoints = OPERATIONS["render_ranges"].reference(points, ptr, size=size, elevations=elevations)
         return found
-    least, index = room_for(((num_pixels,), torch.float32), ((num_pixels,), torch.int64))
-    call("pc_least_at_pixels", value.contiguous(), pixel.contiguous(), len(value), num_pixels, least, index)
-    return least, index
+    shape = (len(ptr) - 1, *size)
+    depth, index = room_for((shape, torch.float32), (shape, torch.int64))
+    call("pc_render_ranges", points, ptr, len(ptr) - 1, *size, *borders, depth, index)
+    return RenderedPoints(depth, index)
+
+
+@kernel("deproject_ranges", "cpu")
+def deproject_ranges(*, ranges: Tensor, elevations: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
+    """Count the readings of every row, then write their points."""
+    views, beams, columns = ranges.shape
+    turns = pixel_turns("deproject_ranges", (beams, columns), elevations)
+    # Not torch's sum: its threads would be woken for a fraction of a millisecond.
+    starts = ptr_from_counts(torch.from_numpy(np.count_nonzero(ranges.flatten(0, 1).numpy() > 0, axis=1)))
+    size = int(starts[-1])
+    points, pixel_index = room_for(((size, 3), torch.float32), ((size,), torch.int64))
+    call("pc_deproject_ranges", ranges, views, beams, columns, starts, *turns, points, pixel_index)
+    first = torch.arange(views + 1, dtype=torch.int64, device="cpu") * beams
+    return points, starts[first], pixel_index
+
+
+@kernel("shaded", "cpu")
+def shaded(
+    values: Tensor,
+    item: Tensor,
+    num_items: int,
+    corners: Tensor | None = None,
+    weights: Tensor | None = None,
+    *,
+    as_bytes: bool = False,
+) -> Tensor:
+    """Mix and round in one pass."""
+    pixels = len(item)
+    (result,) = room_for(((pixels, 3), torch.uint8 if as_bytes else torch.float32))
+    where = item.contiguous(), pixels, num_items
+    mixing = (
+        (None, None, 1)
+        if corners is None or weights is None
+        else (corners.contiguous(), weights.contiguous(), corners.shape[1])
+    )
+    call("pc_shade", *where, *mixing, values.contiguous(), *((None, result) if as_bytes else (result, None)))
+    return result
 
 
 @kernel("front_triangles", "cpu")

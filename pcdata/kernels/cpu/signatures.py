@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xF35E76D0795FD56
+INTERFACE_NUMBER = 0x0EB6250A0CBEAE2
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -40,10 +40,17 @@ pc_duplicate_mask: float* points, int64* ptr, int64 num_clouds, uint8* repeats
 pc_project_points: double* points, int64* ptr, int64 views, double* intrinsics, double* lenses, double* pixels
 pc_render_points: float* points, int64* ptr, int64 views, double* intrinsics, double* lenses, int64 height, int64 width,
     double point_size, float* depth, int64* index
-pc_least_at_pixels: float* value, int64* pixel, int64 rows, int64 pixels, float* least, int64* index
+pc_render_ranges: float* points, int64* ptr, int64 views, int64 beams, int64 columns, double* row_borders, double*
+    column_borders, float* depth, int64* index
+pc_deproject_ranges: float* ranges, int64 views, int64 beams, int64 columns, int64* starts, double* row_turns, double*
+    column_turns, float* points, int64* pixel_index
+pc_shade: int64* item, int64 pixels, int64 items, int64* corners, float* weights, int64 num_corners, float* values,
+    float* mixed, uint8* bytes
 pc_front_triangles: int64* first, int64* across, int64* down, int64 triangles, int64 width, double* rays, int64 pixels,
     double* normals, double* offsets, double* sides, float* depth, int64* index, float* weights
 pc_unbend: double* bent, int64 count, double* lens, int64 steps, double converged, double* solved
+pc_unbend_fisheye: double* bent, int64 count, double* coefficients, double largest, int64 steps, double converged,
+    double* solved
 pc_sample_image: uint8* whole, float* real, int64 views, int64 height, int64 width, int64 channels, double* places,
     int64 out_pixels, int64 nearest, uint8* sampled_whole, float* sampled_real, uint8* valid
 pc_sample_depth: float* depth, int64 views, int64 height, int64 width, double* places, int64 out_pixels, int64 surface,
@@ -61,6 +68,8 @@ pc_count_within: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes,
 pc_list_within: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes, float* groups, int64* group_ptr, float*
     radii, int64 per_query, int64 exclude_self, int64* neighbors_ptr, int64* index, float* distance
 pc_nearest_squared: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, float* squared
+pc_neighborhood_shapes: float* points, int64 num_points, int64* index, int64 num_queries, int64 k, float* centers,
+    float* mean, double* covariance, int64* counts
 pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
     double* camera, float* normals
 pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_neighbors, double std_ratio, int64*

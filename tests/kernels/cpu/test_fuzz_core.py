@@ -29,7 +29,9 @@ pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(w
 # Compared in ways of their own: a direction may be free, a fit may add in another order.
 OWN_CHECKS = {"estimate_normals", "ransac_plane"}
 # Sums of what knn and ball_query find, in torch.
-OWN_CHECKS |= {"f_score", "hausdorff_distance", "interpolate_features", "neighborhood_covariance"}
+OWN_CHECKS |= {"f_score", "hausdorff_distance", "interpolate_features"}
+# Its second step alone, below.
+OWN_CHECKS |= {"neighborhood_covariance"}
 # Planes that ransac_plane's steps find, chosen among in torch.
 OWN_CHECKS |= {"segment_planes", "supporting_plane"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
@@ -238,6 +240,9 @@ def fuzz_neighborhoods(rng: np.random.Generator, points: Tensor, ptr: Tensor, gr
     check_normals(seen, ptr, radius=radius, max_neighbors=k, grid=grid)
     check("core_point_mask", seen, ptr, eps=radius, min_points=int(rng.integers(1, 12)))
     check("dbscan", seen, ptr, eps=radius, min_points=int(rng.integers(1, 12)))
+    found = F.knn(points, ptr, k=k)[0]
+    ours, theirs = (body(points.detach(), found, points.detach()) for body in both("neighborhood_shapes"))
+    assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
 def fuzz_queries(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> None:
@@ -327,9 +332,32 @@ def fuzz_rendering(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> Non
     check("project_points", seen, ptr, **cameras)
     check("render_points", seen, ptr, size=size, point_size=float(rng.choice([0.0, 0.1, 10.0])), **cameras)
     check("render_ranges", seen, ptr, size=size)
+    low, high = sorted(rng.choice([-np.pi / 2, -1.0, -0.2, 0.0, 0.5, np.pi / 2], 2, replace=False).tolist())
+    check("render_ranges", seen, ptr, size=size, elevations=(low, high))
+    ranges = torch.from_numpy(rng.choice([0.0, 0.5, 2.0, 1e4], (int(rng.integers(1, 4)), *size))).float()
+    turned = ranges.mT.contiguous().mT if rng.random() < 0.5 else ranges
+    check("deproject_ranges", turned, elevations=(low, high))
+    fuzz_shading(rng, points.detach())
     triangles = points.detach()[: len(points) // 3 * 3].reshape(-1, 3, 3) + torch.tensor([0.0, 0.0, 2.0])
     counts = [len(triangles) if view == 0 else 0 for view in range(views)]
     check("render_triangles", triangles, ptr_from_counts(counts), size=size, **cameras)
+
+
+def fuzz_shading(rng: np.random.Generator, values: Tensor) -> None:
+    pixels, items = int(rng.integers(0, 300)), int(rng.integers(0, 40))
+    alone = torch.from_numpy(rng.integers(0, len(values) + 1, pixels))
+    given: list[tuple[Any, ...]] = [(alone, len(values), None, None)]
+    if len(values):
+        corners = torch.from_numpy(rng.integers(0, len(values), (items, 3)))
+        weights = torch.from_numpy(rng.random((pixels, 3))).float()
+        given.append((torch.from_numpy(rng.integers(0, items + 2, pixels)), items, corners, weights))
+    for arguments in given:
+        for as_bytes in (False, True):
+            ours, theirs = (
+                body(strided(rng, values).detach(), *arguments, as_bytes=as_bytes) for body in both("shaded")
+            )
+            assert ours.dtype == theirs.dtype
+            assert torch.equal(ours, theirs)
 
 
 def fuzz_rows(rng: np.random.Generator, points: Tensor, ptr: Tensor) -> None:
@@ -376,10 +404,16 @@ def fuzz_lenses(rng: np.random.Generator, depth: Tensor, intrinsics: Tensor, len
     size = None if rng.random() < 0.5 else (int(rng.integers(1, 40)), int(rng.integers(1, 50)))
     check("undistort_depth", depth, intrinsics, lens, size=size, rule=rule, max_jump=float(rng.choice([0.002, 0.5])))
     for image in (
-        torch.from_numpy(rng.integers(0, 256, (views, height, width, 3), dtype=np.uint8)),
+        torch.from_numpy(rng.integers(0, 256, (views, height, width, int(rng.integers(1, 6))), dtype=np.uint8)),
+        torch.from_numpy(rng.choice([0, 255], (views, height, width, 3)).astype(np.uint8)),
         torch.from_numpy(rng.normal(size=(views, height, width, 1))).float(),
     ):
         check("undistort_image", image, intrinsics, lens, size=size, rule=str(rng.choice(["nearest", "bilinear"])))
+    bent = torch.from_numpy(rng.normal(size=(int(rng.integers(0, 200)), 2)) * rng.choice([1e-12, 0.3, 3.0]))
+    fisheye = bent, torch.from_numpy(rng.normal(size=4) * 0.02), float(rng.choice([0.4, 1.2, 1.56]))
+    ours, theirs = (body(*fisheye) for body in both("fisheye_rays"))
+    assert torch.equal(ours.isnan(), theirs.isnan())
+    assert torch.equal(ours.nan_to_num(), theirs.nan_to_num())
     plain = plain_lenses(lens)
     if plain is not None:
         target = torch.from_numpy(rng.normal(size=(200, 2)))

@@ -168,10 +168,28 @@ PC_EXPORT int32_t pc_render_points(const pc_context* context, const float* point
                                    const double* intrinsics, const double* lenses, int64_t height, int64_t width,
                                    double point_size, float* depth, int64_t* index);
 
-// The row with the least positive value at every pixel, the first of equals: least (pixels,), 0 where there is none,
-// and index, N where there is none. pixel (rows,) is -1 for rows that are nowhere; less than 2^32 rows.
-PC_EXPORT int32_t pc_least_at_pixels(const pc_context* context, const float* value, const int64_t* pixel, int64_t rows,
-                                     int64_t pixels, float* least, int64_t* index);
+// The nearest point at every pixel of a spinning lidar's range images (views, beams, columns): depth, its distance, 0
+// where there is none, and index, its row, N where there is none. A direction is in the row of the last of row_borders
+// (beams + 1,) that -z / (sqrt(x^2 + y^2) + |z|) reaches, both rising, and in as many columns as it reaches
+// column_borders (columns - 1,) with 1 + x / (|x| + |y|) where y >= 0, else 3 minus that quotient. Less than 2^32
+// points.
+PC_EXPORT int32_t pc_render_ranges(const pc_context* context, const float* points, const int64_t* ptr, int64_t views,
+                                   int64_t beams, int64_t columns, const double* row_borders,
+                                   const double* column_borders, float* depth, int64_t* index);
+
+// The points (M, 3) of the positive pixels of range images, at cosine and sine of the elevation of each row (beams, 2)
+// and of the azimuth of each column (columns, 2), and their pixel_index; those of each row of all images begin at
+// starts (views * beams + 1,).
+PC_EXPORT int32_t pc_deproject_ranges(const pc_context* context, const float* ranges, int64_t views, int64_t beams,
+                                      int64_t columns, const int64_t* starts, const double* row_turns,
+                                      const double* column_turns, float* points, int64_t* pixel_index);
+
+// What the item (pixels,) in front has of values (N, 3), 0 where it is not below `items`: its row, or, with corners
+// (items, num_corners), the sum of theirs, each times its weight (pixels, num_corners). As mixed (pixels, 3), or as
+// bytes: 255 times that, rounded; either may be null.
+PC_EXPORT int32_t pc_shade(const pc_context* context, const int64_t* item, int64_t pixels, int64_t items,
+                           const int64_t* corners, const float* weights, int64_t num_corners, const float* values,
+                           float* mixed, uint8_t* bytes);
 
 // Rays (pixels, 2) against triangles, each within its box of an image: first (triangles,) pixel, across and down it;
 // the normals (triangles, 3), offsets (triangles,) and sides (triangles, 3, 3) are those of math::meet. depth
@@ -187,6 +205,13 @@ PC_EXPORT int32_t pc_front_triangles(const pc_context* context, const int64_t* f
 // come to `converged`.
 PC_EXPORT int32_t pc_unbend(const pc_context* context, const double* bent, int64_t count, const double* lens,
                             int64_t steps, double converged, double* solved);
+
+// Invert a fisheye lens of four coefficients at bent coordinates (count, 2): those whose angle theta off axis, at most
+// the largest, is bent to theta (1 + k1 theta^2 + ...), which grows that far; NaN where there is none. At most `steps`
+// steps, until the bent angle is `converged`.
+PC_EXPORT int32_t pc_unbend_fisheye(const pc_context* context, const double* bent, int64_t count,
+                                    const double* coefficients, double largest, int64_t steps, double converged,
+                                    double* solved);
 
 // Pixels of images (views, height, width, channels), either whole (uint8) or real (float), the other null, at places
 // (views, out_pixels, 2) u, v -> sampled (views, out_pixels, channels) of the same type, and valid, 0 beyond the image.
@@ -247,6 +272,12 @@ PC_EXPORT int32_t pc_list_within(const pc_context* context, const float* leaves,
 PC_EXPORT int32_t pc_nearest_squared(const pc_context* context, const float* points, const int64_t* ptr,
                                      int64_t num_clouds, const float* queries, const int64_t* queries_ptr,
                                      float* squared);
+
+// Of the neighbors index (Q, k) of centers (Q, 3), num_points = missing, those last: mean (Q, 3), covariance (Q, 3, 3)
+// of the population, and counts (Q,).
+PC_EXPORT int32_t pc_neighborhood_shapes(const pc_context* context, const float* points, int64_t num_points,
+                                         const int64_t* index, int64_t num_queries, int64_t k, const float* centers,
+                                         float* mean, double* covariance, int64_t* counts);
 
 // normals (N, 3) float; neighbors have d2 <= limit; pixel null: no grid.
 PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,

@@ -51,8 +51,90 @@ void unbend(const math::Lens lens, int64_t count, int64_t steps, double converge
   }
 }
 
+// A lens that bends the angle off axis: theta (1 + k1 theta^2 + ...).
+struct BentAngle {
+  double k1, k2, k3, k4;
+
+  double bent(double theta) const {
+    const double t = theta * theta;
+    return theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))));
+  }
+  double slope(double theta) const {
+    const double t = theta * theta;
+    return 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * (9 * k4))));
+  }
+};
+
+// The tangent of 0 to just below a quarter turn, to 5e-16 of it, with the operations of the reference: Cephes, tan.
+double tangent(double theta) {
+  constexpr double kEighth = 0.78539816339744830962, kQuarter = 1.57079632679489661923, kRest = 6.123233995736766e-17;
+  const bool far = theta > kEighth;
+  const double x = far ? (theta - kQuarter) - kRest : theta;
+  const double z = x * x;
+  const double above = (-1.30936939181383734205e4 * z + 1.15351664838587416140e6) * z + -1.79565251976484877988e7;
+  const double below =
+      (((z + 1.36812963470692954678e4) * z + -1.32089234440210967447e6) * z + 2.50083801823357915839e7) * z +
+      -5.38695755929454629881e7;
+  const double near = x + x * (z * above / below);
+  return far ? -1.0 / near : near;
+}
+
+// Rays (x, y) that are bent to `count` coordinates, NaN where there are none up to the largest angle: by Newton's
+// method for the angle, between bounds that close in.
+void unbend_fisheye(const BentAngle& lens, int64_t count, double largest, int64_t steps, double converged,
+                    const double* bent, double* solved) {
+  constexpr double kLeast = 1e-20;  // of squared radii: nearer to the axis nothing is bent
+  double radius[kBlock], goal[kBlock], theta[kBlock], low[kBlock], high[kBlock];
+  int64_t open[kBlock];
+  const double farthest = lens.bent(largest);
+  for (int64_t i = 0; i < kBlock; ++i) {
+    const double x = i < count ? bent[2 * i] : 0.0, y = i < count ? bent[2 * i + 1] : 0.0;
+    const double squared = x * x + y * y;
+    radius[i] = std::sqrt(squared < kLeast ? kLeast : squared);
+    goal[i] = radius[i] <= farthest ? radius[i] : 0.0;
+    theta[i] = goal[i] < largest ? goal[i] : largest;
+    low[i] = 0;
+    high[i] = largest;
+    open[i] = 1;
+  }
+  int64_t any = 1;
+  for (int64_t step = 0; step < steps && any != 0; ++step) {
+    any = 0;
+    for (int64_t i = 0; i < kBlock; ++i) {
+      const double error = lens.bent(theta[i]) - goal[i];
+      low[i] = error < 0 ? theta[i] : low[i];
+      high[i] = error > 0 ? theta[i] : high[i];
+      const double next = theta[i] - error / lens.slope(theta[i]);
+      const double moved = (next > low[i]) & (next < high[i]) ? next : (low[i] + high[i]) / 2;
+      open[i] &= static_cast<int64_t>(std::fabs(error) > converged) & static_cast<int64_t>(moved != theta[i]);
+      theta[i] = open[i] ? moved : theta[i];
+      any |= open[i];
+    }
+  }
+  for (int64_t i = 0; i < kBlock; ++i) theta[i] = tangent(theta[i]) / radius[i];
+  for (int64_t i = 0; i < count; ++i) {
+    const bool seen = radius[i] <= farthest;
+    solved[2 * i] = seen ? bent[2 * i] * theta[i] : std::nan("");
+    solved[2 * i + 1] = seen ? bent[2 * i + 1] * theta[i] : std::nan("");
+  }
+}
+
 }  // namespace
 }  // namespace pc::lenses
+
+PC_EXPORT int32_t pc_unbend_fisheye(const pc_context* context, const double* bent, int64_t count,
+                                    const double* coefficients, double largest, int64_t steps, double converged,
+                                    double* solved) {
+  using namespace pc;
+  using namespace pc::lenses;
+  return guarded([&] {
+    const BentAngle lens{coefficients[0], coefficients[1], coefficients[2], coefficients[3]};
+    parallel_for(*context, count, kPerPiece, [&](int64_t begin, int64_t end, int64_t) {
+      for (int64_t at = begin; at < end; at += kBlock)
+        unbend_fisheye(lens, std::min(kBlock, end - at), largest, steps, converged, bent + 2 * at, solved + 2 * at);
+    });
+  });
+}
 
 PC_EXPORT int32_t pc_unbend(const pc_context* context, const double* bent, int64_t count, const double* lens,
                             int64_t steps, double converged, double* solved) {
