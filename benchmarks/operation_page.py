@@ -14,9 +14,9 @@ README's table are timed by `--frame`. Each peer ran in the same process, in tur
 and NumPy" are the usual recipes there, where no package on PyPI has the operation. A ratio above 1 means we are faster.
 Not installed, so not compared: {left_out}.
 
-What has no compiled body runs in torch: the inversion of fisheye, f-theta and tilted lenses (their rays and maps are
-kept by camera), normals of depth images, range images turned into points, features of covariances, and whatever
-carries a gradient beyond voxels, distances and covariances of neighbors.
+What has no compiled body runs in torch: the inversion of f-theta and tilted lenses (their rays and maps are kept by
+camera), normals of depth images, features of covariances, and whatever carries a gradient beyond voxels, distances and
+covariances of neighbors.
 """
 
 
