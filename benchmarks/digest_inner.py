@@ -19,6 +19,7 @@ from digest_names import (
     backends_of,
     call_inner,
     find_records,
+    functional,
     parts_of,
 )
 from digest_operations import CLOUDS, LENS, Case, _queries, on_a_grid, points, ptr_of
@@ -132,6 +133,8 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     for name, more in (("rows_within", ()), ("within_in", ({},))):
         yield name, "own", lambda more=more: ((cloud, ptr, *more, 0.03), {"exclude_self": True})
         yield name, "queries", lambda more=more: ((*searched, *more, 0.04), asked)
+    found = functional.knn(cloud, ptr, k=7)[0]
+    yield "neighborhood_shapes", "two", lambda: ((cloud, found, cloud), {})
     yield "sorted_rows", "two", lambda: ((cloud, ptr), {})
     yield "density_clusters", "two", lambda: ((cloud, ptr, 0.03, 4, None), {})
     yield "farthest_rows", "two", lambda: ((cloud, ptr, [20, 7]), {})
@@ -154,13 +157,17 @@ def _medians() -> Arguments:
 
 
 def _calls_of_images() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
-    value = torch.rand(90, generator=seeded(6)) + 0.1
-    pixel = torch.randint(-1, 40, (90,), generator=seeded(7))
-    yield "least_at_pixels", "random", lambda: ((value, pixel, 40), {})
+    values = torch.rand(90, 3, generator=seeded(6))
+    front = torch.randint(0, 100, (70,), generator=seeded(7))
+    yield "shaded", "points", lambda: ((values, front, 90), {"as_bytes": True})
+    corners = torch.randint(0, 90, (95, 3), generator=seeded(8))
+    yield "shaded", "triangles", lambda: ((values, front, 95, corners, values[:70]), {})
     yield "linked_pixels", "on a grid", _linked
     bent = torch.rand(30, 2, generator=seeded(4), dtype=torch.float64) - 0.5
     twelve = torch.nn.functional.pad(LENS[0], (0, 7))
     yield "unbent", "lens", lambda: ((bent, twelve, False, 1e3), {})
+    bends = torch.tensor([0.02, -0.01, 0.003, -0.0005], dtype=torch.float64)
+    yield "fisheye_rays", "lens", lambda: ((3 * bent, bends, 1.2), {})
     yield "front_triangles", "two", _triangles_in_boxes
     for name, make in (("smooth_regions", _touching), ("region_planes", _sides)):
         yield name, "table", make
