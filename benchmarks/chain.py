@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from operation_timing import RESULTS, installed, spread
+from timing import RESULTS, installed, spread
 
 import pcdata
 from pcdata import functional as F

@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from operation_timing import RESULTS, in_turn, spread
+from timing import RESULTS, in_turn, spread
 
 import pcdata
 from pcdata import functional as F

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from operation_timing import Case, installed
+from timing import Case, installed
 
 import pcdata
 from pcdata import functional as F

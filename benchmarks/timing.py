@@ -58,9 +58,10 @@ class Row:
     results: str
 
 
-def measure(case: Case, repeats: int) -> Row:
-    verdict = case.compare(case.ours(), timed(case.theirs, first := []))
-    ours, theirs = in_turn(case, repeats, timed, first, once_after=_ONCE_AFTER)
+def measure(case: Case, repeats: int, clock: Clock | None = None) -> Row:
+    clock = clock or timed
+    verdict = case.compare(case.ours(), clock(case.theirs, first := []))
+    ours, theirs = in_turn(case, repeats, clock, first, once_after=_ONCE_AFTER)
     mine, other = 1000 * statistics.median(ours), 1000 * statistics.median(theirs)
     return Row(case.operation, case.points, mine, spread(ours), case.peer, other, spread(theirs), other / mine, verdict)
 
@@ -91,6 +92,14 @@ def timed(body: Callable[[], Any], seconds: list[float]) -> Any:
         pass  # busy: an idle processor would clock down
     result = body()
     seconds.append(time.perf_counter() - started)
+    return result
+
+
+def processor_time(body: Callable[[], Any], seconds: list[float]) -> Any:
+    """Append the seconds of all threads of this process; those of torch wait busily for some of them."""
+    started = time.process_time()
+    result = body()
+    seconds.append(time.process_time() - started)
     return result
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from operation_timing import Case, installed, same
+from timing import Case, installed, same
 
 import pcdata
 from pcdata import functional as F

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from operation_timing import Case, installed, same
+from timing import Case, installed, same
 
 import pcdata
 from pcdata import functional as F
@@ -86,6 +86,28 @@ def index_cases(points: torch.Tensor) -> Iterator[Case]:
             "kNN 16, few queries, sorted before", len(queries), lambda: index.knn(queries=queries, k=K),
             "SciPy cKDTree, built before", lambda: tree.query(asked, k=K, workers=-1),
             lambda a, b: f"distances within {np.abs(a[1].numpy() - b[0]).max():.0e}",
+        )  # fmt: skip
+    if installed("open3d"):
+        import open3d as o3d
+
+        array = points.double().numpy()
+        tree_of_cloud = o3d.geometry.KDTreeFlann(o3d.geometry.PointCloud(o3d.utility.Vector3dVector(array)))
+
+        def one_by_one() -> np.ndarray:
+            return np.array([tree_of_cloud.search_knn_vector_3d(query, K)[2] for query in queries.double().numpy()])
+
+        yield Case(
+            "kNN 16, few queries, sorted before", len(queries), lambda: index.knn(queries=queries, k=K),
+            "Open3D KDTreeFlann, one by one", one_by_one,
+            lambda a, b: f"distances within {np.abs(a[1].numpy() - np.sqrt(b)).max():.0e}",
+        )  # fmt: skip
+        search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points.numpy()))
+        search.fixed_radius_index(RADIUS)
+        yield Case(
+            "all within 1 cm, few queries, sorted before", len(queries),
+            lambda: index.radius_neighbors(queries=queries, radius=RADIUS), "Open3D tensor",
+            lambda: search.fixed_radius_search(o3d.core.Tensor(queries.numpy()), RADIUS),
+            lambda a, b: f"{len(a[0])} and {len(b[0].numpy())} neighbors",
         )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from operation_timing import timed
+from timing import timed
 
 from pcdata import functional as F
 

@@ -1,0 +1,1 @@
+"""What operations.py times: cases beside peers, by kind, and the page that is made of them."""
