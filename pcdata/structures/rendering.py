@@ -115,8 +115,7 @@ def render(
     normals = colors = labels = None
     if cloud.normals is not None:
         mixed = torch.nn.functional.normalize(front.of(cloud.normals), dim=-1)
-        turned = matrix[:, None, None, :3, :3].float() @ mixed[..., None]
-        normals = turned[..., 0]
+        normals = (mixed.flatten(1, 2) @ matrix[:, :3, :3].float().mT).reshape(mixed.shape)
     if cloud.colors is not None:
         colors = front.of(cloud.colors, as_bytes=True)
     if cloud.labels is not None:
