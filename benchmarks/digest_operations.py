@@ -68,7 +68,7 @@ PAIRS: dict[str, Callable[[], dict[str, Any]]] = {
 }
 NEIGHBOR_OPERATIONS = {
     "ball_query": [{"radius": 0.03, "max_neighbors": 5}, {"radius": 0.04, "max_neighbors": 40}],
-    "knn": [{"k": 4}, {"k": 40}],
+    "knn": [{"k": 4}, {"k": 40}, {"k": 5, "norm": "l1"}, {"k": 5, "norm": "linf"}],
     "dbscan": [{"eps": 0.03, "min_points": 4}, {"eps": 0.02, "min_points": 7}],
     "estimate_normals": [{"radius": 0.05, "max_neighbors": 12}, {"radius": None, "max_neighbors": 9}],
     "neighborhood_covariance": [{"radius": 0.05, "max_neighbors": 12}],
@@ -80,6 +80,7 @@ NEIGHBOR_OPERATIONS = {
 CLOUD_OPERATIONS = {
     "box_mask": [{"lower": (0.0, 0.05, 0.0), "upper": (0.15, 0.2, 0.1)}],
     "duplicate_mask": [{}],
+    "hard_voxels": [{"voxel_size": 0.04, "lower": (0.0,) * 3, "upper": (0.2,) * 3, "max_points": 3, "max_voxels": 20}],
     "farthest_point_sample": [{"num_samples": 20}],
     "farthest_point_groups": [{"ratio": 0.2}],
     "find_voxel_size": [{"num_points": 12}],
@@ -258,6 +259,8 @@ def _clouds_and_what_else() -> Iterator[tuple[str, str, Callable[[], dict[str, A
         yield "fit_paired_points", f"two {number}", lambda options=options: {**two(), "targets": target, **options}
     features = torch.rand(227, 4, generator=seeded(5))
     yield "interpolate_features", "queries", lambda: {**_queries({"k": 5}), "features": features}
+    directions = torch.nn.functional.normalize(torch.randn(126, 3, generator=seeded(8)), dim=1)
+    yield "boundary_mask", "two", lambda: {**two(), "normals": directions, "radius": 0.05}
     polygon = [[0.0, 0.0], [0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
     for label in ("random", "ties"):
         flat = CLOUDS[label]()["points"][:, :2].contiguous()

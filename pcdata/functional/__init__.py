@@ -7,6 +7,7 @@ decisions (indices, masks, labels, planes and other shapes, sizes, which points 
 normals, ``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
 """
 
+from pcdata.functional.boundaries import boundary_mask
 from pcdata.functional.clusters import core_point_mask, dbscan
 from pcdata.functional.depth.average import DepthAverage, average_depth
 from pcdata.functional.depth.deproject import deproject_depth, pixel_rays, project_points, range_to_depth
@@ -19,6 +20,7 @@ from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.depth.window_filters import bilateral_filter, median_filter
 from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
+from pcdata.functional.hard_voxels import HardVoxels, hard_voxels
 from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.interpolation import interpolate_features
@@ -76,6 +78,7 @@ __all__ = [
     "FoundLine",
     "FoundSphere",
     "GraspChecks",
+    "HardVoxels",
     "ImageGrid",
     "NeighborIndex",
     "PairedMotion",
@@ -88,6 +91,7 @@ __all__ = [
     "average_depth",
     "ball_query",
     "bilateral_filter",
+    "boundary_mask",
     "box_mask",
     "chamfer_distance",
     "check_grasps",
@@ -113,6 +117,7 @@ __all__ = [
     "fit_paired_points",
     "flying_pixel_mask",
     "frustum_mask",
+    "hard_voxels",
     "hausdorff_distance",
     "hidden_point_mask",
     "image_clusters",

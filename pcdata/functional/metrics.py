@@ -11,7 +11,8 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_length, checked_word
 from pcdata.errors import ShapeError
 from pcdata.functional.nearest import squared_distance
-from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.neighbors import finder, nearest_rows, rows_within
+from pcdata.functional.norms import norm_length
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, segment_max
 
 SIDES = ("both", "a_to_b", "b_to_a")
@@ -27,7 +28,7 @@ NORMS = ("l2", "l1")
     normals_b="M 3",
     sides=partial(checked_word, words=SIDES),
     norm=partial(checked_word, words=NORMS),
-    steps=(nearest_rows,),
+    steps=(nearest_rows, rows_within),
 )
 def chamfer_distance(
     points_a: Tensor,  # (N, 3) float32
@@ -40,14 +41,15 @@ def chamfer_distance(
     norm: str = "l2",
     normals_a: Tensor | None = None,  # (N, 3) float32, unit length
     normals_b: Tensor | None = None,  # (M, 3) float32, unit length
+    abs_cosine: bool = True,
     backend: str = "auto",
 ) -> Tensor:  # (B,) float32; with normals (B, 2): the distance, and the mean of 1 - |cosine|
     """Measure the distance between two clouds: mean over a to the nearest of b, plus mean over b to the nearest of a.
 
     Squared distances by default, in the points' unit squared, as in PyTorch3D's ``chamfer_distance``; with
-    ``squared=False`` plain distances. The nearest point is that of the Euclidean distance; ``norm="l1"`` then measures
-    |dx| + |dy| + |dz| to it, where nothing is squared. Means are taken in float64. The result carries gradients to both
-    clouds and their normals; at distance 0 the gradient of the plain distance is taken as 0.
+    ``squared=False`` plain distances. With ``norm="l1"`` distances are |dx| + |dy| + |dz|, of the point that is nearest
+    by them. Means are taken in float64. The result carries gradients to both clouds and their normals; at distance 0
+    the gradient of the plain distance is taken as 0.
 
     Args:
         points_a: the clouds to measure from.
@@ -57,8 +59,9 @@ def chamfer_distance(
         squared: square the distances.
         sides: which of the two means: "both", "a_to_b" (how far a is from b: accuracy), or "b_to_a" (completeness).
         norm: "l2", or "l1".
-        normals_a: also compare the normals of nearest points, whatever their sign, over the same sides.
+        normals_a: also compare the normals of nearest points over the same sides.
         normals_b: those of the others; both or neither.
+        abs_cosine: normals of either sign are alike; False: the mean of 1 - cosine, 2 where they are opposite.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
@@ -83,8 +86,8 @@ def chamfer_distance(
         own = mean_per_cloud(distance, queries_ptr)
         total = own if total is None else total + own
         if normals is not None and other_normals is not None:
-            cosine = (normals * other_normals[nearest]).sum(1).abs()
-            own = mean_per_cloud(1 - cosine, queries_ptr)
+            cosine = (normals * other_normals[nearest]).sum(1)
+            own = mean_per_cloud(1 - (cosine.abs() if abs_cosine else cosine), queries_ptr)
             turned = own if turned is None else turned + own
     assert total is not None
     return total.float() if turned is None else torch.stack([total, turned], dim=1).float()
@@ -164,11 +167,11 @@ def _to_nearest(
     queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: Tensor, squared: bool, norm: str, backend: str
 ) -> tuple[Tensor, Tensor]:
     """Return the nearest row of its cloud for every query (Q,), and the distance to it (Q,) with a gradient."""
-    index, _ = nearest_rows(points.detach(), ptr, 1, queries=queries.detach(), queries_ptr=queries_ptr, backend=backend)
+    find = finder(points, ptr, None, backend, norm)
+    index, _ = find(1, queries=queries.detach(), queries_ptr=queries_ptr)
     nearest = index[:, 0]
     if norm == "l1":
-        x, y, z = (queries - points[nearest]).abs().unbind(1)
-        distance = (x + y) + z
+        distance = norm_length(queries - points[nearest], norm)
         return nearest, distance * distance if squared else distance
     distance = squared_distance(queries, points[nearest])
     return nearest, distance if squared else root(distance)

@@ -20,10 +20,11 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
-from pcdata.contracts.numbers import checked_count, require_length
+from pcdata.contracts.numbers import checked_count, checked_word, require_length
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, rooted, squared_distance
+from pcdata.functional.norms import NORMS, nearest_in_norm, norm_length, within_in_norm
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 
 # What finds the nearest rows of stated points: nearest_rows, with its points.
@@ -107,8 +108,9 @@ def checked_radius(where: str, name: str, arguments: Any) -> float | Tensor:
     queries="Q D",
     queries_ptr="ptr Q B",
     k=checked_count,
+    norm=functools.partial(checked_word, words=NORMS),
     grid=checked_grid,
-    steps=(nearest_rows,),
+    steps=(nearest_rows, rows_within),
 )
 def knn(
     points: Tensor,  # (N, D) float32
@@ -118,6 +120,7 @@ def knn(
     queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
     queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
     exclude_self: bool = False,
+    norm: str = "l2",
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # index (Q, k) int64 rows of points; distance (Q, k) float32
@@ -133,6 +136,7 @@ def knn(
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
+        norm: distances: "l2", straight; "l1", |dx| + |dy| + |dz|; or "linf", the largest of the three.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
@@ -141,7 +145,8 @@ def knn(
         ConfigError: k is less than 1, or exclude_self with other queries.
     """
     assert ptr is not None  # @op fills it
-    return nearest("knn", finder(points, ptr, grid, backend), points, k, queries, queries_ptr, None, exclude_self)
+    find = finder(points, ptr, grid, backend, norm)
+    return nearest("knn", find, points, k, queries, queries_ptr, None, exclude_self, norm)
 
 
 @op(
@@ -151,8 +156,9 @@ def knn(
     queries_ptr="ptr Q B",
     radius=checked_radius,
     max_neighbors=checked_count,
+    norm=functools.partial(checked_word, words=NORMS),
     grid=checked_grid,
-    steps=(nearest_rows,),
+    steps=(nearest_rows, rows_within),
 )
 def ball_query(
     points: Tensor,  # (N, D) float32
@@ -163,6 +169,7 @@ def ball_query(
     queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
     queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
     exclude_self: bool = False,
+    norm: str = "l2",
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # index (Q, m) int64; distance (Q, m) float32; count (Q,) int64
@@ -179,6 +186,7 @@ def ball_query(
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
+        norm: distances: "l2", straight; "l1", |dx| + |dy| + |dz|; or "linf", the largest of the three.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
@@ -188,8 +196,8 @@ def ball_query(
             queries.
     """
     assert ptr is not None  # @op fills it
-    find = finder(points, ptr, grid, backend)
-    found = nearest("ball_query", find, points, max_neighbors, queries, queries_ptr, radius, exclude_self)
+    find = finder(points, ptr, grid, backend, norm)
+    found = nearest("ball_query", find, points, max_neighbors, queries, queries_ptr, radius, exclude_self, norm)
     return *found, (found[0] < len(points)).sum(1)
 
 
@@ -199,6 +207,7 @@ def ball_query(
     queries="Q D",
     queries_ptr="ptr Q B",
     radius=checked_radius,
+    norm=functools.partial(checked_word, words=NORMS),
     grid=checked_grid,
     steps=(rows_within,),
 )
@@ -210,6 +219,7 @@ def radius_neighbors(
     queries: Tensor | None = None,  # (Q, D) float32; None = the points themselves
     queries_ptr: Tensor | None = None,  # (B+1,); None = one cloud
     exclude_self: bool = False,
+    norm: str = "l2",
     grid: ImageGrid | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # index (E,) int64; distance (E,) float32; neighbors_ptr (Q+1,)
@@ -225,6 +235,7 @@ def radius_neighbors(
         queries: where to search from.
         queries_ptr: row pointers of the queries: query cloud b searches point cloud b.
         exclude_self: no point is its own neighbor, though a repeat of it is; only where the queries are the points.
+        norm: distances: "l2", straight; "l1", |dx| + |dy| + |dz|; or "linf", the largest of the three.
         grid: the depth image the points still lie on; same answers, lets kernels search pixel windows.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
@@ -234,14 +245,19 @@ def radius_neighbors(
     """
     assert ptr is not None  # @op fills it
     find = functools.partial(rows_within, points.detach(), ptr, grid=grid, backend=backend)
-    return all_within("radius_neighbors", find, points, queries, queries_ptr, radius, exclude_self)
+    if norm != "l2":
+        find = functools.partial(within_in_norm, points.detach(), ptr, norm, rows_within, backend=backend)
+    return all_within("radius_neighbors", find, points, queries, queries_ptr, radius, exclude_self, norm)
 
 
 # -- shared by the functions above and by the index ------------------------------------------------------------------
 
 
-def finder(points: Tensor, ptr: Tensor, grid: ImageGrid | None, backend: str) -> Find:
+def finder(points: Tensor, ptr: Tensor, grid: ImageGrid | None, backend: str, norm: str = "l2") -> Find:
     """Return what finds the nearest rows of these points."""
+    if norm != "l2":
+        searches = nearest_rows, rows_within
+        return functools.partial(nearest_in_norm, points.detach(), ptr, norm, searches, backend=backend)
     return functools.partial(nearest_rows, points.detach(), ptr, grid=grid, backend=backend)
 
 
@@ -253,6 +269,7 @@ def all_within(
     queries_ptr: Tensor | None,
     radius: float | Tensor,
     exclude_self: bool,
+    norm: str = "l2",
 ) -> Listed:
     """Return what :func:`radius_neighbors` does, by whatever finds the neighbors among the points."""
     _require_own_queries(where, exclude_self, queries)
@@ -260,7 +277,7 @@ def all_within(
     index, distance, neighbors_ptr = find(radius, **own, exclude_self=exclude_self)
     if _wants_gradient(points, queries):
         query = cloud_of_rows(neighbors_ptr)
-        distance = _distance((points if queries is None else queries)[query], points[index])
+        distance = _distance((points if queries is None else queries)[query], points[index], norm)
     return index, distance, neighbors_ptr
 
 
@@ -314,6 +331,7 @@ def nearest(
     queries_ptr: Tensor | None,
     radius: float | Tensor | None,
     exclude_self: bool,
+    norm: str = "l2",
 ) -> tuple[Tensor, Tensor]:
     """Return what :func:`knn` does, within a radius if there is one, by whatever finds the nearest among the points."""
     _require_own_queries(where, exclude_self, queries)
@@ -325,7 +343,8 @@ def nearest(
         index, distance = (values[~itself].reshape(-1, k) for values in (index, distance))
     if _wants_gradient(points, queries) and len(points):
         found = index < len(points)
-        apart = _distance((points if queries is None else queries)[:, None], points[index.clamp(max=len(points) - 1)])
+        asked = points if queries is None else queries
+        apart = _distance(asked[:, None], points[index.clamp(max=len(points) - 1)], norm)
         distance = torch.where(found, apart, torch.inf)
     return index, distance
 
@@ -370,8 +389,10 @@ def _wants_gradient(*tensors: Tensor | None) -> bool:
     return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
-def _distance(a: Tensor, b: Tensor) -> Tensor:
+def _distance(a: Tensor, b: Tensor, norm: str = "l2") -> Tensor:
     """Return float32 distances of rows with a gradient, 0 where they are 0; the bits are those of the search."""
+    if norm != "l2":
+        return norm_length(a - b, norm)
     squared = squared_distance(a, b)
     apart = squared > 0
     return torch.where(apart, rooted(torch.where(apart, squared, 1.0)), 0.0)

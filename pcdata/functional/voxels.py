@@ -52,7 +52,7 @@ def voxel_means(
     cloud, start, scaled = _scale_to_grid(points, ptr, edges, origin)
     voxel = scaled.floor()
     above = voxel - voxel.amin(0) if origin is not None and len(voxel) else voxel
-    inverse, first = _group_in_row_order(_voxel_keys(cloud, above, len(ptr) - 1))
+    inverse, first = group_in_row_order(voxel_keys(cloud, above, len(ptr) - 1))
     offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
     members = group_count(inverse, len(first))
     mean_offset = group_sum(offset, inverse, len(first)).double() / members[:, None] / _FIXED_POINT
@@ -321,12 +321,12 @@ def _require_distinct(points: Tensor, ptr: Tensor, num_points: int) -> None:
 def numbered_rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, int]:
     """Number the different points (N, 3) of each cloud: (N,) int64, and how many there are."""
     ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
-    return _rank(_voxel_keys(cloud_of_rows(ptr), ranks, len(ptr) - 1))
+    return _rank(voxel_keys(cloud_of_rows(ptr), ranks, len(ptr) - 1))
 
 
 def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
     """Count the different rows of voxel (N, 3, not negative) in each cloud, (B,) int64."""
-    rank, distinct = _rank(_voxel_keys(cloud, voxel, num_clouds))
+    rank, distinct = _rank(voxel_keys(cloud, voxel, num_clouds))
     return group_count(cloud[group_first(rank, distinct)], num_clouds)
 
 
@@ -352,7 +352,7 @@ def _scale_to_grid(
     return cloud, origin, scaled
 
 
-def _voxel_keys(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
+def voxel_keys(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
     """Number the pairs of cloud (N,) and voxel (N, 3, not negative) by (N,) int64 keys that never collide."""
     key, size = cloud, num_clouds
     for axis in voxel.long().unbind(1):
@@ -370,7 +370,7 @@ def _rank(values: Tensor) -> tuple[Tensor, int]:
     return rank, len(distinct)
 
 
-def _group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
+def group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
     """Number equal keys by first appearance; return the group of each row (N,) and the first row of each group (G,)."""
     group, num_groups = _rank(key)
     first, order = group_first(group, num_groups).sort()

@@ -59,6 +59,7 @@ def ball_query(
     queries: Tensor | None,
     queries_ptr: Tensor | None,
     exclude_self: bool,
+    norm: str,
     grid: ImageGrid | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Search with ``torch_cluster.radius``, asking for *all* neighbors, then keep the nearest by the contract's order.
@@ -69,9 +70,10 @@ def ball_query(
         BackendError: on CUDA; for a radius per query, without the points themselves, or where not in three dimensions.
     """
     _require_cpu("ball_query", points)
-    if isinstance(radius, Tensor) or exclude_self or points.shape[1] != 3:
+    if isinstance(radius, Tensor) or exclude_self or norm != "l2" or points.shape[1] != 3:
         raise BackendError(
-            "ball_query: torch-cluster takes one radius, three coordinates and no exclude_self; use backend='auto'"
+            "ball_query: torch-cluster takes one radius, three coordinates, no other norm than l2 and no exclude_self; "
+            "use backend='auto'"
         )
     if queries is None:
         queries, queries_ptr = points, ptr

@@ -21,6 +21,7 @@ from pcdata.rng import seeded
 # Decisions (indices, masks, labels, planes, sizes) have no derivative; normals, registered and smoothed depth are
 # documented to give none.
 WITHOUT = {
+    "boundary_mask",
     "box_mask",
     "core_point_mask",
     "dbscan",
@@ -31,6 +32,7 @@ WITHOUT = {
     "farthest_point_groups",
     "farthest_point_sample",
     "find_voxel_size",
+    "hard_voxels",
     "flying_pixel_mask",
     "frustum_mask",
     "hidden_point_mask",

@@ -97,7 +97,7 @@ def test_sides_norms_and_normals_are_those_of_all_pairs_in_float64():
             }
             for cloud, (one, other) in enumerate(((slice(0, 40), slice(0, 15)), (slice(40, 70), slice(15, 55)))):
                 offset = a[one, None].double() - b[None, other].double()
-                nearest = offset.norm(dim=2)
+                nearest = offset.norm(p=power, dim=2)
                 for sides, axis in (("a_to_b", 1), ("b_to_a", 0)):
                     row = nearest.argmin(axis)
                     pick = (torch.arange(len(row)), row) if axis == 1 else (row, torch.arange(len(row)))
@@ -109,6 +109,16 @@ def test_sides_norms_and_normals_are_those_of_all_pairs_in_float64():
                         found[sides][cloud, 1].double(), (1 - cosine.abs()).mean(), rtol=1e-5, atol=0
                     )
             torch.testing.assert_close(found["both"], found["a_to_b"] + found["b_to_a"])
+
+
+def test_normals_that_point_the_other_way_are_told_where_asked():
+    points = torch.rand(30, 3, generator=seeded(1))
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(30, 3)
+    flipped = torch.where((torch.arange(30) < 10)[:, None], -up, up)
+    given = {"normals_a": up, "normals_b": flipped, "sides": "a_to_b"}
+    assert chamfer_distance(points, None, points, None, **given).tolist() == [[0.0, 0.0]]
+    signed = chamfer_distance(points, None, points, None, **given, abs_cosine=False)
+    torch.testing.assert_close(signed, torch.tensor([[0.0, 2 / 3]]))
 
 
 @pytest.mark.parametrize("columns", [3, 2, 6])

@@ -22,6 +22,10 @@ PEERS = {
         "functional/depth/test_window_filters.py",
         "kornia `bilateral_blur`; OpenCV `bilateralFilter`; PCL `FastBilateralFilter`",
     ),
+    "boundary_mask": (
+        "functional/test_boundaries.py",
+        "PCL `BoundaryEstimation`; Open3D tensor `compute_boundary_points`",
+    ),
     "box_mask": ("functional/test_selection.py", "Open3D `crop`; PCL `CropBox`"),
     "chamfer_distance": ("functional/test_metrics.py", "PyTorch3D `loss.chamfer_distance`"),
     "core_point_mask": ("functional/test_clusters.py", "scikit-learn `DBSCAN.core_sample_indices_`"),
@@ -57,6 +61,10 @@ PEERS = {
     ),
     "flying_pixel_mask": ("functional/depth/test_flying_pixels.py", "PCL `ShadowPoints`"),
     "frustum_mask": ("functional/test_visibility.py", "PCL `FrustumCulling`"),
+    "hard_voxels": (
+        "functional/test_hard_voxels.py",
+        "MMDetection3D `VoxelizationByGridShape`; mmcv `Voxelization`; spconv `PointToVoxel`",
+    ),
     "hausdorff_distance": ("functional/test_metrics.py", "SciPy `directed_hausdorff`"),
     "hidden_point_mask": ("functional/test_visibility.py", "Open3D `hidden_point_removal`"),
     "image_clusters": ("functional/test_image_clusters.py", "PCL `OrganizedEuclideanClusterExtraction`"),

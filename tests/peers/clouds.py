@@ -271,13 +271,26 @@ PYTORCH3D = Section(
         Call(
             "chamfer_distance(points, others, single_directional=True, norm=1)",
             "F.chamfer_distance(points, None, others, None, sides='a_to_b', norm='l1', squared=False)",
-            "the nearest point is that of the Euclidean distance",
+            "one way",
         ),
         Call(
             "chamfer_distance(points, others, x_normals=normals, y_normals=other_normals)",
             "F.chamfer_distance(points, None, others, None, normals_a=normals, normals_b=other_normals)",
             "both losses as columns (B, 2)",
         ),
+        Call(
+            "chamfer_distance(points, others, x_normals=normals, y_normals=other_normals, abs_cosine=False)",
+            "F.chamfer_distance(points, None, others, None, normals_a=normals, normals_b=other_normals, "
+            "abs_cosine=False)",
+            "likewise",
+        ),
+        Call(
+            "chamfer_distance(points, others, batch_reduction='sum', point_reduction='sum')",
+            "200 * F.chamfer_distance(points, None, others, None, sides='a_to_b') "
+            "+ 150 * F.chamfer_distance(points, None, others, None, sides='b_to_a')",
+            "means times the numbers of points",
+        ),
+        Call("knn_points(queries, points, K=8, norm=1)", "F.knn(points, queries=queries, k=8, norm='l1')", ""),
         Call(
             "chamfer_distance(points, others, point_reduction=None)",
             "F.knn(others, queries=points, k=1)[1] ** 2",
@@ -615,6 +628,11 @@ PCL = Section(
             "of depth images, before they become points",
         ),
         Call("MedianFilter.setWindowSize(3)", "pcdata.MedianFilterDepth()(frame)", "likewise"),
+        Call(
+            "BoundaryEstimation.setKSearch(30), setAngleThreshold(1.57)",
+            "F.boundary_mask(points, normals, max_neighbors=30, min_gap=1.57)",
+            "a mask",
+        ),
         Call("TransformationEstimationSVD", "F.fit_paired_points(points, moved)", ""),
         Call(
             "GeneralizedIterativeClosestPoint.align",
@@ -678,6 +696,12 @@ MMDETECTION3D = Section(
             "GlobalAlignment(rotation_axis=2)",
             "cloud.transformed(pose.repeat(1, 1, 1), frame_id='aligned')",
             "as a step: `ToFrame(frame=, matrix=, start=)`; a matrix that is not rigid is refused",
+        ),
+        Call(
+            "VoxelizationByGridShape / mmcv Voxelization([0.05, 0.05, 0.1], [0, 0, 0, 0.2, 0.2, 0.2], 5, 200)",
+            "F.hard_voxels(points, voxel_size=[[0.05, 0.05, 0.1]], lower=(0, 0, 0), upper=(0.2, 0.2, 0.2), "
+            "max_points=5, max_voxels=200)",
+            "rows of the points; cells are x, y, z: `.cell.flip(1)` is theirs; of all fields by the same rows",
         ),
         Call(
             "VoxelBasedPointSampler",

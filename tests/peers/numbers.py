@@ -60,6 +60,12 @@ SCIPY = Section(
             by(lambda a: a[1], lambda b: b[0]),
         ),
         Call(
+            "tree.query(queries.numpy(), k=8, p=1)",
+            "F.knn(points, queries=queries, k=8, norm='l1')",
+            "`norm='linf'` is p=inf; in `ball_query` and `radius_neighbors` too",
+            by(lambda a: a[0], lambda b: b[1]),
+        ),
+        Call(
             "tree.query(queries.numpy(), k=8, distance_upper_bound=0.03)",
             "F.ball_query(points, queries=queries, radius=0.03, max_neighbors=8)",
             "with the number found",

@@ -184,6 +184,7 @@ def chamfer_distance(
     norm: str,
     normals_a: Tensor | None,
     normals_b: Tensor | None,
+    abs_cosine: bool,
 ) -> Tensor:
     """Run the reference's contract in the core, without gradients; it measures distances alone."""
     if norm != "l2" or normals_a is not None or normals_b is not None:
@@ -197,6 +198,7 @@ def chamfer_distance(
             norm=norm,
             normals_a=normals_a,
             normals_b=normals_b,
+            abs_cosine=abs_cosine,
             backend="cpu",
         )
         return found
