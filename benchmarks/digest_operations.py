@@ -257,6 +257,8 @@ def _clouds_and_what_else() -> Iterator[tuple[str, str, Callable[[], dict[str, A
     target = two()["points"][:, [1, 2, 0]] + 0.01 * torch.rand(126, 3, generator=seeded(3))
     for number, options in enumerate(({}, {"with_scale": True, "weights": weights})):
         yield "fit_paired_points", f"two {number}", lambda options=options: {**two(), "targets": target, **options}
+    start = CLOUDS["two"]()["points"] + 0.003
+    yield "iterate_closest_points", "two", lambda: {**two(), "targets": start, "targets_ptr": ptr_of(90, 36)}
     features = torch.rand(227, 4, generator=seeded(5))
     yield "interpolate_features", "queries", lambda: {**_queries({"k": 5}), "features": features}
     directions = torch.nn.functional.normalize(torch.randn(126, 3, generator=seeded(8)), dim=1)

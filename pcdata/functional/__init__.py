@@ -8,6 +8,7 @@ normals, ``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.boundaries import boundary_mask
+from pcdata.functional.closest_points import ClosestPoints, iterate_closest_points
 from pcdata.functional.clusters import core_point_mask, dbscan
 from pcdata.functional.depth.average import DepthAverage, average_depth
 from pcdata.functional.depth.deproject import deproject_depth, pixel_rays, project_points, range_to_depth
@@ -72,6 +73,7 @@ from pcdata.geometry.lens import distort_normalized, undistort_normalized
 
 __all__ = [
     "SHAPE_FEATURES",
+    "ClosestPoints",
     "DepthAverage",
     "FoundCircle",
     "FoundCylinder",
@@ -122,6 +124,7 @@ __all__ = [
     "hidden_point_mask",
     "image_clusters",
     "interpolate_features",
+    "iterate_closest_points",
     "knn",
     "median_filter",
     "neighborhood_covariance",

@@ -23,13 +23,14 @@ class PairedMotion(NamedTuple):
     rmse: Tensor  # (B,) float64, weighted, in the points' unit
 
 
-def _checked_flag(where: str, name: str, arguments: Mapping[str, Any]) -> bool:
+def checked_flag(where: str, name: str, arguments: Mapping[str, Any]) -> bool:
+    """Require True or False."""
     if not isinstance(arguments[name], bool):
         raise DTypeError(f"{where}: {name} must be True or False, not {type(arguments[name]).__name__}")
     return bool(arguments[name])
 
 
-@op(points="N D : float", targets="N D : float", weights="N : float", ptr="ptr N B >= 3", with_scale=_checked_flag)
+@op(points="N D : float", targets="N D : float", weights="N : float", ptr="ptr N B >= 3", with_scale=checked_flag)
 def fit_paired_points(
     points: Tensor,  # (N, D) float32 or float64
     targets: Tensor,  # (N, D): row n is the partner of point n

@@ -33,6 +33,7 @@ WITHOUT = {
     "farthest_point_sample",
     "find_voxel_size",
     "hard_voxels",
+    "iterate_closest_points",
     "flying_pixel_mask",
     "frustum_mask",
     "hidden_point_mask",

@@ -164,6 +164,13 @@ def in_pairs(count: int, seed: int) -> dict[str, Tensor]:
     return {"points": cloud, "targets": targets, "weights": torch.rand(count, generator=seeded(seed + 9))}
 
 
+def onto_a_copy(count: int, seed: int) -> dict[str, Tensor]:
+    cloud = points(count, seed)
+    initial = torch.eye(4, dtype=torch.float64)[None].clone()
+    initial[:, :3, 3] = 0.001
+    return {"points": cloud, "targets": cloud[: count // 2 + 1] + 0.004, "initial": initial}
+
+
 def in_pairs_of_a_plane(count: int, seed: int) -> dict[str, Tensor]:
     pairs = in_pairs(count, seed)
     return {name: pairs[name][:, :2].contiguous() for name in ("points", "targets")}
@@ -252,6 +259,7 @@ EXAMPLES = [
     Example("flying_pixel_mask", depth_alone, ("row",)),
     Example("image_clusters", on_an_image, ("row",), {"size": (12, 16), "eps": 0.1, "reach": 2}),
     Example("interpolate_features", with_features, ("row",), {"k": 5}),
+    Example("iterate_closest_points", onto_a_copy, ("cloud",) * 5, {"max_rounds": 8, "with_scale": True}),
     Example("knn", one_cloud, ("index", "row"), {"k": 4}),
     Example("knn", with_queries, ("index", "row"), {"k": 40}),
     Example("knn", with_queries, ("index", "row"), {"k": 7, "norm": "l1"}),

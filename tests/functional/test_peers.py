@@ -72,6 +72,7 @@ PEERS = {
         "functional/test_interpolation.py",
         "PyG `knn_interpolate`; Open3D-ML `three_interpolate`",
     ),
+    "iterate_closest_points": ("functional/test_closest_points.py", "PyTorch3D `iterative_closest_point`"),
     "knn": ("functional/test_neighbors.py", "torch-cluster `knn`; PyTorch3D `knn_points`; Open3D `knn_search`"),
     "median_filter": ("functional/depth/test_window_filters.py", "OpenCV `medianBlur`; PCL `MedianFilter`"),
     "neighborhood_covariance": (

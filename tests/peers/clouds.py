@@ -127,6 +127,18 @@ OPEN3D = Section(
             same(),
         ),
         Call(
+            "pcd.compute_mahalanobis_distance()",
+            "((points - points.mean(0)).double() @ torch.linalg.inv(torch.cov(points.double().T, correction=0)) "
+            "* (points - points.mean(0))).sum(1).sqrt()",
+            "of neighborhoods: `F.neighborhood_covariance`",
+            same(1e-4),
+        ),
+        Call(
+            "pcd.get_minimal_oriented_bounding_box()",
+            "F.smallest_rectangle(points[:, :2])",
+            "of boxes that stand upright, exactly; of objects: `pcdata.transforms.describe_objects`",
+        ),
+        Call(
             "pcd.compute_nearest_neighbor_distance()",
             "F.knn(points, k=1, exclude_self=True)[1]",
             "infinity, not 0, for a point alone",
@@ -306,6 +318,11 @@ PYTORCH3D = Section(
             "F.fit_paired_points(points, moved, weights=weights, with_scale=True)",
             "any number of columns; 4x4 for column vectors, scale inside; never a reflection; an undetermined "
             "rotation is an error",
+        ),
+        Call(
+            "iterative_closest_point(points, moved, estimate_scale=True)",
+            "F.iterate_closest_points(points, points + 0.003, ptr, ptr, with_scale=True)",
+            "a ragged batch in one call; 4x4 for column vectors, scale inside; `max_distance` of partners",
         ),
         Call(
             "iterative_closest_point(points, moved)",
