@@ -10,7 +10,7 @@ import torch
 
 from pcdata import transforms as T
 from pcdata.errors import ConfigError, ReplayError
-from pcdata.rng import seeded
+from pcdata.rng import Streams, seeded
 from tests.factories import assert_same, cloud_in_base
 from tests.messages import told as message
 
@@ -18,8 +18,8 @@ MANY = 600
 
 
 def chosen(step: T.RandomOneOf, count: int = MANY) -> list[int]:
-    result = step(cloud_in_base((1,) * count), generator=seeded(0))
-    return [history[-1]["params"]["chosen"] for history in result.history]
+    cloud = cloud_in_base((1,) * count)
+    return step.make_params(cloud, Streams.of(seeded(0), count))["chosen"].tolist()
 
 
 def test_steps_are_drawn_by_their_weights():
