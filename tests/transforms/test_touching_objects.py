@@ -67,6 +67,16 @@ def test_boxes_that_touch_come_apart_and_stay_whole(boxes, noise):
     assert cut["pixels"] > 10
 
 
+def test_lines_of_missing_pixels_part_nothing():
+    whole, truth = scene(*LOW_AND_HIGH, noise=0.0015)
+    pixel = whole.source_index
+    there = (pixel // SIZE[1] % 4 > 0) & (pixel % SIZE[1] % 5 > 0)  # as depth registered to a larger image has them
+    cloud = whole.select(there, torch.tensor([0, int(there.sum())]))
+    found, f = parted(cloud, truth[there])
+    assert f > 0.95
+    assert len(found.meta[0]["touching"]["cuts"]) == 1
+
+
 def test_what_shows_no_evidence_stays_one():
     # Two boxes with flush faces look like one long box.
     cloud, _ = scene((-0.06, 0, 0.12, 0.1, 0.1), (0.06, 0, 0.12, 0.1, 0.1), noise=0.001)

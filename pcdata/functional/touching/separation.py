@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, is_lined
 from pcdata.functional.rows import ptr_from_counts, transform_points
 from pcdata.functional.touching.contacts import region_contacts
 from pcdata.functional.touching.faces import Scene
@@ -118,9 +118,25 @@ def _image(points: Tensor, grid: ImageGrid) -> tuple[Tensor, PixelCamera, Tensor
     inverse = torch.zeros(shape, dtype=torch.float64, device=points.device)
     pixel = (v - top) * shape[1] + (u - left)
     inverse.view(-1)[pixel] = 1 / seen[:, 2].double()
+    if is_lined(pixel, shape):
+        inverse = _without_lines(inverse)
     k = grid.intrinsics[0].double().cpu()
     fx, fy, cx, cy = (float(k[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return inverse, PixelCamera(fx, fy, cx - left, cy - top), pixel
+
+
+def _without_lines(inverse: Tensor) -> Tensor:
+    """Fill single missing pixels between two that are there by their mean, along rows, along columns and once more.
+
+    Where the two are of different surfaces the mean is of neither, as far from both: a jump stays a jump.
+    """
+    filled = inverse.clone()
+    for _ in range(2):
+        for image in (filled, filled.T):
+            before, here, after = image[:, :-2], image[:, 1:-1], image[:, 2:]
+            missing = (here == 0) & (before > 0) & (after > 0)
+            here[missing] = (before[missing] + after[missing]) / 2
+    return filled
 
 
 def _measured_noise(inverse: Tensor) -> float:
