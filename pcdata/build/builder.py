@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from pcdata.build.building import Building
 from pcdata.build.building_folder import BuildingFolder
-from pcdata.build.building_url import BuildingUrl
 from pcdata.build.config import BuildConfig
 from pcdata.build.engines.in_process import work_here
 from pcdata.build.finishing import complete_dataset, counts_of
 from pcdata.build.kept_for_retry import take_over
 from pcdata.build.plan import Plan, plan_of
 from pcdata.build.records import BuiltSample, ShardRecord
+from pcdata.build.request import BuildRequest, Engine
 from pcdata.build.shard_work import Job
 from pcdata.build.source_state import captures_digest
 from pcdata.build.tally import Tally, all_failed, most_bad
-from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError, add_note
+from pcdata.errors import CacheError, CaptureError, add_note
 from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note
-from pcdata.files.urls import is_in_process, is_url, path_of
-from pcdata.io.sources.capture_source import CaptureSource, check_apart, checked_ids, episodes_of, skipped_of
+from pcdata.io.sources.capture_source import CaptureSource, skipped_of
 from pcdata.progress import Progress
-from pcdata.structures import PointCloud
 from pcdata.validation.step_losses import judge_step_losses
-
-Engine = Literal["pool", "ray"]
-ENGINES: tuple[Engine, ...] = ("pool", "ray")
 
 
 @dataclass(frozen=True)
@@ -109,10 +102,8 @@ def build_dataset(
             captures failed; steps drop too much (strict).
         PcdataError: all of the first 8 captures failed, or all; of the type that the first one raised.
     """
-    building = checked_request(
-        config,
-        source,
-        folder,
+    request = BuildRequest(
+        overwrite=overwrite,
         restart=restart,
         workers=workers,
         timeout=timeout,
@@ -120,9 +111,22 @@ def build_dataset(
         engine=engine,
         part=part,
         finalize=finalize,
+        strict=strict,
+        hash_captures=hash_captures,
         retry_quarantined=retry_quarantined,
     )
-    overwrite = overwrite or retry_quarantined
+    return _built(config, source, folder, request, progress, note)
+
+
+def _built(
+    config: BuildConfig,
+    source: CaptureSource,
+    folder: str | Path,
+    asked: BuildRequest,
+    progress: Progress | None,
+    note: Note | None,
+) -> BuildReport:
+    building = asked.building(config, source, folder)
     report = BuildReport(building.target if isinstance(building, BuildingFolder) else building.target.url)
     report.skipped.update(skipped_of(source))
 
@@ -131,111 +135,51 @@ def build_dataset(
         if note is not None:
             note(text)
 
-    plan = plan_of(config, source, hash_captures=hash_captures)
+    plan = plan_of(config, source, hash_captures=asked.hash_captures)
     if (
-        (part is not None or finalize)
-        and not overwrite
+        (asked.part is not None or asked.finalize)
+        and not asked.replaces
         and (quarantined := building.quarantined_of(plan.identity)) is not None
     ):  # a job that is started again when all is done
         tell("the dataset was put into place before")
         report.quarantined.update(quarantined)
         return replace(report, num_shards=plan.num_shards, num_finished=plan.num_shards, is_complete=True)
-    building.check_target(overwrite)
-    limit = most_bad(max_bad, len(plan.ids))
+    building.check_target(asked.replaces)
+    limit = most_bad(asked.max_bad, len(plan.ids))
     job = Job.of(config, source, plan, building)
-    what = "finalize" if finalize else "all" if part is None else f"part-{part[0]}-of-{part[1]}"
-    with building.opened(plan, what, restart=restart, note=tell):
-        replaced = building.prepared(overwrite, tell) if part is None else None
-        shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
-        if retry_quarantined and isinstance(building, BuildingFolder):
+    with building.opened(plan, asked.what, restart=asked.restart, note=tell):
+        replaced = building.prepared(asked.replaces, tell) if asked.part is None else None
+        shards = asked.shards(plan)
+        if asked.retry_quarantined and isinstance(building, BuildingFolder):
             take_over(building, plan)
-        done = _finished(job, shards, tell, retry_quarantined=retry_quarantined)
-        if finalize and len(done) < plan.num_shards:
+        done = _finished(job, shards, tell, retry_quarantined=asked.retry_quarantined)
+        if asked.finalize and len(done) < plan.num_shards:
             missing = plan.num_shards - len(done)
             raise CacheError(f"{folder}: {missing} of {plan.num_shards} shards are not finished; build them first")
         tally = Tally(plan, shards, done, limit, progress)
         try:
-            _work(job, [shard for shard in shards if shard not in done], tally, engine, workers, timeout)
+            _work(job, [shard for shard in shards if shard not in done], tally, asked)
         except BaseException as error:
             _tell_kept(error, building, plan)
             raise
         done = building.finished(plan)
-        if part is None and len(done) < plan.num_shards:
+        if asked.part is None and len(done) < plan.num_shards:
             raise CacheError(f"{folder}: shards that were finished are gone or damaged; start again to build them anew")
-        is_complete = len(done) == plan.num_shards and _finish(
-            config, source, job, done, part, replaced, overwrite=overwrite, strict=strict, note=tell
-        )
+        is_complete = len(done) == plan.num_shards and _finish(config, source, job, done, replaced, asked, tell)
     return _told(report, [done[shard] for shard in shards if shard in done], plan.num_shards, len(done), is_complete)
 
 
-def checked_request(
-    config: BuildConfig,
-    source: CaptureSource,
-    folder: str | Path,
-    *,
-    restart: bool,
-    workers: int,
-    timeout: float | None,
-    max_bad: int | str | None,
-    engine: str,
-    part: tuple[int, int] | None,
-    finalize: bool,
-    retry_quarantined: bool,
-) -> BuildingFolder | BuildingUrl:
-    """Return where the unfinished build is that arguments of :func:`build_dataset` ask for; nothing is written.
-
-    Raises:
-        ConfigError: they do not fit together, or the folder is among the captures.
-    """
-    _check_arguments(config, source)
-    _check_ways(workers, timeout, engine, part, finalize)
-    if max_bad is not None:
-        most_bad(max_bad, len(source.ids))
-    if retry_quarantined and (restart or finalize or part is not None):
-        raise ConfigError(
-            "build_dataset: retry_quarantined goes on with a whole build: without restart, finalize, part"
-        )
-    building = building_at(folder)
-    if isinstance(building, BuildingFolder):
-        check_apart("build_dataset", building.target, source)
-        return building
-    if is_in_process(folder) and (workers or engine != "pool"):
-        raise ConfigError(f"build_dataset: {folder} is in the memory of this process: build it with workers=0")
-    if retry_quarantined:
-        raise ConfigError(
-            f"build_dataset: {folder}: retry_quarantined takes a folder of this machine; build it again: --overwrite"
-        )
-    return building
-
-
-def building_at(folder: str | Path) -> BuildingFolder | BuildingUrl:
-    """Return where the unfinished build of a dataset is: in a folder, or at any URL that fsspec opens.
-
-    Raises:
-        ConfigError: there is no such kind of URL.
-        MissingExtraError: what opens it is not installed.
-    """
-    if folder == "":
-        raise ConfigError("build_dataset: the folder is an empty text; name one")
-    if isinstance(folder, str) and ":" in folder:
-        if is_url(folder):
-            return BuildingUrl(folder)
-        folder = path_of(folder)
-    # Resolved: "." has no name to write beside, and a link must lead to the new dataset afterwards.
-    return BuildingFolder(Path(os.path.realpath(Path(folder).expanduser())))
-
-
-def _work(job: Job, shards: list[int], tally: Tally, engine: Engine, workers: int, timeout: float | None) -> None:
+def _work(job: Job, shards: list[int], tally: Tally, asked: BuildRequest) -> None:
     if not shards:
         return
-    if engine == "ray":
+    if asked.engine == "ray":
         from pcdata.build.engines.on_ray import work_on_ray
 
-        work_on_ray(job, shards, tally, tasks=workers, timeout=timeout)
-    elif workers:
+        work_on_ray(job, shards, tally, tasks=asked.workers, timeout=asked.timeout)
+    elif asked.workers:
         from pcdata.build.engines.pool import work_in_pool
 
-        work_in_pool(job, shards, tally, workers=workers, timeout=timeout)
+        work_in_pool(job, shards, tally, workers=asked.workers, timeout=asked.timeout)
     else:
         work_here(job, shards, tally)
 
@@ -272,11 +216,8 @@ def _finish(
     source: CaptureSource,
     job: Job,
     done: dict[int, ShardRecord],
-    part: tuple[int, int] | None,
     replaced: object,
-    *,
-    overwrite: bool,
-    strict: bool,
+    asked: BuildRequest,
     note: Note,
 ) -> bool:
     """Put the dataset into place; False where another process that has a part of the work does."""
@@ -288,16 +229,16 @@ def _finish(
         try:
             stack.enter_context(building.claim("finish", note))
         except CacheError:
-            if part is None:
+            if asked.part is None:
                 raise
             note("another process puts the dataset into place")
             return False
-        if part is not None:
-            replaced = building.prepared(overwrite, note)
+        if asked.part is not None:
+            replaced = building.prepared(asked.replaces, note)
         alarms = judge_step_losses(counts_of(done))
         for one in alarms:
             note(f"{one.name} {one.found}; {one.advice}")
-        if alarms and strict:
+        if alarms and asked.strict:
             raise CaptureError(
                 f"build_dataset: steps drop more than is usual, of which the notes tell; what is finished is kept in "
                 f"{building.kept_at}: mend the steps or leave captures out, or take it as it is without strict"
@@ -324,45 +265,3 @@ def _told(
         report.samples.extend(record.samples)
         report.quarantined.update(record.quarantined)
     return replace(report, num_shards=num_shards, num_finished=num_finished, is_complete=is_complete)
-
-
-def _check_arguments(config: BuildConfig, source: CaptureSource) -> None:
-    if not isinstance(config, BuildConfig):
-        raise DTypeError(
-            f"build_dataset: config must be a BuildConfig, not {type(config).__name__}; "
-            "pcdata.load_config(path) reads one"
-        )
-    checked_ids("build_dataset", source)
-    if config.loader.windows is not None and not episodes_of(source):
-        raise ConfigError(
-            f"build_dataset: loader.windows: {source!r} has no episodes to cut windows from; say in episodes.json "
-            "beside the captures which follow each other (pcdata.write_episodes), or leave windows out"
-        )
-    stored, on_the_fly = config.pipeline.split()
-    if on_the_fly.takes is not PointCloud:
-        raise ConfigError(
-            f"build_dataset: {type(on_the_fly.steps[0]).__name__} in the section depth is random, so no cloud is the "
-            "same in every epoch and none can be stored; leave it out here, or load captures on the fly with "
-            "CloudDataset"
-        )
-    if stored.gives is not PointCloud:
-        raise ConfigError("build_dataset: the pipeline gives images, not clouds to store; put Deproject last")
-
-
-def _check_ways(workers: int, timeout: float | None, engine: str, part: tuple[int, int] | None, finalize: bool) -> None:
-    where = "build_dataset"
-    if engine not in ENGINES:
-        raise ConfigError(f"{where}: engine must be one of {', '.join(ENGINES)}, got {engine!r:.60}")
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
-        raise ConfigError(f"{where}: workers must be a whole number from 0, got {workers!r:.60}")
-    if timeout is not None:
-        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < float("inf"):
-            raise ConfigError(f"{where}: timeout must be seconds above 0, got {timeout!r:.60}")
-        if engine == "pool" and not workers and not finalize:
-            raise ConfigError(f"{where}: timeout needs a process that can be ended: workers=1 or more")
-    if part is not None:
-        whole = isinstance(part, tuple) and len(part) == 2 and all(type(number) is int for number in part)
-        if not whole or not 0 <= part[0] < part[1]:
-            raise ConfigError(f"{where}: part must be (k, n) with 0 <= k < n, got {part!r:.60}")
-        if finalize:
-            raise ConfigError(f"{where}: finalize takes no part: it puts the whole dataset into place")

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from pcdata.build.builder import checked_request
 from pcdata.build.building import Building
 from pcdata.build.building_folder import BuildingFolder
 from pcdata.build.config import BuildConfig
 from pcdata.build.kept_for_retry import records_for_retry
 from pcdata.build.plan import plan_of
+from pcdata.build.request import BuildRequest
 from pcdata.build.source_state import captures_digest, files_of
 from pcdata.errors import CacheError
-from pcdata.io.sources.capture_source import CaptureSource, checked_ids
+from pcdata.io.sources.capture_source import CaptureSource
 
 
 @dataclass(frozen=True)
@@ -33,54 +34,27 @@ class Outlook:
     hindrances: list[str] = field(default_factory=list)  # why it would not begin
 
 
-def outlook(
-    config: BuildConfig,
-    source: CaptureSource,
-    folder: str | Path,
-    *,
-    overwrite: bool = False,
-    restart: bool = False,
-    workers: int = 0,
-    timeout: float | None = None,
-    max_bad: int | str | None = None,
-    engine: str = "pool",
-    part: tuple[int, int] | None = None,
-    finalize: bool = False,
-    hash_captures: bool = False,
-    retry_quarantined: bool = False,
-) -> Outlook:
-    """Return what :func:`build_dataset` would do with these arguments, which are its own.
+def outlook(config: BuildConfig, source: CaptureSource, folder: str | Path, **options: Any) -> Outlook:
+    """Return what :func:`build_dataset` would do with the same arguments; ``options`` are those of ``BuildRequest``.
 
     Raises:
         CaptureError: the source has no captures, or two of one id.
         ConfigError: the arguments do not fit together.
     """
-    checked_ids("build", source)
-    building = checked_request(
-        config,
-        source,
-        folder,
-        restart=restart,
-        workers=workers,
-        timeout=timeout,
-        max_bad=max_bad,
-        engine=engine,
-        part=part,
-        finalize=finalize,
-        retry_quarantined=retry_quarantined,
-    )
-    plan = plan_of(config, source, hash_captures=hash_captures)
-    replaces, hindrances = _target(building, overwrite or retry_quarantined)
+    asked = BuildRequest(**options)
+    building = asked.building(config, source, folder)
+    plan = plan_of(config, source, hash_captures=asked.hash_captures)
+    replaces, hindrances = _target(building, asked.replaces)
     try:
         different = building.differences(plan)
     except CacheError as error:
         different = [str(error)]
-    if different and not restart:
+    if different and not asked.restart:
         hindrances.append(
             f"an unfinished build, which differs in its {', '.join(different)}; --restart deletes it and begins anew"
         )
-    records = building.finished(plan) if different == [] and not restart else {}
-    if retry_quarantined and isinstance(building, BuildingFolder) and not different:
+    records = building.finished(plan) if different == [] and not asked.restart else {}
+    if asked.retry_quarantined and isinstance(building, BuildingFolder) and not different:
         try:
             records = records_for_retry(building, plan)
         except CacheError as error:
@@ -88,12 +62,13 @@ def outlook(
     known = [
         record
         for shard, record in records.items()
-        if captures_digest(source, plan.ids_of(shard), hash_captures) == record.captures and not record.is_doubtful
+        if captures_digest(source, plan.ids_of(shard), asked.hash_captures) == record.captures
+        and not record.is_doubtful
     ]
-    done = [record for record in known if not (retry_quarantined and record.quarantined)]
-    told = records.values() if retry_quarantined else known  # mended captures are others than those quarantined
-    shards = range(plan.num_shards) if part is None else range(part[0], plan.num_shards, part[1])
-    if finalize and len(done) < plan.num_shards:
+    done = [record for record in known if not (asked.retry_quarantined and record.quarantined)]
+    told = records.values() if asked.retry_quarantined else known  # mended captures are others than those quarantined
+    shards = asked.shards(plan)
+    if asked.finalize and len(done) < plan.num_shards:
         hindrances.append(
             f"{plan.num_shards - len(done)} of {plan.num_shards} shards are not finished; build them first"
         )

@@ -51,7 +51,7 @@ _BESIDE = 3.0  # distances of neighbors: how far beside a point the next one of 
 # Of points of which one in n is kept, none of the next 6 n is with a chance of exp(-6), far below what may be missing.
 _KEPT, _COUNTED = 6.0, 24
 _MOST = 2048  # points of a cloud that are looked up
-_DESCRIBED = 4096  # points that a cloud is described by: more of them make few candidates fewer
+_DESCRIBED = 8192  # points that a cloud is described by: more take longer, fewer make more candidates
 _ALIGNED = 192  # points that are brought onto the other cloud
 _STEPS = 24  # of the alignment, at most
 _SNAPS = 4  # times that what is nearly aligned is judged on the way

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import inspect
 import json
 import os
 
@@ -12,7 +14,8 @@ import pytest
 import torch
 
 from pcdata import CachedCloudDataset, PointCloud, open_source
-from pcdata.build import build_dataset, config_from_yaml
+from pcdata.build import build_dataset, config_from_yaml, outlook
+from pcdata.build.request import BuildRequest
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError
 from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.sample_keys import key_of
@@ -195,6 +198,19 @@ def test_a_pipeline_without_deprojection_is_refused(tmp_path, source):
     with pytest.raises(ConfigError, match="Deproject"):
         build_dataset(config_from_yaml("cloud: []"), source, tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_build_and_an_outlook_take_the_same_options(tmp_path, source, configure):
+    own = inspect.signature(build_dataset).parameters
+    options = {name: one.default for name, one in own.items() if one.kind is one.KEYWORD_ONLY}
+    assert options.pop("progress") is options.pop("note") is None
+    assert options == {one.name: one.default for one in dataclasses.fields(BuildRequest)}
+    assert outlook(configure(), source, tmp_path / "out", **options).num_samples == 3
+    for call in (build_dataset, outlook):
+        with pytest.raises(TypeError, match="worker"):
+            call(configure(), source, tmp_path / "out", worker=2)
+        with pytest.raises(ConfigError, match="workers must be a whole number"):
+            call(configure(), source, tmp_path / "out", workers=-1)
 
 
 # -- what is there already -----------------------------------------------------------------------------------------

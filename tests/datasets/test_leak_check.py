@@ -147,6 +147,24 @@ def test_halves_and_quarters_are_found_among_many_clouds_that_are_alike():
     assert len(pairs) < 40 * 20
 
 
+def test_thinned_copies_of_large_clouds_are_found_though_a_part_of_their_points_describes_them():
+    draw = np.random.default_rng(5)
+    sizes = draw.uniform(0.9, 1.1, (60, 1, 3))  # boxes that differ a little
+    clouds = [*(draw.uniform(-0.3, 0.3, (60, 20_000, 3)) * sizes)]
+    copies = [draw.permutation(cloud)[: 10_000 if row % 2 else 5_000] for row, cloud in enumerate(clouds[:20])]
+    every = [*clouds, *copies]
+    counts, parts = np.array([len(cloud) for cloud in every]), [np.arange(60), np.arange(60, 80)]
+    generator = seeded(0)
+    halves = [
+        half
+        for cloud, times in zip(every, thinned(counts, generator).tolist())
+        for half in thinnings(cloud, times, generator)
+    ]
+    pairs = {*candidates(np.stack([descriptor(cloud) for cloud in every]), counts, parts, np.stack(halves))}
+    assert sum((60 + row, row) in pairs for row in range(20)) >= 19
+    assert len(pairs) < 20 * 10
+
+
 class Copied:
     """Clouds by name; one is a shuffled copy of another."""
 
