@@ -126,7 +126,7 @@ def _built(
     progress: Progress | None,
     note: Note | None,
 ) -> BuildReport:
-    building = asked.building(config, source, folder)
+    building, replaces = asked.building(config, source, folder), asked.replaces
     report = BuildReport(building.target if isinstance(building, BuildingFolder) else building.target.url)
     report.skipped.update(skipped_of(source))
 
@@ -138,17 +138,17 @@ def _built(
     plan = plan_of(config, source, hash_captures=asked.hash_captures)
     if (
         (asked.part is not None or asked.finalize)
-        and not asked.replaces
+        and not replaces
         and (quarantined := building.quarantined_of(plan.identity)) is not None
     ):  # a job that is started again when all is done
         tell("the dataset was put into place before")
         report.quarantined.update(quarantined)
         return replace(report, num_shards=plan.num_shards, num_finished=plan.num_shards, is_complete=True)
-    building.check_target(asked.replaces)
+    building.check_target(replaces)
     limit = most_bad(asked.max_bad, len(plan.ids))
     job = Job.of(config, source, plan, building)
     with building.opened(plan, asked.what, restart=asked.restart, note=tell):
-        replaced = building.prepared(asked.replaces, tell) if asked.part is None else None
+        replaced = building.prepared(replaces, tell) if asked.part is None else None
         shards = asked.shards(plan)
         if asked.retry_quarantined and isinstance(building, BuildingFolder):
             take_over(building, plan)

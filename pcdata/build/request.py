@@ -47,8 +47,10 @@ class BuildRequest:
             raise ConfigError(f"{_WHERE}: engine must be one of {', '.join(ENGINES)}, got {self.engine!r:.60}")
         if isinstance(self.workers, bool) or not isinstance(self.workers, int) or self.workers < 0:
             raise ConfigError(f"{_WHERE}: workers must be a whole number from 0, got {self.workers!r:.60}")
-        self._check_timeout()
-        self._check_part()
+        if self.timeout is not None:
+            self._check_timeout(self.timeout)
+        if self.part is not None:
+            self._check_part(self.part)
         if self.retry_quarantined and (self.restart or self.finalize or self.part is not None):
             raise ConfigError(
                 f"{_WHERE}: retry_quarantined goes on with a whole build: without restart, finalize, part"
@@ -90,19 +92,13 @@ class BuildRequest:
             )
         return building
 
-    def _check_timeout(self) -> None:
-        given = self.timeout
-        if given is None:
-            return
+    def _check_timeout(self, given: float) -> None:
         if isinstance(given, bool) or not isinstance(given, (int, float)) or not 0 < given < float("inf"):
             raise ConfigError(f"{_WHERE}: timeout must be seconds above 0, got {given!r:.60}")
         if self.engine == "pool" and not self.workers and not self.finalize:
             raise ConfigError(f"{_WHERE}: timeout needs a process that can be ended: workers=1 or more")
 
-    def _check_part(self) -> None:
-        part = self.part
-        if part is None:
-            return
+    def _check_part(self, part: tuple[int, int]) -> None:
         whole = isinstance(part, tuple) and len(part) == 2 and all(type(number) is int for number in part)
         if not whole or not 0 <= part[0] < part[1]:
             raise ConfigError(f"{_WHERE}: part must be (k, n) with 0 <= k < n, got {part!r:.60}")
