@@ -142,6 +142,7 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     values = torch.rand(126, generator=seeded(4), dtype=torch.float64)
     yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})
     yield "window_medians", "on a grid", _medians
+    yield "hull_rows", "two", lambda: ((cloud[:, :2].double(),), {})
     jaw = ParallelJaw(
         opening=0.08, finger_length=0.04, finger_thickness=0.01, finger_width=0.02, palm_length=0.05, tip=0.03
     )
@@ -153,7 +154,7 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
 
 def _medians() -> Arguments:
     cloud = on_a_grid()
-    return (cloud["points"][:, 2].double(), cloud["points"], cloud["ptr"], cloud["grid"]), {}
+    return (cloud["points"][:, 2], cloud["points"], cloud["ptr"], cloud["grid"]), {}
 
 
 def _calls_of_images() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:

@@ -1,6 +1,6 @@
 """How well objects on a table are told apart, on real scenes with ground truth, beside the plain recipe and Open3D's.
 
-    PCDATA_TEST_DATA=... python benchmarks/segmentation.py [--parts table ablation kinds other] [--pictures FOLDER]
+    PCDATA_TEST_DATA=... python benchmarks/segmentation.py [--parts table time ablation kinds other] [--pictures FOLDER]
 
 Scenes: the Object Segmentation Database as modified by Alexandrov (`osd/`, or --osd FOLDER); a number says its kind.
 One set of numbers for all of them. `kinds` fits three numbers on three kinds of scenes and scores the fourth. Prints
@@ -29,6 +29,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 import pcdata
+from pcdata.functional import ParallelJaw, check_grasps
 from pcdata.functional.touching import joining, separation
 from pcdata.functional.touching.limits import Limits
 from pcdata.io import open_source, read_labels, read_pcd
@@ -39,7 +40,7 @@ from pcdata.validation import SegmentationScores, mean_scores, score_segmentatio
 
 OUTLINES = Path(__file__).parent / "apc_outlines.json"  # frame -> object -> corners (u, v), the nearest object last
 RESULT = Path(__file__).parent / "results" / "segmentation.json"
-PARTS = ("table", "ablation", "kinds", "other")
+PARTS = ("table", "time", "ablation", "kinds", "other")
 KINDS = {"boxes": range(17), "stacked": range(17, 25), "occluded": range(25, 33), "cylinders": range(33, 45)}
 SHOWN = ("overlap_f", "boundary_f", "found", "mean_iou")
 TABLE = RemovePlane(which="supporting", cut="measured", probability=0.9999)
@@ -69,6 +70,8 @@ def main() -> None:
     }
     if "table" in arguments.parts:
         found["table"] = table(scenes, arguments.pictures)
+    if "time" in arguments.parts:
+        found["time"] = timing(scenes)
     if {"ablation", "kinds"} & set(arguments.parts):
         without_table = [(name, kind, cloud, truth, TABLE(cloud)) for name, kind, cloud, truth in scenes]
         if "ablation" in arguments.parts:
@@ -193,6 +196,72 @@ def draw(scenes: list[Scene], scores: dict[str, SegmentationScores], method: Met
         image[:, cloud.source_index] = torch.stack([truth, method(cloud)]).clamp(min=-1).numpy() + 1
         picture = palette[image.reshape(2, height, width) % 256]
         Image.fromarray(np.concatenate([*picture], axis=1)).save(folder / f"{name}_{scores[name].overlap_f:.3f}.png")
+
+
+# -- time -------------------------------------------------------------------------------------------------------------
+
+HAND = ParallelJaw(
+    opening=0.08,
+    finger_length=0.045,
+    finger_thickness=0.01,
+    finger_width=0.02,
+    palm_length=0.06,
+    palm_span=0.2,
+    tip=0.1,
+)
+
+
+def timing(scenes: list[Scene]) -> dict[str, Any]:
+    """Time the steps of the method with two threads: the least of three runs, then the median over the scenes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        seconds: dict[str, list[tuple[float, float]]] = {}
+        part = ClusterObjects(split_touching=True)
+        warm = part(TABLE(scenes[0][2]))
+        for _, _, cloud, _ in scenes:
+            rest, table_took = least_time(lambda cloud=cloud: TABLE(cloud))
+            _, part_took = least_time(lambda rest=rest: part(rest))
+            seconds.setdefault("RemovePlane", []).append(table_took)
+            seconds.setdefault("ClusterObjects", []).append(part_took)
+            both = table_took[0] + part_took[0], table_took[1] + part_took[1]
+            seconds.setdefault("a frame", []).append(both)
+        points, given = grasps_at(warm)
+        _, took = least_time(lambda: check_grasps(points, **given))
+        seconds["10,000 grasps, 20,000 points"] = [took]
+    finally:
+        torch.set_num_threads(threads)
+    result = {
+        step: {
+            "wall": round(1000 * statistics.median(wall for wall, _ in took), 1),
+            "cpu": round(1000 * statistics.median(cpu for _, cpu in took), 1),
+        }
+        for step, took in seconds.items()
+    }
+    rows = [[step, *(f"{one[key]:.1f}" for key in ("wall", "cpu"))] for step, one in result.items()]
+    print(text_table(("with 2 threads", "ms", "CPU ms"), rows))
+    return result
+
+
+def least_time(call: Callable[[], Any], runs: int = 3) -> tuple[Any, tuple[float, float]]:
+    """Return a result, and the least wall and CPU seconds of a few runs."""
+    found, taken = None, []
+    for _ in range(runs):
+        start = time.perf_counter(), time.process_time()
+        found = call()
+        taken.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    return found, (min(wall for wall, _ in taken), min(cpu for _, cpu in taken))
+
+
+def grasps_at(objects: PointCloud) -> tuple[Tensor, dict[str, Any]]:
+    """Return 20,000 points of objects, and 10,000 grasps at them from all sides."""
+    generator = torch.Generator().manual_seed(0)
+    points = objects.points[torch.randint(objects.num_points, (20_000,), generator=generator)]
+    grasps = torch.eye(4, dtype=torch.float64).repeat(10_000, 1, 1)
+    turn = torch.linalg.qr(torch.randn(10_000, 3, 3, generator=generator, dtype=torch.float64))[0]
+    grasps[:, :3, :3] = turn * torch.linalg.det(turn)[:, None, None]
+    grasps[:, :3, 3] = points[:10_000].double() - 0.1 * grasps[:, :3, 2]
+    return points, {"grasps": grasps, "gripper": HAND}
 
 
 # -- what each ingredient brings --------------------------------------------------------------------------------------

@@ -171,6 +171,8 @@ def points_in_grippers(
     origin: Tensor,  # (G, 3) float64
     lower: Tensor,  # (4, G, 3) float64, as ParallelJaw.boxes
     upper: Tensor,
+    *,
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # (G,), (G,) int64
     """Count the points in palm or fingers, and between the fingers, of each gripper.
 

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_places
+from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, group_first
 from pcdata.functional.voxels import numbered_rows
@@ -126,28 +127,32 @@ def convex_hull(
     Fewer than three rows come back where all points lie on a line.
 
     Raises:
-        ShapeError: the points are not (N, 2).
+        ShapeError, DTypeError, NonFiniteError: the points are not (N, 2) finite numbers.
 
     Source: Barber, Dobkin and Huhdanpaa, The quickhull algorithm for convex hulls, ACM TOMS 22(4), 1996; in a plane.
     """
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ShapeError(f"convex_hull: points must be (N, 2), got {tuple(points.shape)}")
-    wide = points.detach().double()
-    rows = torch.arange(len(wide), dtype=torch.int64, device=points.device)
+    check_tensors("convex_hull", {"points": points}, {"points": "N 2 : float"})
+    return hull_rows(points.detach().double())
+
+
+@inner
+def hull_rows(points: Tensor, *, backend: str = "auto") -> Tensor:  # (P,) int64
+    """Return the rows that :func:`convex_hull` gives, of points (N, 2) float64."""
+    rows = torch.arange(len(points), dtype=torch.int64, device=points.device)
     if not len(rows):
         return rows
-    x, y = wide.unbind(1)
+    x, y = points.unbind(1)
     left = (x == x.min()).nonzero().squeeze(1)
     right = (x == x.max()).nonzero().squeeze(1)
     first, last = left[y[left].argmin()], right[y[right].argmax()]
-    if bool((wide[first] == wide[last]).all()):
+    if bool((points[first] == points[last]).all()):
         return first[None]
     corners: list[Tensor] = []
     # Edges of the hull so far, each with the points to its right; the farthest of those is a corner too.
     stack = [(last, first, rows), (first, last, rows)]
     while stack:
         a, b, around = stack.pop()
-        edge, offset = wide[b] - wide[a], wide[around] - wide[a]
+        edge, offset = points[b] - points[a], points[around] - points[a]
         beyond = offset[:, 0] * edge[1] - offset[:, 1] * edge[0]
         outside = beyond > 1e-12 * float(edge.square().sum())
         if not bool(outside.any()):
@@ -180,7 +185,7 @@ def over_hull(
     """Mark points over or under the convex hull of base in a plane, or within ``margin`` of the lines of its edges."""
     axes = plane_axes(plane)
     flat, flat_base = points.double() @ axes, base.double() @ axes
-    corners = flat_base[convex_hull(flat_base)]
+    corners = flat_base[hull_rows(flat_base)]
     if len(corners) < 3:
         return torch.zeros(len(points), dtype=torch.bool, device=points.device)
     edge = corners.roll(-1, 0) - corners

@@ -174,8 +174,9 @@ def _evidence(found: list[Separation], before: list[Tensor], after: list[Tensor]
     cuts: list[tuple[float, ...]] = []
     joins: list[tuple[int, ...]] = []
     for b, separation in enumerate(found):
-        pairs = torch.stack([before[b], after[b]], 1).unique(dim=0).tolist()
-        name = {old: new for old, new in pairs if old >= 0 and new >= 0}
+        new_of = torch.full((int(before[b].max()) + 2 if len(before[b]) else 1,), -1, dtype=torch.int64, device="cpu")
+        new_of[before[b].cpu() + 1] = after[b].cpu()  # all rows of an object have one new label
+        name = {old: new for old, new in enumerate(new_of[1:].tolist()) if new >= 0}
         for cut in separation.cuts:
             if all(one in name for one in cut.objects):
                 cuts.append((b, *sorted(name[one] for one in cut.objects), cut.strength, cut.num_pixels))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.selection import convex_hull, plane_axes
+from pcdata.functional.selection import hull_rows, plane_axes
 from pcdata.structures import PointCloud
 
 _MOST_CORNERS = 24  # of a stored hull: meta is written with every sample
@@ -54,9 +56,9 @@ def plane_facts(
     b: int,
 ) -> dict[str, Any]:
     """Return what is stored of one plane, in the source frame: itself, its share, its spread, and the hull of it."""
-    own, source_from_cloud = own.detach(), cloud.source_from_cloud[b]
+    own, source_from_cloud = own.detach().double(), cloud.source_from_cloud[b]
     (source_plane,) = map_planes(plane[None], torch.linalg.inv(source_from_cloud)[None])
-    off = own.double() @ plane[:3] + plane[3]
+    off = own @ plane[:3] + plane[3]
     corners = hull_corners(own, plane)
     moved = corners @ source_from_cloud[:3, :3].T + source_from_cloud[:3, 3]
     return {
@@ -72,13 +74,19 @@ def plane_facts(
 
 def hull_corners(own: Tensor, plane: Tensor) -> Tensor:  # (C, 3) float64
     """Return corners of the convex hull of points in a plane, moved onto it, without those that matter least."""
-    flat = own.double() @ plane_axes(plane)
-    rows = convex_hull(flat)
-    while len(rows) > _MOST_CORNERS:
-        # Leave out the corner whose triangle with its neighbors is smallest.
-        here = flat[rows]
-        before, after = here.roll(1, 0) - here, here.roll(-1, 0) - here
-        least = int((before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).abs().argmin())
-        rows = torch.cat([rows[:least], rows[least + 1 :]])
-    corners = own[rows].double()
+    own = own.double()
+    flat = own @ plane_axes(plane)
+    rows = hull_rows(flat)
+    rows = rows[_most_corners(flat[rows].cpu().numpy())]
+    corners = own[rows]
     return corners - (corners @ plane[:3] + plane[3])[:, None] * plane[:3]
+
+
+def _most_corners(corners: NDArray[np.float64]) -> list[int]:  # (C, 2), in order
+    """Say which corners stay: again and again the one goes whose triangle with its neighbors is smallest."""
+    kept = np.arange(len(corners))
+    while len(kept) > _MOST_CORNERS:
+        here = corners[kept]
+        before, after = np.roll(here, 1, 0) - here, np.roll(here, -1, 0) - here
+        kept = np.delete(kept, np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).argmin())
+    return [int(one) for one in kept]

@@ -8,7 +8,8 @@ import torch
 from scipy.spatial import ConvexHull
 
 from pcdata import functional as F
-from pcdata.errors import ConfigError, ShapeError
+from pcdata.errors import ConfigError, NonFiniteError, ShapeError
+from pcdata.functional.selection import hull_rows
 from pcdata.rng import seeded
 
 
@@ -78,6 +79,7 @@ def test_hulls_are_scipys(kind):
     if kind == "skewed":
         points = points @ torch.tensor([[1000.0, 999.0], [0.0, 0.01]], dtype=torch.float64)
     hull = F.convex_hull(points).tolist()
+    assert hull == hull_rows(points, backend="torch").tolist()
     wanted = ConvexHull(points.numpy()).vertices.tolist()  # counterclockwise too
     assert sorted(hull) == sorted(wanted)
     first = wanted.index(hull[0])
@@ -89,3 +91,13 @@ def test_hulls_of_lines_and_single_points_have_fewer_corners():
     assert sorted(F.convex_hull(line).tolist()) == [0, 4]
     assert F.convex_hull(line[:1].repeat(3, 1)).tolist() == [0]
     assert F.convex_hull(line[:0]).tolist() == []
+    assert all(
+        F.convex_hull(line[:n]).tolist() == hull_rows(line[:n].double(), backend="torch").tolist() for n in range(6)
+    )
+
+
+def test_hulls_of_what_is_no_point_are_refused():
+    with pytest.raises(NonFiniteError, match="convex_hull: points"):
+        F.convex_hull(torch.tensor([[0.0, 0.0], [torch.nan, 1.0]]))
+    with pytest.raises(ShapeError, match="convex_hull: points"):
+        F.convex_hull(torch.zeros(4, 3))

@@ -151,15 +151,15 @@ def _measured_noise(inverse: Tensor) -> float:
 
 
 def in_order_of_rows(found: Tensor) -> tuple[Tensor, dict[int, int]]:
-    """Number objects by their first rows; -1 stays. Also return old -> new."""
-    ids, inverse = found.unique(return_inverse=True)
+    """Number objects (n,) of 0, 1, ... by their first rows; -1 stays. Also return old -> new."""
+    count = int(found.max()) + 1 if len(found) else 0
     rows = torch.arange(len(found), dtype=torch.int64, device=found.device)
-    first = torch.full_like(ids, len(found)).scatter_reduce_(0, inverse, rows, "amin")
-    order = first[ids >= 0].argsort()
-    start = int((ids < 0).sum())
-    number = torch.full_like(ids, -1)
-    number[order + start] = torch.arange(len(order), dtype=torch.int64, device=found.device)
-    return number[inverse], dict(zip(ids[ids >= 0].tolist(), number[ids >= 0].tolist()))
+    first = torch.full((count + 1,), len(found), dtype=torch.int64, device=found.device)
+    first.scatter_reduce_(0, found + 1, rows, "amin")
+    order = first[1:].argsort(stable=True)[: int((first[1:] < len(found)).sum())]
+    number = torch.full_like(first, -1)
+    number[order + 1] = torch.arange(len(order), dtype=torch.int64, device=found.device)
+    return number[found + 1], dict(zip(order.tolist(), range(len(order))))
 
 
 __all__ = ["REASONS", "Cut", "Join", "Separation", "in_order_of_rows", "separate_objects"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pcdata.kernels.cpu import depth_to_color as cpu_registration
 from pcdata.kernels.cpu import fusion as cpu_fusion
+from pcdata.kernels.cpu import grasps as cpu_grasps
+from pcdata.kernels.cpu import image_windows as cpu_image_windows
 from pcdata.kernels.cpu import images as cpu_images
 from pcdata.kernels.cpu import lenses as cpu_lenses
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
@@ -18,6 +20,8 @@ from pcdata.kernels.cpu.native import unavailable
 
 __all__ = [
     "cpu_fusion",
+    "cpu_grasps",
+    "cpu_image_windows",
     "cpu_images",
     "cpu_lenses",
     "cpu_neighbors",

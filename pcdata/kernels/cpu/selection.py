@@ -1,4 +1,4 @@
-"""Masks of points in one pass: boxes, polygons, repeats."""
+"""Masks of points in one pass: boxes, polygons, repeats; the hull of points in a plane."""
 
 from __future__ import annotations
 
@@ -40,3 +40,11 @@ def duplicate_mask(*, points: Tensor, ptr: Tensor) -> Tensor:
     repeats = room(len(points), torch.bool)
     call("pc_duplicate_mask", points, ptr, len(ptr) - 1, repeats)
     return repeats
+
+
+@kernel("hull_rows", "cpu")
+def hull_rows(points: Tensor) -> Tensor:
+    """Divide edges like the reference, with one pass over the points outside of each."""
+    corners, number = room(len(points), torch.int64), room(1, torch.int64)
+    call("pc_convex_hull", points.contiguous(), len(points), corners, number)
+    return corners[: int(number)].clone()

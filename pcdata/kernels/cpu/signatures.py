@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x0EB6250A0CBEAE2
+INTERFACE_NUMBER = 0xB0BEABD7E19569B
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -37,6 +37,12 @@ pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* ins
 pc_box_mask: float* points, int64* ptr, int64 num_clouds, float* lower, float* upper, uint8* inside
 pc_polygon_mask: float* points, int64 rows, double* corners, int64 num_corners, uint8* inside
 pc_duplicate_mask: float* points, int64* ptr, int64 num_clouds, uint8* repeats
+pc_convex_hull: double* points, int64 count, int64* corners, int64* num_corners
+pc_points_in_grippers: float* points, int64 count, double* axes, double* origin, double* lower, double* upper, int64
+    num_grasps, int64* hits, int64* held
+pc_window_medians: float* values, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, float* medians
+pc_linked_pixels: float* points, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, double limit,
+    int64 reach, int64* label
 pc_project_points: double* points, int64* ptr, int64 views, double* intrinsics, double* lenses, double* pixels
 pc_render_points: float* points, int64* ptr, int64 views, double* intrinsics, double* lenses, int64 height, int64 width,
     double point_size, float* depth, int64* index
@@ -89,6 +95,9 @@ pc_count_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes
     int64* counts
 pc_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, double distance, uint8* near
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
+pc_reach: float* points, int64 rows, double* places, int64 num_places, double least, double* reach
+pc_fit_surface: float* points, int64 count, double* reach, double* plane, double* axes, double* numbers, double* height,
+    double* found
 pc_tsdf_touched: float* depth, float* rays, int64 height, int64 width, float* turn, float* fraction, int64* camera,
     float* offsets, int64 num_offsets, int64* found, int64* count
 pc_tsdf_find: int64* keys, int64 num_blocks, int32* slots, int64 num_slots, int64 num_known, int64* wanted, int64

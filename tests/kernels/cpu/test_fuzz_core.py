@@ -32,8 +32,8 @@ OWN_CHECKS = {"estimate_normals", "ransac_plane"}
 OWN_CHECKS |= {"f_score", "hausdorff_distance", "interpolate_features"}
 # Its second step alone, below.
 OWN_CHECKS |= {"neighborhood_covariance"}
-# Planes that ransac_plane's steps find, chosen among in torch.
-OWN_CHECKS |= {"segment_planes", "supporting_plane"}
+# Planes that ransac_plane's steps find, chosen among in torch; a surface whose steps are fuzzed below.
+OWN_CHECKS |= {"segment_planes", "supporting_plane", "table_surface"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
 
 
@@ -378,6 +378,47 @@ def both(name: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return INNER[name].public, INNER[name].reference
 
 
+def equal_but_for_nan(ours: Tensor, theirs: Tensor) -> bool:
+    return torch.equal(ours.isnan(), theirs.isnan()) and torch.equal(ours.nan_to_num(), theirs.nan_to_num())
+
+
+def fuzz_image_windows(rng: np.random.Generator, points: Tensor, ptr: Tensor, grid: ImageGrid) -> None:
+    eps, reach = float(rng.choice([1e-6, 0.005, 0.02, 0.1, 3.0])), int(rng.integers(1, 4))
+    on_image = {"pixel_index": grid.pixel_index, "size": grid.size}
+    check("image_clusters", strided(rng, points), ptr, **on_image, eps=eps, reach=reach)
+    values = rng.normal(size=len(points)) * rng.choice([1e-6, 1.0, 1e30])
+    if rng.random() < 0.5:
+        values = np.rint(values)  # ties
+    values[rng.random(len(points)) < rng.choice([0.0, 0.2, 1.0])] = rng.choice([np.nan, np.inf, -np.inf])
+    given = torch.from_numpy(values).float(), points, ptr, grid
+    assert equal_but_for_nan(*(body(*given) for body in both("window_medians")))
+
+
+def fuzz_hull(rng: np.random.Generator, points: Tensor) -> None:
+    flat = points.detach()[:, :2].double()
+    if rng.random() < 0.3:
+        flat = torch.nn.functional.normalize(flat - flat.mean(0) if len(flat) else flat)  # on a circle: all corners
+    ours, theirs = (body(flat) for body in both("hull_rows"))
+    assert torch.equal(ours, theirs)
+
+
+def fuzz_grippers(rng: np.random.Generator, points: Tensor) -> None:
+    count = int(rng.choice([0, 1, 5, 40]))
+    axes = torch.from_numpy(np.linalg.qr(rng.normal(size=(count, 3, 3)))[0])
+    if rng.random() < 0.3:
+        axes = torch.eye(3, dtype=torch.float64)[torch.from_numpy(rng.permutation(3))].repeat(count, 1, 1)
+    nearest = points.detach()[torch.from_numpy(rng.integers(0, max(len(points), 1), count))] if len(points) else None
+    origin = torch.from_numpy(rng.normal(size=(count, 3)) * rng.choice([1e-3, 0.5]))
+    origin = origin if nearest is None else origin + nearest
+    size = float(rng.choice([1e-3, 0.1, 2.0]))
+    lower = torch.from_numpy(rng.normal(size=(4, count, 3))) * size
+    upper = lower + torch.from_numpy(rng.random((4, count, 3))) * size
+    if rng.random() < 0.3:  # faces that points lie on
+        origin, lower, upper = origin.round(), lower.round(), upper.round()
+    ours, theirs = (body(points.detach(), axes, origin, lower, upper) for body in both("points_in_grippers"))
+    assert all(map(torch.equal, ours, theirs))
+
+
 def fuzz_images(rng: np.random.Generator) -> None:
     height, width, views = int(rng.integers(1, 40)), int(rng.integers(1, 50)), int(rng.integers(1, 3))
     depth = torch.from_numpy(np.stack([depth_image(rng, height, width) for _ in range(views)])).float()
@@ -437,7 +478,12 @@ def each_case(first: int, body: Callable[[np.random.Generator], None]) -> None:
 
 
 def test_organized_clouds_full_of_ties_equal_the_reference(machine: str):
-    each_case(0, lambda rng: fuzz_neighborhoods(rng, *organized(rng)))
+    def body(rng: np.random.Generator) -> None:
+        points, ptr, grid = organized(rng)
+        fuzz_neighborhoods(rng, points, ptr, grid)
+        fuzz_image_windows(rng, points, ptr, grid)
+
+    each_case(0, body)
 
 
 def test_ragged_clouds_equal_the_reference(machine: str):
@@ -450,6 +496,8 @@ def test_ragged_clouds_equal_the_reference(machine: str):
         fuzz_masks(rng, points, ptr)
         fuzz_rendering(rng, points, ptr)
         fuzz_rows(rng, points, ptr)
+        fuzz_hull(rng, points)
+        fuzz_grippers(rng, points)
 
     each_case(1_000_000, body)
 

@@ -155,6 +155,32 @@ PC_EXPORT int32_t pc_polygon_mask(const pc_context* context, const float* points
 PC_EXPORT int32_t pc_duplicate_mask(const pc_context* context, const float* points, const int64_t* ptr,
                                     int64_t num_clouds, uint8_t* repeats);
 
+// points (count, 2) -> corners (*num_corners,) of room for all: the rows of their convex hull, counterclockwise, as
+// hull_rows describes them.
+PC_EXPORT int32_t pc_convex_hull(const pc_context* context, const double* points, int64_t count, int64_t* corners,
+                                 int64_t* num_corners);
+
+// points (count, 3); of each gripper its axes (num_grasps, 3, 3) in rows, its origin (num_grasps, 3) and the corners
+// lower and upper (4, num_grasps, 3) of palm, two fingers and the room between them -> hits and held (num_grasps,), the
+// points in the first three and in the last, as points_in_grippers describes them.
+PC_EXPORT int32_t pc_points_in_grippers(const pc_context* context, const float* points, int64_t count,
+                                        const double* axes, const double* origin, const double* lower,
+                                        const double* upper, int64_t num_grasps, int64_t* hits, int64_t* held);
+
+// -- points on depth images -------------------------------------------------------------------------------------------
+
+// values (N,) of points on the pixels (N,), rising within each cloud, of images (height, width) -> medians (N,): the
+// lower medians of the values that the 3 x 3 pixels around each have; those that are NaN do not count.
+PC_EXPORT int32_t pc_window_medians(const pc_context* context, const float* values, const int64_t* pixel,
+                                    const int64_t* ptr, int64_t num_clouds, int64_t height, int64_t width,
+                                    float* medians);
+
+// points (N, 3) on such pixels -> label (N,): 0, 1, ... in each cloud, the parts that are connected over pixels at most
+// `reach` apart whose points are nearer than `limit` squared. Clouds hold less than 2^31 points.
+PC_EXPORT int32_t pc_linked_pixels(const pc_context* context, const float* points, const int64_t* pixel,
+                                   const int64_t* ptr, int64_t num_clouds, int64_t height, int64_t width, double limit,
+                                   int64_t reach, int64_t* label);
+
 // -- rendering --------------------------------------------------------------------------------------------------------
 
 // points (N, 3) float64 in the frames of their cameras, intrinsics (views, 3, 3), lenses (views, 14) or null: twelve
@@ -354,6 +380,18 @@ PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points,
 // eighth point of a piece, and pieces are added in order.
 PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              const uint8_t* mask, const double* centers, double* sums);
+
+// points (rows, 3), places (num_places, 3), one for all or one for each -> reach (rows,): their distances, of at least
+// `least`.
+PC_EXPORT int32_t pc_reach(const pc_context* context, const float* points, int64_t rows, const double* places,
+                           int64_t num_places, double least, double* reach);
+
+// points (count, 3) with reach (count,), a plane (4,) and its axes (3, 2), numbers (8,) as fit_surface lays them out ->
+// height (count,) over the surface, and found (4,): noise, typical reach, clutter, and the points near the plane at
+// first. Where these are less than 3, nothing else is certain.
+PC_EXPORT int32_t pc_fit_surface(const pc_context* context, const float* points, int64_t count, const double* reach,
+                                 const double* plane, const double* axes, const double* numbers, double* height,
+                                 double* found);
 
 // -- truncated signed distance fields ---------------------------------------------------------------------------------
 
