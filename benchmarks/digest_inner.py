@@ -143,6 +143,10 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})
     yield "window_medians", "on a grid", _medians
     yield "hull_rows", "two", lambda: ((cloud[:, :2].double(),), {})
+    places = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 0.9]], dtype=torch.float64)
+    yield "reaches", "two", lambda: ((cloud, ptr, places, 0.01), {})
+    level, ones = torch.tensor([0.0, 0.0, 1.0, -0.05], dtype=torch.float64), torch.ones(126, dtype=torch.float64)
+    yield "fit_surface", "level", lambda: ((cloud, ones, level, 0.03, "digest"), {})
     jaw = ParallelJaw(
         opening=0.08, finger_length=0.04, finger_thickness=0.01, finger_width=0.02, palm_length=0.05, tip=0.03
     )

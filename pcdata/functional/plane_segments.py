@@ -194,7 +194,7 @@ def supporting_plane(
     winners, samples = [], []
     for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
         own = points[start : stop : max(1, math.ceil((stop - start) / _SAMPLE))]
-        span = float((own.amax(0) - own.amin(0)).max()) / distance
+        span = max(float(along.max() - along.min()) for along in own.T.contiguous()) / distance
         if span > _MOST_SPAN:
             raise UnitError(
                 f"supporting_plane: cloud {b} spans {span:.3g} times distance={distance:g}, more than {_MOST_SPAN:g}; "

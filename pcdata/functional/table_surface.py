@@ -18,8 +18,8 @@ from pcdata.functional.image_clusters import linked_pixels
 from pcdata.functional.image_grid import ImageGrid, checked_grid, is_lined
 from pcdata.functional.neighbors import knn
 from pcdata.functional.planes import fit_planes
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
-from pcdata.functional.surface_fit import fit_surface
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, pick_rows, ptr_after_mask
+from pcdata.functional.surface_fit import fit_surface, reaches
 
 # Of the distance: what makers of depth cameras allow theirs within its range, and more than the good ones have.
 _WORST_NOISE = 0.02
@@ -44,7 +44,10 @@ class TableSurface(NamedTuple):
 
 
 def _checked_viewpoint(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
-    """Require a finite place (3,) for all, one per cloud (B, 3) or one per point (N, 3); bodies get (N, 3) float64."""
+    """Require a finite place (3,) for all, one per cloud (B, 3) or one per point (N, 3); bodies get one of the latter.
+
+    They are float64.
+    """
     points, ptr = arguments["points"], arguments["ptr"]
     places = torch.as_tensor(arguments[name], dtype=torch.float64, device=points.device).detach()
     if places.shape not in {(3,), (len(ptr) - 1, 3), tuple(points.shape)}:
@@ -53,9 +56,7 @@ def _checked_viewpoint(where: str, name: str, arguments: Mapping[str, Any]) -> T
         )
     if not bool(torch.isfinite(places).all()):
         raise ConfigError(f"{where}: {name} must be finite")
-    if places.ndim == 2 and len(places) == len(ptr) - 1 != len(points):
-        places = places[cloud_of_rows(ptr)]
-    return places.expand(len(points), 3)
+    return places.expand(len(ptr) - 1, 3) if places.ndim == 1 else places
 
 
 @inner
@@ -113,7 +114,7 @@ def _middle_of_nine(values: list[Tensor]) -> Tensor:
     min_size=checked_length,
     max_noise=checked_length,
     grid=checked_grid,
-    steps=(window_medians, linked_pixels, fit_planes),
+    steps=(reaches, fit_surface, window_medians, linked_pixels, fit_planes),
     gradient=False,
 )
 def table_surface(
@@ -163,7 +164,7 @@ def table_surface(
         NoPlaneError: a plane's normal is zero, or it has fewer than 3 points nearer than ``distance``.
     """
     assert ptr is not None  # @op fills it
-    assert viewpoint is None or isinstance(viewpoint, Tensor)  # and makes it (N, 3)
+    assert viewpoint is None or isinstance(viewpoint, Tensor)  # and makes it (B, 3) or (N, 3)
     points, planes = points.contiguous(), planes.contiguous()  # sums over strides are taken in another order
     length = planes[:, :3].norm(dim=1, keepdim=True)
     if bool((length == 0).any()):
@@ -171,13 +172,15 @@ def table_surface(
     planes = planes / length
     reach = points.new_ones(len(points), dtype=torch.float64)
     if viewpoint is not None:
-        reach = (points.double() - viewpoint).norm(dim=1).clamp(min=distance)
+        reach = reaches(points, ptr, viewpoint, distance, backend=backend)
     fits, sides = [], []
     for b, (start, stop) in enumerate(_bounds(ptr)):
-        fits.append(fit_surface(points[start:stop], reach[start:stop], planes[b], distance, f"cloud {b}"))
+        own = points[start:stop], reach[start:stop], planes[b]
+        fits.append(fit_surface(*own, distance, f"cloud {b}", backend=backend))
         sides.append(math.nan)
         if viewpoint is not None and stop > start:
-            aside = abs(float((viewpoint[start:stop] @ planes[b, :3] + planes[b, 3]).median()))
+            places = viewpoint[start:stop] if len(viewpoint) == len(points) else viewpoint[b : b + 1]
+            aside = abs(float((places @ planes[b, :3] + planes[b, 3]).median()))
             sides[-1] = aside if aside > distance else math.nan
     heights = torch.cat([fit.height for fit in fits])
     sigmas, typical, clutter, side = (
@@ -188,32 +191,27 @@ def table_surface(
     believed = (clutter <= _MOST_CLUTTER) & (sigmas <= worst)
     if max_noise is not None:
         believed &= ~(sigmas / side > max_noise)  # NaN is not known to be more
-    cloud = cloud_of_rows(ptr)
-    rise = window_medians((heights / (sigmas[cloud] * reach)).float(), points, ptr, grid, backend=backend)
-    suspect = rise > cut
-    area = point_areas(points, ptr, grid)
-    part, num_parts = _connected(points, ptr, suspect, grid, 5 * distance, backend)
-    high = torch.where(rise[suspect] > min_height, area[suspect], 0.0)
-    covered = torch.zeros(num_parts, dtype=torch.float64, device=points.device).index_add_(0, part, high.double())
-    something = torch.zeros_like(suspect)
-    something[suspect] = (covered >= min_size**2)[part]
+    spread = torch.cat([fit.noise * reach[start:stop] for fit, (start, stop) in zip(fits, _bounds(ptr))])
+    rise = window_medians((heights / spread).float(), points, ptr, grid, backend=backend)
+    something = _standing(points, ptr, rise, cut, min_height, min_size, grid, 5 * distance, backend)
     below = (rise < -cut) & (heights < -distance)
     table = ~(something | below)
-    own = table & (heights.abs() < cut * sigmas[cloud] * reach)
+    flat = table & (heights.abs() < cut * spread)
     if not bool(believed.all()):
+        cloud = cloud_of_rows(ptr)
         x, y, z = points.double().unbind(1)
         nx, ny, nz, offset = planes[cloud].unbind(1)
         over_plane = ((nx * x + ny * y) + nz * z) + offset
         heights = torch.where(believed[cloud], heights, over_plane)
         table = torch.where(believed[cloud], table, over_plane.abs() < distance)
-        own = torch.where(believed[cloud], own, table)
-    refitted = fit_planes(points, ptr, own, backend=backend).to(points.device)
+        flat = torch.where(believed[cloud], flat, table)
+    refitted = fit_planes(points, ptr, flat, backend=backend).to(points.device)
     # Those of a line stay, and those that are not believed.
     refitted = torch.where(believed[:, None] & ~refitted[:, :1].isnan(), refitted, planes)
     turned = (refitted[:, :3] * planes[:, :3]).sum(1, keepdim=True) < 0
     return TableSurface(
         table,
-        own,
+        flat,
         heights.float(),
         torch.where(believed, sigmas * typical, math.nan),
         torch.where(believed, sigmas / side, math.nan),
@@ -248,17 +246,44 @@ def point_areas(points: Tensor, ptr: Tensor, grid: ImageGrid | None) -> Tensor: 
     return torch.cat(areas)
 
 
+def _standing(
+    points: Tensor,
+    ptr: Tensor,
+    rise: Tensor,
+    cut: float,
+    min_height: float,
+    min_size: float,
+    grid: ImageGrid | None,
+    reach: float,
+    backend: str,
+) -> Tensor:  # (N,) bool
+    """Mark the suspects that are something: in connected parts that cover enough at more than the least height."""
+    suspect = rise > cut
+    fields = {"points": points, "rise": rise}
+    if grid is None:
+        fields["area"] = point_areas(points, ptr, None)  # neighbors of all points
+    else:
+        fields["pixel"] = grid.pixel_index
+    own, own_ptr = pick_rows(fields, suspect), ptr_after_mask(suspect, ptr)
+    if grid is not None:
+        on = ImageGrid(own["pixel"], grid.size, grid.intrinsics, grid.camera_from_points)
+        own["area"] = point_areas(own["points"], own_ptr, on)
+    part, num_parts = _connected(own["points"], own_ptr, own.get("pixel"), grid, ptr, reach, backend)
+    high = torch.where(own["rise"] > min_height, own["area"], 0.0)
+    covered = torch.zeros(num_parts, dtype=torch.float64, device=points.device).index_add_(0, part, high.double())
+    suspect[suspect.clone()] = (covered >= min_size**2)[part]
+    return suspect
+
+
 def _connected(
-    points: Tensor, ptr: Tensor, suspect: Tensor, grid: ImageGrid | None, reach: float, backend: str
+    own: Tensor, own_ptr: Tensor, pixel: Tensor | None, grid: ImageGrid | None, ptr: Tensor, reach: float, backend: str
 ) -> tuple[Tensor, int]:  # (suspects,) part, their number over all clouds
-    """Number the connected parts of the suspects."""
-    own, own_ptr = points[suspect], ptr_after_mask(suspect, ptr)
+    """Number the connected parts of the suspects, points ``own`` on pixels of a grid, of clouds with ``ptr``."""
     if not len(own):
         return own_ptr.new_zeros(0), 0
-    if grid is None:
+    if grid is None or pixel is None:
         part = dbscan(own, own_ptr, eps=reach / 2, min_points=1)
     else:
-        pixel = grid.pixel_index[suspect]
         part = torch.cat(
             [
                 linked_pixels(

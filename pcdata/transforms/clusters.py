@@ -17,6 +17,7 @@ from pcdata.functional.rows import ptr_after_mask, ptr_from_counts
 from pcdata.functional.touching import REASONS, Separation, in_order_of_rows, separate_objects
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
+from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decision, Decisions
 from pcdata.transforms.families import DropLimit, LeftOutWarning
@@ -65,6 +66,7 @@ class ClusterObjects(DropLimit):
         if self.min_size > self.max_size:
             raise ConfigError(f"ClusterObjects: min_size {self.min_size} exceeds max_size {self.max_size}")
 
+    @torch_on_one_thread()
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
         grid = data.image_grid()
@@ -139,6 +141,7 @@ class ClusterObjects(DropLimit):
         number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
         return number[raw + 1], size[~accepted]
 
+    @torch_on_one_thread()
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Write the labels and drop the rest unless the whole scene is kept."""
         labels = params["labels"]

@@ -16,13 +16,14 @@ from pcdata.contracts.host import negated
 from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import near_planes, ransac_plane
-from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, count_per_cloud, pick_rows, ptr_after_mask
 from pcdata.functional.selection import over_hull
 from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
 from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
+from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import RemoveTransform
@@ -119,6 +120,7 @@ class RemovePlane(RemoveTransform):
         """The frame of ``up``."""
         return self.frame
 
+    @torch_on_one_thread()
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Find the plane of every cloud and the rows that stay."""
         planes, own = self._found(data)
@@ -129,7 +131,7 @@ class RemovePlane(RemoveTransform):
             data.ptr,
             planes=planes,
             distance=self.distance,
-            viewpoint=data.viewpoint_per_point(),
+            viewpoint=data.extra.get("viewpoint", data.viewpoint),
             max_noise=_WORST_SENSOR,
             grid=data.image_grid(),
         )
@@ -230,12 +232,13 @@ class RemovePlane(RemoveTransform):
         side = float(seen_from[b].double() @ plane[:3] + plane[3])
         return "neither side" if abs(side) < self.distance else "sensor"
 
+    @torch_on_one_thread()
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
         entries: list[dict[str, Any]] = []
         for b, (start, stop) in enumerate(pairwise(data.ptr.tolist())):
             plane = params["planes"][b]
-            own = data.points[start:stop][params["per_point"][start:stop]]
+            own = pick_rows({"points": data.points[start:stop]}, params["per_point"][start:stop])["points"]
             found = plane_facts(own, stop - start, plane, data, b)
             found["faces"] = self._faces(data, b, plane)
             for name in ("noise", "disparity_noise"):

@@ -15,6 +15,7 @@ from pcdata.kernels.cpu import rows as cpu_rows
 from pcdata.kernels.cpu import sampling as cpu_sampling
 from pcdata.kernels.cpu import selection as cpu_selection
 from pcdata.kernels.cpu import stored_rows as cpu_stored_rows
+from pcdata.kernels.cpu import surfaces as cpu_surfaces
 from pcdata.kernels.cpu import touching as cpu_touching
 from pcdata.kernels.cpu.native import unavailable
 
@@ -32,6 +33,7 @@ __all__ = [
     "cpu_sampling",
     "cpu_selection",
     "cpu_stored_rows",
+    "cpu_surfaces",
     "cpu_touching",
     "unavailable",
 ]
