@@ -149,6 +149,7 @@ def _parser() -> argparse.ArgumentParser:
         export,
         fuse,
         models,
+        report,
         sensors,
         split,
         validate,
@@ -159,7 +160,22 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"pcdata {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    groups = (datasets, build, split, card, verify, convert, fuse, export, validate, evaluate, models, sensors, calib)
+    groups = (
+        datasets,
+        build,
+        split,
+        card,
+        verify,
+        convert,
+        fuse,
+        export,
+        validate,
+        report,
+        evaluate,
+        models,
+        sensors,
+        calib,
+    )
     for group in groups:
         group.add_to(commands)
     for command in commands.choices.values():  # also after the command, where one adds it to a line that failed

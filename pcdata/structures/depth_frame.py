@@ -23,6 +23,7 @@ from pcdata.structures.confidence import Confidence
 from pcdata.structures.image_arrays import camera_of, image_tensor, pose_tensor
 from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.structures.point_arrays import signals_of_arrays
+from pcdata.structures.showing import shown_page
 from pcdata.structures.signal_joining import check_same_signals, joined_signals, remaining_signals
 from pcdata.structures.signals import Signal, Values, check_signal_form, checked_signal, told_signals
 from pcdata.structures.structure import Structure, derived
@@ -275,6 +276,10 @@ class DepthFrame(Structure):
     def _tensors(self) -> dict[str, Tensor | None]:
         names = ("depth", "colors", "labels", "confidence", "mask", "world_from_camera")
         return {name: getattr(self, name) for name in names}
+
+    def show(self, *, max_points: int = 200_000) -> Any:
+        """Return a :class:`pcdata.report.Page` with the points that the images show; see :meth:`PointCloud.show`."""
+        return shown_page([("capture", self)], repr(self), max_points=max_points)
 
     def __repr__(self) -> str:
         height, width = self.size

@@ -18,12 +18,14 @@ from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
 from pcdata.structures.cloud_checks import check_cloud, check_motions
+from pcdata.structures.cloud_summary import cloud_summary
 from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
 from pcdata.structures.read_later import Histories, Metas, OfClouds, Step
+from pcdata.structures.showing import shown_page
 from pcdata.structures.signals import told_signals
 from pcdata.structures.structure import checked_copy, derived
 from pcdata.structures.unbatched import Unbatched
@@ -406,6 +408,19 @@ class PointCloud(CloudBatch):
         filler = fillers({name: values[0] for name, values in parts.items()}, clouds[0].kinds)
         rows = pad_rows({name: rows_per_cloud(value, counts) for name, value in parts.items()}, width, filler)
         return padded_clouds(clouds, rows, flat)
+
+    def summary(self) -> str:
+        """Say in some lines where the points are, how far apart, and what is known of each."""
+        return cloud_summary(self)
+
+    def show(self, *, max_points: int = 200_000, grasps: Tensor | None = None) -> Any:
+        """Return a :class:`pcdata.report.Page` with the cloud in three dimensions: a notebook shows it.
+
+        Args:
+            max_points: drawn; of more every k-th is.
+            grasps: (G, 4, 4) poses in this frame to be drawn, x between the fingers and z toward the object.
+        """
+        return shown_page([("cloud", self)], repr(self), max_points=max_points, grasps=grasps)
 
     def __repr__(self) -> str:
         counts = self.counts.tolist()

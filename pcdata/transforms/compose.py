@@ -15,6 +15,7 @@ from pcdata.files.opening import read_text
 from pcdata.functional.noise import move_points
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import PointCloud
+from pcdata.structures.showing import shown_page
 from pcdata.transforms.base import Data, Transform, num_clouds, sha256_of
 from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_of_sections
 from pcdata.transforms.chain_rules import check_chain, warn_of_order
@@ -215,6 +216,20 @@ class Compose(Transform):
             end = next((i for i in range(end, len(steps)) if steps[i].is_random), len(steps))
         parts = (steps[: self._captures], steps[self._captures : end], steps[end:])
         return {section: [step.to_config() for step in part] for section, part in zip(SECTIONS, parts)}
+
+    def show_steps(self, data: Data, *, generator: GeneratorLike | None = None, max_points: int = 100_000) -> Any:
+        """Return a :class:`pcdata.report.Page` that steps through the clouds after every step.
+
+        Args:
+            data: a capture or a cloud.
+            generator: as of any step; needed where steps are random.
+            max_points: drawn of each cloud; of more every k-th is.
+        """
+        views: list[tuple[str, Any]] = [("capture", data)]
+        for step, made in self.step_through(data, generator=generator):
+            if isinstance(made, PointCloud):
+                views.append((type(step).__name__, made))
+        return shown_page(views, repr(data), max_points=max_points)
 
     def to_yaml(self) -> str:
         """Write the sections as YAML that :meth:`from_yaml` reads."""

@@ -1,0 +1,85 @@
+"""The commands that show and grade captures: report, grade."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pcdata.cli.argument_types import positive
+from pcdata.cli.known_names import SENSORS
+from pcdata.cli.options import add_capture_options, open_captures
+from pcdata.cli.progress_bar import ProgressBar
+
+
+def add_to(commands: Any) -> None:
+    """Add the commands to the parser."""
+    report = commands.add_parser("report", help="write one page that shows whether captures are good, and why not")
+    _add_captures(report)
+    report.add_argument("--out", metavar="FILE.html", default="report.html", help="the page (default: report.html)")
+    report.add_argument("--config", metavar="FILE.yaml", help="show the steps of this pipeline too")
+    report.add_argument("--samples", type=positive, metavar="N", default=12, help="captures shown (default: 12)")
+    report.set_defaults(run=_report)
+    grade = commands.add_parser("grade", help="grade a recording from A to F, by camera and episode, with the reasons")
+    _add_captures(grade)
+    grade.add_argument("--json", metavar="FILE", help="write the grade with every check's trend to FILE, replacing it")
+    grade.set_defaults(run=_grade)
+
+
+def _add_captures(command: argparse.ArgumentParser) -> None:
+    command.add_argument("path", metavar="PATH", help="folder of captures, a recording, or one cloud file")
+    add_capture_options(command)
+    command.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
+    command.add_argument(
+        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
+    )
+
+
+def _limits(arguments: argparse.Namespace) -> Any:
+    from pcdata.validation import CaptureLimits
+
+    return CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from pcdata.build import load_config
+    from pcdata.files.opening import replacing
+    from pcdata.report.html.capture_report import capture_page
+
+    pipeline = None if arguments.config is None else load_config(arguments.config).pipeline
+    source = open_captures(arguments.path, arguments, limit=arguments.limit)
+    with replacing("report --out", arguments.out) as temporary, ProgressBar("report") as progress:
+        page, grading = capture_page(
+            source, pipeline=pipeline, limits=_limits(arguments), num_shown=arguments.samples, progress=progress
+        )
+        Path(temporary).write_text(page, encoding="utf-8")
+    grade = grading.grade()
+    print(f"grade    {grade.letter}")
+    for reason in grade.reasons[:3]:
+        print(f"  {reason}")
+    print(f"page     {arguments.out} ({len(page.encode()) / 1e6:.1f} MB)")
+    return 0
+
+
+def _grade(arguments: argparse.Namespace) -> int:
+    from pcdata.files.opening import replacing
+    from pcdata.io.sources.capture_source import episodes_of
+    from pcdata.validation import validate_source
+    from pcdata.validation.grading import LETTERS, Grading
+
+    source = open_captures(arguments.path, arguments, limit=arguments.limit)
+    grading = Grading(source.ids, episodes_of(source))
+    with ProgressBar("grade") as progress:
+        for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
+            grading.add(report)
+            if not report.whole:
+                progress(done, len(source.ids), report.sample_id)
+    if arguments.json:
+        with replacing("grade --json", arguments.json) as temporary:
+            Path(temporary).write_text(json.dumps(grading.to_json(), indent=1, allow_nan=False), encoding="utf-8")
+    grade = grading.grade()
+    print(f"{grade.letter}: {LETTERS[grade.letter]}")
+    for reason in grade.reasons:
+        print(f"  {reason}")
+    return int(grade.letter in "DF")

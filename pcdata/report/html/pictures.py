@@ -1,0 +1,91 @@
+"""Pictures of depth images as PNG, without matplotlib: a page has many, and they must be small."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pcdata.structures import DepthFrame
+
+WIDTH = 320  # pixels that a picture is reduced to
+# Viridis at nine places (van der Walt and Smith 2015), as the viewer has it.
+_VIRIDIS = np.array(
+    [
+        *([68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141]),
+        *([39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]),
+    ],
+    dtype=np.float64,
+)
+_NO_READING = (214, 64, 159)  # not in viridis
+_STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Kinect-like sensors up to some metres
+
+
+def depth_picture(frame: DepthFrame, view: int) -> str:
+    """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a data URI."""
+    depth = _reduced(frame.depth[view].cpu().numpy())
+    valid = depth > 0
+    near, far = np.quantile(depth[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
+    image = viridis((depth - near) / max(far - near, 1e-9))
+    image[~valid] = _NO_READING
+    return png_uri(image)
+
+
+def confidence_picture(frame: DepthFrame, view: int) -> str | None:
+    """Confidence from low (dark) to high, None where the capture has none."""
+    if frame.confidence is None:
+        return None
+    confidence = _reduced(frame.confidence[view].cpu().numpy().astype(np.float64))
+    return png_uri(viridis(confidence / max(float(confidence.max()), 1e-9)))
+
+
+def edges_picture(frame: DepthFrame, view: int) -> str | None:
+    """The color image with the rims of depth in red: they lie on the outlines of things where both are registered."""
+    if frame.colors is None:
+        return None
+    depth = _reduced(frame.depth[view].cpu().numpy())
+    image = _reduced(frame.colors[view].cpu().numpy()).copy()
+    image[rims(depth)] = (255, 40, 40)
+    return png_uri(image)
+
+
+def color_picture(frame: DepthFrame, view: int) -> str | None:
+    """The color image, None where the capture has none."""
+    return None if frame.colors is None else png_uri(_reduced(frame.colors[view].cpu().numpy()))
+
+
+def rims(depth: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return the near side of steps of depth, (H, W)."""
+    rim = np.zeros(depth.shape, dtype=bool)
+    for axis in (0, 1):
+        first = depth[:-1] if axis == 0 else depth[:, :-1]
+        second = depth[1:] if axis == 0 else depth[:, 1:]
+        both = (first > 0) & (second > 0)
+        step = np.where(both, second - first, 0) / np.maximum(np.minimum(first, second), 1e-9)
+        low, high = (rim[:-1], rim[1:]) if axis == 0 else (rim[:, :-1], rim[:, 1:])
+        low |= step > _STEP
+        high |= step < -_STEP
+    return rim
+
+
+def viridis(share: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return colors (..., 3) for numbers in 0..1."""
+    place = np.clip(np.nan_to_num(share), 0, 1) * (len(_VIRIDIS) - 1)
+    low = np.minimum(place.astype(int), len(_VIRIDIS) - 2)
+    return np.asarray(_VIRIDIS[low] + (place - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])).astype(np.uint8)
+
+
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """Return an image (H, W, 3) as a data URI of a PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="png", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _reduced(image: NDArray) -> NDArray:
+    """Keep every k-th pixel: depth is never averaged."""
+    stride = max(1, -(-image.shape[1] // WIDTH))
+    return image[::stride, ::stride]
