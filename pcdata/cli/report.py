@@ -28,7 +28,7 @@ def add_to(commands: Any) -> None:
 
 
 def _add_captures(command: argparse.ArgumentParser) -> None:
-    command.add_argument("path", metavar="PATH", help="folder of captures, a recording, or one cloud file")
+    command.add_argument("path", metavar="PATH", help="folder of captures, a recording, one cloud file, or a dataset")
     add_capture_options(command)
     command.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
     command.add_argument(
@@ -45,14 +45,23 @@ def _limits(arguments: argparse.Namespace) -> Any:
 def _report(arguments: argparse.Namespace) -> int:
     from pcdata.build import load_config
     from pcdata.files.opening import replacing
+    from pcdata.io.sources.capture_source import check_apart
+    from pcdata.io.store.manifest import Manifest
     from pcdata.report.html.capture_report import capture_page
+    from pcdata.report.html.dataset_report import dataset_page
 
-    pipeline = None if arguments.config is None else load_config(arguments.config).pipeline
-    source = open_captures(arguments.path, arguments, limit=arguments.limit)
+    check_apart("--out", arguments.out, arguments.path)
     with replacing("report --out", arguments.out) as temporary, ProgressBar("report") as progress:
-        page, grading = capture_page(
-            source, pipeline=pipeline, limits=_limits(arguments), num_shown=arguments.samples, progress=progress
-        )
+        if Manifest.is_one(Path(arguments.path)):
+            page, grading = dataset_page(arguments.path, num_shown=arguments.samples, progress=progress)
+        else:
+            page, grading = capture_page(
+                open_captures(arguments.path, arguments, limit=arguments.limit),
+                pipeline=None if arguments.config is None else load_config(arguments.config).pipeline,
+                limits=_limits(arguments),
+                num_shown=arguments.samples,
+                progress=progress,
+            )
         Path(temporary).write_text(page, encoding="utf-8")
     grade = grading.grade()
     print(f"grade    {grade.letter}")

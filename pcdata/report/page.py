@@ -63,7 +63,7 @@ def page_of_views(
 
     Raises:
         DTypeError: it is something else.
-        CaptureError: depth images without readings, or of lenses that must be undistorted first.
+        TooFewPointsError: depth images without a reading.
     """
     stages = []
     for place, (caption, data) in enumerate(views):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from pcdata.transforms import Compose
 from pcdata.validation import CaptureLimits, validate_source
 from pcdata.validation.grading import LETTERS, Grading
 from pcdata.validation.view_names import view_names
-from pcdata.verdicts import Verdict
+from pcdata.verdicts import Finding, Verdict
 
 NUM_SHOWN = 12  # samples with pictures and clouds, unless more are asked for
 _MOST_BYTES = 18 << 20  # of packed clouds in a page; as text, with pictures, that is below 30 MB
@@ -32,6 +32,23 @@ _BYTES_PER_POINT = 7  # of a packed point with colors, as measured on captures o
 _MOST_TRENDS = 24  # time lines
 _COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
 Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of a whole dataset besides its clouds.
+
+    Args:
+        findings: about all of it.
+        funnel: (step, median points after it, words) in order.
+        sections: parts of the page of its own.
+        pipeline: the steps that made it, as YAML.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    funnel: tuple[tuple[str, float, str], ...] = ()
+    sections: tuple[Section, ...] = ()
+    pipeline: str = ""
 
 
 @dataclass(frozen=True)
@@ -53,6 +70,7 @@ def capture_page(
     num_shown: int = NUM_SHOWN,
     title: str = "",
     progress: Progress | None = None,
+    known: Known | None = None,
 ) -> tuple[str, Grading]:
     """Judge every capture of a source and return a self-contained page, and the grades it tells of.
 
@@ -65,11 +83,14 @@ def capture_page(
         num_shown: captures with pictures and clouds.
         title: of the page; "" = what the source says of itself.
         progress: told (captures judged, all, which).
+        known: what is known of a dataset besides its clouds.
 
     Raises:
         CaptureError: the source has no captures, or two with one id.
     """
+    known = known or Known()
     grading = Grading(source.ids, episodes_of(source))
+    grading.together += [("the build", finding) for finding in known.findings]
     worst: list[tuple[int, int]] = []  # (severity, -place) of the worst captures
     total = len(source.ids)
     for report in validate_source(source, limits=limits):
@@ -81,7 +102,7 @@ def capture_page(
             if progress is not None:
                 progress(place + 1, total, report.sample_id)
     looked = [_look(source, place, pipeline, num_shown, grading) for place in _places_shown(worst, total, num_shown)]
-    return _page(source, grading, looked, pipeline, title or str(source)), grading
+    return _page(source, grading, looked, pipeline, title or str(source), known), grading
 
 
 def _places_shown(worst: list[tuple[int, int]], total: int, num_shown: int) -> list[int]:
@@ -144,22 +165,20 @@ def _pictures(frame: DepthFrame) -> Iterator[tuple[str, str]]:
         yield f"{frame.num_views - 8} views more are not shown", color_picture(frame, 8) or depth_picture(frame, 8)
 
 
-def _page(source: CaptureSource, grading: Grading, looked: list[_Looked], pipeline: Compose | None, title: str) -> str:
+def _page(
+    source: CaptureSource, grading: Grading, looked: list[_Looked], pipeline: Compose | None, title: str, known: Known
+) -> str:
     scenes = [one.scene for one in looked if one.scene is not None]
-    place_of = {
-        one.scene.name: place for place, one in enumerate(o for o in looked if o.scene is not None) if one.scene
-    }
+    place_of = {scene.name: place for place, scene in enumerate(scenes)}
+    funnel = known.funnel or _funnel(looked)
     sections = [
         Section("Verdict", _verdict(grading)),
-        *(
-            [Section("Points after each step", _funnel(looked))]
-            if any(one.funnel for one in looked) and pipeline
-            else []
-        ),
-        Section("Captures", _captures(grading, looked, place_of)),
-        Section("Numbers over the captures", _trends(grading)),
+        *([Section("Points after each step (median)", bars(funnel))] if funnel else []),
+        *known.sections,
+        Section("Samples", _captures(grading, looked, place_of)),
+        Section("Numbers over the samples", _trends(grading)),
         *([Section("Episodes", _episodes(grading))] if grading.episodes else []),
-        Section("How this was made", _made(source, pipeline)),
+        Section("How this was made", _made(source, known.pipeline or (pipeline.to_yaml() if pipeline else ""))),
     ]
     return page_of(title, sections, scenes)
 
@@ -187,7 +206,7 @@ def _verdict(grading: Grading) -> str:
     return "".join(parts)
 
 
-def _finding(finding: Any, view: str, where: str) -> str:
+def _finding(finding: Finding, view: str, where: str) -> str:
     about = " ".join(filter(None, [finding.name, view]))
     advice = f'<p class="advice">What to do: {shown(finding.advice)}</p>' if finding.advice else ""
     return (
@@ -196,16 +215,25 @@ def _finding(finding: Any, view: str, where: str) -> str:
     )
 
 
-def _funnel(looked: list[_Looked]) -> str:
+def _funnel(looked: list[_Looked]) -> tuple[tuple[str, float, str], ...]:
+    """The median points after each step of the samples that are shown."""
     chains = [one.funnel for one in looked if one.funnel]
+    if not chains:
+        return ()
     names = [name for name, _ in chains[0]]
     same = [chain for chain in chains if [name for name, _ in chain] == names]
-    medians = np.median(np.array([[count for _, count in chain] for chain in same]), axis=0)
+    medians = np.median(np.array([[count for _, count in chain] for chain in same]), axis=0).tolist()
+    return funnel_rows(list(zip(names, medians)))
+
+
+def funnel_rows(steps: Sequence[tuple[str, float]]) -> tuple[tuple[str, float, str], ...]:
+    """Return rows for bars from (step, median points after it): each with its share of the step before."""
     rows = []
-    for place, (name, count) in enumerate(zip(names, medians.tolist())):
-        kept = f" ({count / medians[place - 1]:.0%} of before)" if place and medians[place - 1] else ""
+    for place, (name, count) in enumerate(steps):
+        before = steps[place - 1][1] if place else 0
+        kept = f" ({count / before:.0%} of before)" if before else ""
         rows.append((f"{place + 1}. {name}", count, f"{count:,.0f}{kept}"))
-    return f"<p>The median of {len(same)} captures that are shown below.</p>{bars(rows)}"
+    return tuple(rows)
 
 
 def _captures(grading: Grading, looked: list[_Looked], place_of: Mapping[str, int]) -> str:
@@ -262,9 +290,7 @@ def _episodes(grading: Grading) -> str:
     return f"<table><tr><th>episode</th><th>captures</th>{head}</tr>{''.join(rows[:500])}</table>{more}"
 
 
-def _made(source: CaptureSource, pipeline: Compose | None) -> str:
+def _made(source: CaptureSource, pipeline: str) -> str:
     versions = f"pcdata {__version__}, torch {torch.__version__}, Python {platform.python_version()}"
-    steps = (
-        f"<pre>{shown(pipeline.to_yaml(), 20_000)}</pre>" if pipeline is not None else "<p>No pipeline was given.</p>"
-    )
-    return f"<p>Captures: {shown(source)}. {shown(versions)}.</p>{steps}"
+    steps = f"<pre>{shown(pipeline, 20_000)}</pre>" if pipeline else "<p>No pipeline was given.</p>"
+    return f"<p>Of {shown(source)}. {shown(versions)}.</p>{steps}"

@@ -15,7 +15,7 @@ _ROW = 24
 def bars(rows: Sequence[tuple[str, float, str]], *, width: int = 720) -> str:  # name, value, what stands beside it
     """Bars from left to right, one below another, all from 0."""
     most = max((value for _, value, _ in rows), default=0) or 1
-    left, right = 260, 150
+    left, right = 260, 200
     drawn = []
     for place, (name, value, told) in enumerate(rows):
         y = place * _ROW

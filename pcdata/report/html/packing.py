@@ -39,7 +39,7 @@ def pack_cloud(cloud: PointCloud, *, most_points: int) -> PackedCloud:
     stride = max(1, -(-cloud.num_points // most_points))
     arrays = {name: value[::stride] for name, value in cloud.numpy().items() if len(value) == cloud.num_points}
     points = arrays.pop("points").astype(np.float64)
-    columns = _Columns(len(points))
+    columns = _Columns()
     lower, step = _range_of(points)
     said: dict[str, Any] = {
         "count": len(points),
@@ -63,15 +63,14 @@ def pack_cloud(cloud: PointCloud, *, most_points: int) -> PackedCloud:
 class _Columns:
     """Bytes of columns, one after another."""
 
-    def __init__(self, count: int) -> None:
-        self._count = count
+    def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
     def add(self, values: NDArray[Any], dtype: str) -> int:
         """Add one column, or those of a matrix; return where they begin."""
         start = self._length
-        for column in values.reshape(self._count, -1).T:
+        for column in values[:, None].T if values.ndim == 1 else values.T:
             column = np.ascontiguousarray(column).astype(np.int64)
             part = np.diff(column, prepend=0).astype(np.dtype(dtype).newbyteorder("<"))  # wraps, and so does decoding
             self._parts.append(part.tobytes())

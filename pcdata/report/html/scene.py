@@ -113,7 +113,10 @@ def _bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 20_000)]
-    return np.quantile(some, 0.01, axis=0), np.quantile(some, 0.99, axis=0)
+    low, high = np.quantile(some, [0.01, 0.99], axis=0)
+    all_low, all_high = points.min(0), points.max(0)
+    strays = np.linalg.norm(all_high - all_low) > 1.5 * np.linalg.norm(high - low)
+    return (low, high) if strays else (all_low, all_high)
 
 
 def _is_camera(cloud: PointCloud) -> bool:

@@ -16,7 +16,7 @@ def shown(text: object, longest: int = _LONGEST) -> str:
     told = str(text)
     if len(told) > longest:
         told = f"{told[:longest]}... ({len(told):,} characters)"
-    safe = "".join(c if _is_plain(c) else c.encode("ascii", "backslashreplace").decode("ascii") for c in told)
+    safe = "".join(c if _is_plain(c) else ascii(c)[1:-1] for c in told)
     return html.escape(safe, quote=True)
 
 

@@ -35,7 +35,10 @@ class Viewer {
     find("before").addEventListener("click", () => this.go(this.step - 1));
     find("after").addEventListener("click", () => this.go(this.step + 1));
     find("color").addEventListener("change", (event) => this.paint(event.target.value));
-    find("size").addEventListener("input", (event) => this.stage.setSize(Number(event.target.value)));
+    find("size").addEventListener("input", (event) => {
+      this.sized = true; // from now on the reader's size
+      this.stage.setSize(Number(event.target.value));
+    });
     find("reset").addEventListener("click", () => this.look());
     find("measure").addEventListener("click", () => this.setMeasuring(!this.measuring));
     const canvas = this.stage.canvas;
@@ -122,6 +125,7 @@ class Viewer {
     this.stage.setLines(lines, (name) => !this.hidden.has(name));
     this.listLines(lines);
     const { colors, legend } = colorsOf(this.cloud, said, mode, said.up);
+    if (!this.sized) find("size").value = said.count < 6000 ? 5 : said.count < 40000 ? 3 : 2;
     this.stage.show(this.cloud.positions, colors, Number(find("size").value));
     this.tell(mode, legend);
     this.picked = [];

@@ -1,0 +1,110 @@
+"""The page on a dataset that was built: what its steps left, what is in it, and what the build was warned of."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pcdata.datasets import CachedCloudDataset
+from pcdata.io.store.manifest import Manifest
+from pcdata.report.html.capture_report import NUM_SHOWN, Known, Progress, capture_page, funnel_rows
+from pcdata.report.html.page import Section
+from pcdata.report.html.text import shown
+from pcdata.structures import Episode, PointCloud
+from pcdata.validation.grading import Grading
+from pcdata.verdicts import Finding, Verdict
+
+_MOST_LISTED = 200  # captures that were left out
+
+
+def dataset_page(
+    folder: str | Path, *, num_shown: int = NUM_SHOWN, title: str = "", progress: Progress | None = None
+) -> tuple[str, Grading]:
+    """Judge every stored cloud of a dataset and return a self-contained page, and the grades it tells of.
+
+    Args:
+        folder: what ``pcdata build`` wrote.
+        num_shown: samples with their clouds.
+        title: of the page; "" = the dataset's own text.
+        progress: told (samples judged, all, which).
+
+    Raises:
+        CacheError: the dataset is damaged.
+    """
+    dataset = CachedCloudDataset(folder, augment=None)
+    known = _known(dataset.manifest)
+    return capture_page(
+        _Stored(dataset), num_shown=num_shown, title=title or str(dataset), progress=progress, known=known
+    )
+
+
+class _Stored:
+    """The stored clouds as a source."""
+
+    name = "dataset"
+
+    def __init__(self, dataset: CachedCloudDataset) -> None:
+        self._dataset = dataset
+        self.ids = list(dataset.ids)
+        self._places = {sample_id: place for place, sample_id in enumerate(self.ids)}
+        self.episodes: list[Episode] = dataset.episodes
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def load(self, sample_id: str) -> PointCloud:
+        """Return the cloud as it was stored."""
+        return self._dataset[self._places[sample_id]]
+
+    def __repr__(self) -> str:
+        return repr(self._dataset)
+
+
+def _known(manifest: Manifest) -> Known:
+    steps = [(str(one["step"]), float(one["median"])) for one in manifest.steps]
+    left_out = {**manifest.quarantined, **manifest.skipped}
+    findings = [_finding_of(alarm) for alarm in manifest.alarms]
+    if manifest.quarantined:
+        total = len(manifest.index.ids) + len(manifest.quarantined)
+        findings.insert(
+            0,
+            Finding(
+                name="quarantined",
+                verdict=Verdict.WARN,
+                found=f"{len(manifest.quarantined):,} of {total:,} captures could not be built",
+                value=len(manifest.quarantined) / total,
+                threshold=0.0,
+                advice="see why below; mend them and build again with --retry-quarantined",
+            ),
+        )
+    sections = []
+    if left_out:
+        rows = "".join(
+            f"<tr><td>{shown(sample_id, 200)}</td><td>{shown(why, 500)}</td></tr>"
+            for sample_id, why in list(left_out.items())[:_MOST_LISTED]
+        )
+        more = f"<p>{len(left_out) - _MOST_LISTED:,} more.</p>" if len(left_out) > _MOST_LISTED else ""
+        sections.append(Section("Left out", f"<table><tr><th>capture</th><th>why</th></tr>{rows}</table>{more}"))
+    return Known(
+        findings=tuple(findings),
+        funnel=funnel_rows(steps),
+        sections=tuple(sections),
+        pipeline=yaml.safe_dump(_plain(manifest.pipeline), sort_keys=False, width=120),
+    )
+
+
+def _finding_of(alarm: Any) -> Finding:
+    known = {field.name for field in fields(Finding)}
+    given = {name: value for name, value in alarm.items() if name in known}
+    return Finding(**{**given, "verdict": Verdict(given.get("verdict", "warn"))})
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "items"):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    return value

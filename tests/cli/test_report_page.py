@@ -1,0 +1,107 @@
+"""The commands report and grade: pages that stand alone, exit codes, refusals."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pcdata.cli import main
+from pcdata.report.html.page import page_of
+from tests.validation.captures import scene, store
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    frames = list(scene(num_views=1).noisy_frames(3))
+    frames = [replace(frame, colors=frame.colors ^ number) for number, frame in enumerate(frames)]  # type: ignore[operator]
+    return store(tmp_path_factory.mktemp("report") / "capture", frames)
+
+
+@pytest.fixture(scope="module")
+def frozen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    frames = list(scene(num_views=1).noisy_frames(3))
+    frames = [replace(frame, colors=frame.colors ^ number) for number, frame in enumerate(frames)]  # type: ignore[operator]
+    folder = store(tmp_path_factory.mktemp("frozen") / "capture", frames)
+    (folder / "depth" / "f1.png").write_bytes((folder / "depth" / "f0.png").read_bytes())
+    return folder
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    code = main([*map(str, words)])
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return code, out, err
+
+
+def test_the_page_stands_alone(capsys, made, tmp_path):
+    page = tmp_path / "report.html"
+    code, out, _ = run(capsys, "report", made, "--out", page)
+    assert code == 0
+    assert out.startswith("grade    A\n")
+    text = page.read_text(encoding="utf-8")
+    assert not re.findall(r"(?:src|href)=[\"'](?!data:)", text)
+    assert "default-src 'none'" in text
+    assert '<span class="grade A">A</span>' in text
+    assert "No pipeline was given" in text
+
+
+def test_what_is_wrong_comes_first(capsys, frozen, tmp_path):
+    page = tmp_path / "report.html"
+    code, out, _ = run(capsys, "report", frozen, "--out", page)
+    assert code == 0
+    assert "fail repeated_depth view 0, in 1 of 3 captures, first 'f1'" in out
+    body = page.read_text(encoding="utf-8").split("<main>")[1]
+    assert body.index('class="grade F"') < body.index("repeated_depth") < body.index("<canvas")
+    assert body.index("What to do:") < body.index("<canvas")
+    first = re.search(r'data-sample="0">(\w+)<', body)
+    assert first is not None
+    assert first[1] == "f1"  # the worst is shown first
+
+
+def test_the_steps_of_a_pipeline_are_shown(capsys, made, tmp_path):
+    config = tmp_path / "steps.yaml"
+    config.write_text(
+        "depth: [Deproject]\ncloud: [{FarthestPointSample: {num_points: 256}}]\naugment: [RandomJitter]\n"
+    )
+    assert run(capsys, "report", made, "--out", tmp_path / "r.html", "--config", config)[0] == 0
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "2. FarthestPointSample" in text
+    index = json.loads(text.split('id="pcdata-index">')[1].split("</script>")[0])
+    assert [stage["cloud"]["total"] for stage in index[0]["stages"]][-1] == 256
+    assert "RandomJitter" in text  # the chain is told whole, its random steps are not run
+
+
+def test_a_step_that_fails_is_told_and_the_capture_shown(capsys, made, tmp_path):
+    config = tmp_path / "steps.yaml"
+    config.write_text(
+        "depth: [Deproject]\ncloud: [{CropWorkspace: {frame: camera, lower: [5, 5, 5], upper: [6, 6, 6], "
+        "max_drop: 0.5}}]\n"
+    )
+    assert run(capsys, "report", made, "--out", tmp_path / "r.html", "--config", config)[0] == 0
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "max_drop" in text
+    assert "<canvas" in text
+
+
+def test_grade_is_for_a_nightly_job(capsys, made, frozen, tmp_path):
+    assert run(capsys, "grade", made)[0] == 0
+    code, out, _ = run(capsys, "grade", frozen, "--json", tmp_path / "g.json")
+    assert code == 1
+    assert out.startswith("F: more than 10% fail")
+    assert json.loads((tmp_path / "g.json").read_text())["grade"] == "F"
+
+
+def test_the_page_is_never_among_what_is_read(capsys, made):
+    before = sorted(made.rglob("*"))
+    code, _, err = run(capsys, "report", made, "--out", made / "depth" / "f0.png")
+    assert code == 2
+    assert "--out" in err
+    assert sorted(made.rglob("*")) == before
+
+
+def test_a_page_without_data_is_small():
+    assert len(page_of("empty", [], [])) < 2_000_000

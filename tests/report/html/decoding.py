@@ -1,0 +1,33 @@
+"""What the page's script does with a packed cloud, in NumPy."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from typing import Any
+
+import numpy as np
+
+from pcdata.report.html.packing import PackedCloud
+
+
+def decoded(packed: PackedCloud) -> dict[str, np.ndarray]:
+    """Return positions and every field by name, as numbers that the page shows."""
+    content = zlib.decompress(base64.b64decode(packed.text))
+    said = packed.said
+    found = {"points": np.array(said["lower"]) + np.array(said["step"]) * _columns(content, said, "uint16", 3)}
+    for field in said["fields"]:
+        columns = _columns(content, {**field, "count": said["count"]}, field["type"], field["num"])
+        if field["kind"] == "category":
+            columns = np.array(field["values"])[columns] if len(columns) else columns
+        elif field["kind"] == "scalar":
+            columns = field["low"] + field["step"] * columns
+        found[field["name"]] = columns
+    return found
+
+
+def _columns(content: bytes, said: dict[str, Any], dtype: str, num: int) -> np.ndarray:
+    kind = np.dtype(dtype).newbyteorder("<")
+    count = said["count"]
+    read = np.frombuffer(content, kind, count * num, said["offset"]).reshape(num, count)
+    return np.cumsum(read, axis=1, dtype=np.dtype(dtype)).T.astype(np.int64)

@@ -1,0 +1,181 @@
+"""The page in a real browser, without a network or a GPU: what is drawn, picked and measured, by mouse and keyboard."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pcdata import Compose, PointCloud
+from pcdata.transforms import Deproject, EstimateNormals, FarthestPointSample
+from tests.factories import tabletop_frame
+
+pytestmark = pytest.mark.browser
+playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+CHROMIUM = os.environ.get("PCDATA_CHROMIUM") or shutil.which("chromium")
+if CHROMIUM is None:
+    pytest.skip("no chromium: apt-get install chromium", allow_module_level=True)
+
+# Points on a coarse grid, so that each is picked apart from its neighbors; its label is its number.
+GRID = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 2, torch.zeros(1), indexing="ij"), -1).reshape(-1, 3) * 0.1
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    drawing = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=drawing)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def visit(browser, tmp_path) -> Iterator[Any]:
+    """Open a page from its file; nothing else may be asked for, and nothing may be complained of."""
+    heard: list[str] = []
+    asked: list[str] = []
+    pages = []
+
+    def opened(page: Any, scheme: str = "light") -> Any:
+        file = page.save(tmp_path / "page.html")
+        tab = browser.new_page(viewport={"width": 1000, "height": 900}, color_scheme=scheme)
+        tab.on("console", lambda message: heard.append(message.text))
+        tab.on("pageerror", lambda error: heard.append(str(error)))
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(Path(file).as_uri())
+        tab.evaluate("window.pcdata.ready")
+        tab.wait_for_function("window.pcdata.stage.drawn > 0")
+        pages.append(tab)
+        return tab
+
+    yield opened
+    for tab in pages:
+        tab.close()
+    assert heard == []
+    assert len(asked) == len(pages)
+    assert all(url.startswith("file:") for url in asked)
+
+
+@pytest.fixture(scope="module")
+def grid() -> Any:
+    cloud = PointCloud(points=GRID, labels=torch.arange(25), colors=torch.rand(25, 3), frame_id="base")
+    return cloud.show()
+
+
+@pytest.fixture(scope="module")
+def steps() -> Any:
+    chain = Compose([Deproject(), FarthestPointSample(num_points=2000), EstimateNormals(radius=0.05)])
+    return chain.show_steps(tabletop_frame(1))
+
+
+def pixels(tab: Any) -> Any:
+    """(H, W, 3) of the canvas, as it is drawn now."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    tab.evaluate("window.pcdata.stage.draw()")
+    return np.array(Image.open(io.BytesIO(tab.locator("canvas").screenshot())).convert("RGB")).astype(int)
+
+
+def colored(image: Any) -> int:
+    """How many pixels differ from the ground, which is that of the corner."""
+    return int((abs(image - image[2, 2]).max(axis=2) > 24).sum())
+
+
+def place_of(tab: Any, row: int) -> list[float]:
+    return tab.evaluate(f"window.pcdata.stage.drawnAt(window.pcdata.place({row}))")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_cloud_is_drawn_on_both_grounds(visit, steps, scheme):
+    tab = visit(steps, scheme)
+    image = pixels(tab)
+    assert colored(image) > 1000
+    assert (image[2, 2].mean() > 128) == (scheme == "light")
+
+
+@pytest.mark.parametrize("row", [0, 7, 24])
+def test_a_click_picks_the_point_that_is_there(visit, grid, row):
+    tab = visit(grid)
+    x, y = place_of(tab, row)
+    tab.locator("canvas").click(position={"x": x, "y": y})
+    told = tab.locator("#picked").text_content()
+    assert f"labels {row}" in told
+    x, y, z = (float(word) for word in told.split("(")[1].split(")")[0].split())
+    assert torch.allclose(torch.tensor([x, y, z]), GRID[row], atol=1e-4)
+
+
+def test_two_points_are_measured(visit, grid):
+    tab = visit(grid)
+    tab.locator("#measure").click()
+    for row in (0, 4):  # 0.4 m apart
+        x, y = place_of(tab, row)
+        tab.locator("canvas").click(position={"x": x, "y": y})
+    assert tab.locator("#picked").text_content().startswith("400.0 mm apart")
+
+
+def test_nothing_is_picked_where_nothing_is(visit, grid):
+    tab = visit(grid)
+    tab.locator("canvas").click(position={"x": 5, "y": 5})
+    assert tab.locator("#picked").text_content() == "no point there"
+
+
+def test_every_choice_changes_what_is_drawn(visit, steps):
+    tab = visit(steps)
+    assert tab.locator("#step option").all_text_contents() == [
+        *("capture", "Deproject", "FarthestPointSample", "EstimateNormals")
+    ]
+    before = pixels(tab)
+    tab.locator("#color").select_option("normals")
+    normals = pixels(tab)
+    assert (before != normals).any()
+    tab.locator("#size").fill("8")
+    large = pixels(tab)
+    assert colored(large) > 1.2 * colored(normals)
+    tab.locator("#before").click()
+    tab.wait_for_function("window.pcdata.step === 2")
+    assert "normals" not in tab.locator("#color option").all_text_contents()
+    axis = tab.get_by_label("x axis")
+    with_axis = pixels(tab)
+    axis.uncheck()
+    assert (with_axis != pixels(tab)).any()
+
+
+def test_the_keyboard_reaches_all(visit, steps):
+    tab = visit(steps)
+    canvas = tab.locator("canvas")
+    canvas.focus()
+    images = [pixels(tab)]
+    for key in ("ArrowLeft", "ArrowUp", "+", "c"):
+        canvas.press(key)
+        images.append(pixels(tab))
+        assert (images[-1] != images[-2]).any(), key
+    canvas.press("[")
+    tab.wait_for_function("window.pcdata.step === 2")
+    canvas.press("m")
+    assert tab.locator("#measure").get_attribute("aria-pressed") == "true"
+    canvas.press("m")
+    canvas.press("r")
+    canvas.press("Enter")
+    assert tab.locator("#picked").text_content() != ""
+    reached = []
+    tab.locator("#sample").focus()
+    for _ in range(9):
+        reached.append(tab.evaluate("document.activeElement.id || document.activeElement.tagName"))
+        tab.keyboard.press("Tab")
+    assert {"sample", "step", "color", "size", "measure", "reset", "CANVAS"} <= {*reached}
+
+
+def test_hostile_names_are_text_in_the_viewer(visit):
+    name = "<img src=x onerror=window.hit=1>\u202e"
+    cloud = PointCloud(points=GRID, frame_id=name.encode("ascii", "ignore").decode(), meta=[{"sample_id": name}])
+    tab = visit(cloud.show())
+    assert tab.evaluate("window.hit") is None
+    assert "<img src=x" in tab.locator("#counted").text_content()
