@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from importlib.resources import files
 from typing import Any
 
 from pcdata.report.html.scene import SampleScene
@@ -87,7 +87,7 @@ def _index(scenes: Sequence[SampleScene]) -> tuple[str, dict[str, str]]:
 
 @cache
 def _web_file(name: str) -> str:
-    return (resources.files("pcdata.report.html") / "web" / name).read_text(encoding="utf-8")
+    return (files("pcdata.report.html") / "web" / name).read_text(encoding="utf-8")
 
 
 def _digest(script: str) -> str:
