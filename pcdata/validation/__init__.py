@@ -2,6 +2,8 @@
 
 from pcdata.validation.capture_check import CHECKS, Check, register_check
 from pcdata.validation.capture_limits import CaptureLimits
+from pcdata.validation.drift import CameraDrift, DriftLimits, DriftPoint, DriftResult, measure_drift
+from pcdata.validation.grading import Grade, Grading
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap
 from pcdata.validation.run import check_of_error, validate_frame, validate_source
@@ -11,9 +13,15 @@ from pcdata.validation.summary import WHOLE, SampleReport, Summary
 __all__ = [
     "CHECKS",
     "WHOLE",
+    "CameraDrift",
     "CameraOverlap",
     "CaptureLimits",
     "Check",
+    "DriftLimits",
+    "DriftPoint",
+    "DriftResult",
+    "Grade",
+    "Grading",
     "ObjectScore",
     "OverlapLimits",
     "OverlapResult",
@@ -23,6 +31,7 @@ __all__ = [
     "Summary",
     "check_of_error",
     "mean_scores",
+    "measure_drift",
     "register_check",
     "score_segmentation",
     "validate_frame",

@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from pcdata.cli import main
 from pcdata.report.html.page import page_of
-from tests.validation.captures import scene, store
+from pcdata.synthetic import tabletop
+from tests.validation.captures import SIZE, scene, store
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +107,20 @@ def test_the_page_is_never_among_what_is_read(capsys, made):
 
 def test_a_page_without_data_is_small():
     assert len(page_of("empty", [], [])) < 2_000_000
+
+
+def test_drift_tells_a_moved_camera_by_its_exit_code(capsys, tmp_path):
+    here = tabletop(0, size=SIZE).frame.world_from_camera
+    there = here.clone()
+    there[:, :3, 3] += torch.tensor([0.0, 0.006, 0.0])
+    for name, poses in (("still", [here] * 2), ("moved", [here, there])):
+        scenes = [tabletop(0, noise="stereo", size=SIZE, world_from_camera=pose) for pose in poses]
+        frames = [scene.render(seed_noise=4 * n + k) for n, scene in enumerate(scenes) for k in range(4)]
+        store(tmp_path / name, [replace(frame, world_from_camera=here) for frame in frames])
+    code, out, _ = run(capsys, "drift", tmp_path / "still", "--window", 4)
+    assert (code, out.splitlines()[0]) == (0, "drift: pass")
+    page, told = tmp_path / "drift.html", tmp_path / "drift.json"
+    code, out, _ = run(capsys, "drift", tmp_path / "moved", "--window", 4, "--out", page, "--json", told)
+    assert (code, out.splitlines()[0]) == (1, "drift: fail")
+    assert json.loads(told.read_text())["cameras"][0]["shift"] == pytest.approx(0.006, rel=0.2)
+    assert "moved by" in page.read_text(encoding="utf-8")
