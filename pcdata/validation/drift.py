@@ -31,7 +31,7 @@ from pcdata.verdicts import Limits, Verdict, finite_json, worst
 
 STILL, STEP, RAMP, MOVING, UNKNOWN = "still", "step", "ramp", "moving", "unknown"
 _MAX_SAMPLES = 4000  # of a view, as overlap takes
-_SAME = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)  # then and now: both in the camera's frame
+_SAME = torch.eye(4, dtype=torch.float64, device="cpu").repeat(2, 1, 1)  # then and now, both in its frame
 _CHANGED = 0.03  # metres and share of depth: what changed more than this, beyond what a drift does, is another thing
 _FEWEST = 0.3  # of the samples that must meet the first surface; fewer is another scene, or a moving camera
 _FAR = 0.05  # metres from one window to the next: no mount slips so, a hand does
@@ -271,7 +271,7 @@ def _point(
         seen = float((depth > 0).sum())
         kept = float(background.sum()) / max(seen, 1.0)
         current = _surface(now, view, torch.where(background, depth, torch.zeros_like(depth)))
-        fit = align_views([[surface, current]], _SAME)
+        fit = align_views([[surface, current]], _SAME.to(depth.device))
         result = judge_alignment(fit, ("then", "now"), limits.overlap(), reference=0)
     except PcdataError:
         return _lost(ids, 0.0), ()
