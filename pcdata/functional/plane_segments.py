@@ -158,8 +158,8 @@ def supporting_plane(
     what counts is area, however near the sensor or however often seen. Each scores its area, times one more than the
     area of what stands on it, times how level it is: 0.1 + max(0, cosine of its normal and up); the highest wins, the
     first found of equals. What stands on a plane is what is left without any plane, in connected parts that reach down
-    to it, above it and over its convex hull. The winner is refitted to its inliers, of 65,536 points at most, until
-    they no longer change.
+    to it, above it and over its convex hull, less what noise puts below it. The winner is refitted to its inliers, of
+    65,536 points at most, until they no longer change.
 
     The result is that of :func:`ransac_plane`: normals along ``up`` where given, else toward the viewpoint.
 
@@ -238,6 +238,16 @@ def _turned(planes: Tensor, up: Tensor | None, seen_from: Tensor) -> Tensor:
     return torch.where((side < 0)[:, None], -planes, planes)
 
 
+def _standing(height: Tensor, over: Tensor, part: Tensor, distance: float) -> int:
+    """Count the voxels above a plane, over its hull, of parts that reach down to it and rise from it."""
+    above = over & (height > 0)
+    nothing = torch.zeros(int(part.max()) + 1, dtype=torch.bool, device=height.device)
+    # What is no higher than this may be noise of the plane.
+    rises = nothing.index_put((part[above & (height > 3 * distance)],), nothing.new_ones(()))
+    touches = nothing.index_put((part[above & (height < 4 * distance)],), nothing.new_ones(()))
+    return int((above & (rises & touches)[part]).sum())
+
+
 def _scores(
     voxels: Tensor, label: Tensor, planes: Tensor, up: Tensor | None, distance: float, backend: str
 ) -> Tensor:  # (P,) float64 on the CPU
@@ -254,13 +264,9 @@ def _scores(
         standing = 0
         if len(rest):
             height = rest.double() @ plane[:3] + plane[3]
-            above = over_hull(rest, own, plane, 2 * distance) & (height > 0)
-            num_parts = int(part.max()) + 1
-            nothing = torch.zeros(num_parts, dtype=torch.bool, device=voxels.device)
-            # What is no higher than this may be noise of the plane.
-            rises = nothing.index_put((part[above & (height > 3 * distance)],), nothing.new_ones(()))
-            touches = nothing.index_put((part[above & (height < 4 * distance)],), nothing.new_ones(()))
-            standing = int((above & (rises & touches)[part]).sum())
+            over = over_hull(rest, own, plane, 2 * distance)
+            # Noise of the plane lies above it as below it; nothing stands below.
+            standing = max(0, _standing(height, over, part, distance) - _standing(-height, over, part, distance))
         level = 1.0 if up is None else _LEAST_LEAN + max(0.0, float(plane[:3].cpu() @ up))
         scores.append(len(own) * (1 + standing) * level)
     return torch.tensor(scores, dtype=torch.float64, device="cpu")

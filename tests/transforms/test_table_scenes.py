@@ -11,7 +11,15 @@ import torch
 
 from pcdata.errors import NoPlaneError, TooFewPointsError
 from pcdata.structures import PointCloud
-from pcdata.transforms import ClusterObjects, RemovePlane, UnmeasuredTableWarning
+from pcdata.synthetic import tabletop
+from pcdata.transforms import (
+    ClusterObjects,
+    Deproject,
+    RemovePlane,
+    ToFrame,
+    UnmeasuredTableWarning,
+    planes_in_cloud,
+)
 from pcdata.validation import score_segmentation
 from tests.rooms import seen_room, standing
 
@@ -118,3 +126,12 @@ def test_clutter_through_the_plane_is_not_its_noise_and_where_it_is_most_the_cut
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnmeasuredTableWarning)
         assert torch.equal(step.replay(cloud, [entry]).points, left.points)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_far_floor_whose_noise_piles_up_is_not_what_things_stand_on(seed):
+    """Stereo noise of the floor, 1.5 m away, is thicker than the slab: what juts out of it stands on nothing."""
+    frame = next(iter(tabletop(seed, num_views=1, noise="stereo", size=(360, 480)).noisy_frames(1)))
+    cloud = ToFrame(frame="base")(Deproject()(frame))
+    (plane,) = planes_in_cloud(RemovePlane(which="supporting")(cloud))
+    assert abs(float(plane[3])) < 0.002  # the table is z = 0, the floor 0.75 m below
