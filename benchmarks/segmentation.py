@@ -1,10 +1,10 @@
 """How well objects on a table are told apart, on real scenes with ground truth, beside the plain recipe and Open3D's.
 
-    PCDATA_TEST_DATA=... python benchmarks/segmentation.py [--parts table time ablation kinds other] [--pictures FOLDER]
+    PCDATA_TEST_DATA=... python benchmarks/segmentation.py [--parts PART ...] [--pictures FOLDER]
 
 Scenes: the Object Segmentation Database as modified by Alexandrov (`osd/`, or --osd FOLDER); a number says its kind.
-One set of numbers for all of them. `kinds` fits three numbers on three kinds of scenes and scores the fourth. Prints
-tables and writes results/segmentation.json.
+One set of numbers for all of them. `heaps`: 20 touching objects, rendered in 4 views that are merged. `kinds` fits
+three numbers on three kinds of scenes and scores the fourth. Prints tables and writes results/segmentation.json.
 """
 
 from __future__ import annotations
@@ -35,14 +35,27 @@ from pcdata.functional.touching.limits import Limits
 from pcdata.io import open_source, read_labels, read_pcd
 from pcdata.report import text_table
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.transforms import ClusterObjects, Compose, Deproject, LeftOutWarning, RemovePlane, ToFrame
+from pcdata.synthetic import tabletop
+from pcdata.transforms import (
+    ClusterObjects,
+    Compose,
+    Deproject,
+    LeftOutWarning,
+    MergeViews,
+    RandomSensorNoise,
+    RemovePlane,
+    ToFrame,
+)
 from pcdata.validation import SegmentationScores, mean_scores, score_segmentation
 
 OUTLINES = Path(__file__).parent / "apc_outlines.json"  # frame -> object -> corners (u, v), the nearest object last
 RESULT = Path(__file__).parent / "results" / "segmentation.json"
-PARTS = ("table", "time", "ablation", "kinds", "other")
+PARTS = ("table", "time", "ablation", "kinds", "other", "heaps")
+HEAPS = {"seen while the method was made": range(6), "unseen": range(100, 106)}  # seeds
+HEAP_SENSORS = ("kinect_v1", "realsense_d415")
 KINDS = {"boxes": range(17), "stacked": range(17, 25), "occluded": range(25, 33), "cylinders": range(33, 45)}
 SHOWN = ("overlap_f", "boundary_f", "found", "mean_iou")
+HEAP_SHOWN = ("overlap_f", "found", "mean_iou")  # a merged cloud has no boundaries
 TABLE = RemovePlane(which="supporting", cut="measured", probability=0.9999)
 PLAIN = Compose([RemovePlane(distance=0.01), ClusterObjects()])
 
@@ -80,6 +93,8 @@ def main() -> None:
             found["kinds"] = cross_validation(without_table)
     if "other" in arguments.parts:
         found["other"] = other_sensors(Path(os.environ["PCDATA_TEST_DATA"]))
+    if "heaps" in arguments.parts:
+        found["heaps"] = heaps(arguments.limit or 1)
     if arguments.osd is None and arguments.limit is None:
         RESULT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
@@ -449,6 +464,35 @@ def apc(data: Path) -> Iterator[Other]:
         seen = frame.depth[0] > 0
         for what, truth in (("masks", masks), ("outlines", outlined)):
             yield f"apc {sample[-2:]} {what}", frame, truth, (truth < 0) | ~seen, [TABLE]
+
+
+# -- heaps that several cameras saw -----------------------------------------------------------------------------------
+
+
+def heaps(every: int) -> dict[str, Any]:
+    """Score 20 touching objects in 4 merged views: all points of objects that are left, row by row."""
+    step = ClusterObjects(split_touching=True, max_size=1_000_000, keep="all")
+    table_ = RemovePlane(cut="measured", keep="over", probability=0.9999, max_tilt=0.2, up=(0, 0, 1), frame="base")
+    result: dict[str, Any] = {}
+    rows = []
+    for sensor in HEAP_SENSORS:
+        steps = Compose([RandomSensorNoise(sensor=sensor), Deproject(), ToFrame(frame="base"), MergeViews(), table_])
+        for kind, seeds in HEAPS.items():
+            scores, seconds = {}, []
+            for seed in seeds[::every]:
+                frame = tabletop(seed, 20, 4, touching=True, floor=False).frame
+                cloud = steps(frame, generator=torch.Generator().manual_seed(seed))
+                start = time.process_time()
+                labels = step(cloud).labels
+                seconds.append(time.process_time() - start)
+                scores[seed] = score_segmentation(labels, torch.where(cloud.labels > 0, cloud.labels, -1))
+            shown = {key: statistics.fmean(getattr(one, key) for one in scores.values()) for key in HEAP_SHOWN}
+            milliseconds = round(1000 * statistics.median(seconds), 1)
+            each = {str(seed): round(one.mean_iou, 4) for seed, one in scores.items()}
+            result[f"{sensor}, {kind}"] = {"mean": shown, "cpu_milliseconds": milliseconds, "mean_iou": each}
+            rows.append([sensor, kind, *(f"{value:.3f}" for value in shown.values()), milliseconds])
+    print(text_table(("heaps of 20, 4 views", "seeds", *HEAP_SHOWN, "CPU ms"), rows))
+    return result
 
 
 if __name__ == "__main__":

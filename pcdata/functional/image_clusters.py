@@ -49,10 +49,10 @@ def linked_pixels(
             dx, dy, dz = (points[one] - points[two]).unbind(1)
             near = ((dx * dx + dy * dy) + dz * dz) < limit
             pairs.append(torch.stack([one[near], two[near]]))
-    return _numbered(_lowest_rows(torch.cat(pairs, 1), none, points.device), ptr)
+    return _numbered(lowest_rows(torch.cat(pairs, 1), none, points.device), ptr)
 
 
-def _lowest_rows(pairs: Tensor, count: int, device: torch.device) -> Tensor:
+def lowest_rows(pairs: Tensor, count: int, device: torch.device) -> Tensor:
     """Return the lowest row of each row's connected part, given the pairs (2, E) that are linked."""
     lowest = torch.arange(count, dtype=torch.int64, device=device)
     while True:

@@ -5,6 +5,7 @@ from pcdata.synthetic.stereo_camera import SensorNoise
 from pcdata.synthetic.tabletop import BASE_FRAME, Tabletop, tabletop
 from pcdata.synthetic.tabletop_source import SyntheticSource, tabletop_frames
 from pcdata.synthetic.teleop import TeleopSource, TeleopState
+from pcdata.synthetic.turned import Turned, bowl_profile, mug_profile
 from pcdata.synthetic.viewpoints import Miscalibration, look_at
 
 __all__ = [
@@ -19,7 +20,10 @@ __all__ = [
     "Tabletop",
     "TeleopSource",
     "TeleopState",
+    "Turned",
+    "bowl_profile",
     "look_at",
+    "mug_profile",
     "tabletop",
     "tabletop_frames",
 ]

@@ -21,7 +21,7 @@ _TINY = 1e-150
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shape(ABC):
-    """A colored convex solid somewhere in the base frame."""
+    """A colored solid somewhere in the base frame."""
 
     base_from_object: Tensor  # (4, 4) float64 rigid; the object's origin is its center
     label: int  # 0 = table, 1.. = objects, -1 = background
@@ -48,9 +48,8 @@ class Shape(ABC):
         The normal is that of the face the ray came through, so it never points away from the ray's origin.
         """
         rotation, center = self._pose(directions)
-        enter, leave, normals = self._interval((origins - center) @ rotation, directions @ rotation)
-        hit = (enter <= leave) & (enter > 0)
-        return torch.where(hit, enter, math.inf), normals @ rotation.T
+        enter, normals = self._entry((origins - center) @ rotation, directions @ rotation)
+        return enter, normals @ rotation.T
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Return the (N,) exact distance in metres from (N, 3) base points to the surface, negative inside."""
@@ -74,16 +73,28 @@ class Shape(ABC):
         return pose[:3, :3], pose[:3, 3]
 
     @abstractmethod
-    def _interval(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Object frame: the (N,) distances where the ray's line enters and leaves (enter > leave = miss), normals."""
+    def _entry(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Object frame: the (N,) distance where each ray enters, inf = miss, and the outward normals there."""
 
     @abstractmethod
     def _signed_distance(self, points: Tensor) -> Tensor:
         """Object frame."""
 
 
+class ConvexShape(Shape):
+    """A solid that a line enters and leaves once."""
+
+    def _entry(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        enter, leave, normals = self._interval(origins, directions)
+        return torch.where((enter <= leave) & (enter > 0), enter, math.inf), normals
+
+    @abstractmethod
+    def _interval(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Object frame: the (N,) distances where the ray's line enters and leaves (enter > leave = miss), normals."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Box(Shape):
+class Box(ConvexShape):
     """A cuboid; ``size`` is its full length in metres along its own x, y, z."""
 
     size: tuple[float, float, float]
@@ -110,7 +121,7 @@ class Box(Shape):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cylinder(Shape):
+class Cylinder(ConvexShape):
     """A closed cylinder about its own z axis, from -height/2 to height/2."""
 
     radius: float
@@ -139,7 +150,7 @@ class Cylinder(Shape):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sphere(Shape):
+class Sphere(ConvexShape):
     """A ball of ``radius`` metres."""
 
     radius: float

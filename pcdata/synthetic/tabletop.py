@@ -12,6 +12,7 @@ from torch import Tensor
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.rng import generator_for
 from pcdata.structures import Camera, DepthFrame
+from pcdata.synthetic.heap import heap_objects
 from pcdata.synthetic.raycast import Hits, cast, ray_directions
 from pcdata.synthetic.scene import make_floor, make_table, place_objects
 from pcdata.synthetic.shading import own_colors, shade
@@ -90,6 +91,7 @@ def tabletop(
     size: tuple[int, int] = (480, 640),
     miscalibration: Miscalibration | None = None,
     floor: bool = True,
+    touching: bool = False,
     camera: Camera | None = None,
     world_from_camera: Tensor | None = None,
     sample_id: str | None = None,
@@ -107,6 +109,8 @@ def tabletop(
         noise: a sensor model, "stereo" for its defaults, "none" or None for exact depth.
         size: (height, width) in pixels; ignored where ``camera`` is given.
         miscalibration: a known error of the reported poses; the images stay as they are.
+        touching: boxes, cans, balls, bowls and mugs that are pushed together until they touch, every sixth on top of
+            another, instead of objects that stand apart.
         floor: False leaves the space around the table empty (depth 0).
         camera: one camera for every view, or V cameras; None = a typical depth camera.
         world_from_camera: (V, 4, 4) float64 true poses, for example from :func:`look_at`; None = around the table.
@@ -124,14 +128,14 @@ def tabletop(
     camera = usual_camera if camera is None else _one_per_view(camera, num_views)
     poses = (usual_poses if world_from_camera is None else world_from_camera).double().to(device)
 
-    truth, colors = rendered(
-        camera.to(device), poses, make_table(), make_floor() if floor else None, place_objects(seed, num_objects)
-    )
+    objects = heap_objects(seed, num_objects) if touching else place_objects(seed, num_objects)
+    truth, colors = rendered(camera.to(device), poses, make_table(), make_floor() if floor else None, objects)
     provenance: dict[str, Any] = {
         "source": "pcdata.synthetic.tabletop",
         "seed": seed,
         "num_objects": num_objects,
         "floor": floor,
+        **({"touching": True} if touching else {}),
         "noise": None if sensor is None else asdict(sensor),
         "seed_noise": 0,
         "miscalibration": None if miscalibration is None else asdict(miscalibration),

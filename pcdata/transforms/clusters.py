@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -14,7 +15,14 @@ from pcdata.errors import ConfigError, DTypeError, ReplayError, TooFewPointsErro
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import ptr_after_mask, ptr_from_counts
-from pcdata.functional.touching import REASONS, Separation, in_order_of_rows, separate_objects
+from pcdata.functional.touching import (
+    REASONS,
+    Separation,
+    View,
+    in_order_of_rows,
+    separate_objects,
+    separate_views,
+)
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.threads import torch_on_one_thread
@@ -23,6 +31,7 @@ from pcdata.transforms.decisions import Decision, Decisions
 from pcdata.transforms.families import DropLimit, LeftOutWarning
 from pcdata.transforms.field_types import Count, Metres
 from pcdata.transforms.found_planes import planes_in_cloud
+from pcdata.transforms.merged_views import merged_views
 
 
 class ClusterObjects(DropLimit):
@@ -42,13 +51,14 @@ class ClusterObjects(DropLimit):
         max_size: larger clusters are not objects.
         keep: "all": keep the whole scene, with -1 where no object is.
         split_touching: part clusters where objects touch, by the shape of their surfaces, and join what an object in
-            front keeps apart; needs the depth image that the cloud lies on. Labels then follow the lowest row of each
-            object, and ``meta["touching"]`` tells the noise, every ``cut`` between two objects with its strength (0 to
-            1, above 0.35) and length in pixels, and every join with its reason. What shows no evidence stays the
+            front keeps apart; needs the depth image that the cloud lies on, or those that MergeViews merged: the
+            evidence of all views is added up. Labels then follow the lowest row of each object, and
+            ``meta["touching"]`` tells the noise, every ``cut`` between two objects with its strength (0 to 1; in one
+            image above 0.35) and length in pixels, and every join with its reason. What shows no evidence stays the
             cluster it was. A RemovePlane before it tells heights, without which bowls and cups may come apart.
 
     Raises:
-        ConfigError: ``split_touching`` and the cloud no longer lies on its depth image.
+        ConfigError: ``split_touching`` and the cloud no longer lies on its depth images.
     """
 
     runs_statistics = True
@@ -75,13 +85,15 @@ class ClusterObjects(DropLimit):
         separations: list[Separation] = []
         before: list[Tensor] = []
         if self.split_touching:
-            if grid is None:
-                raise ConfigError(
-                    "ClusterObjects: split_touching needs the depth image that the points lie on, but the cloud was "
-                    "merged, downsampled or reordered, or was never one; put ClusterObjects before those steps"
-                )
             for b, part in enumerate(clusters_of):
-                found, separation = self._separated(data, grid, b, part)
+                images = merged_views(data, b) if grid is None else grid
+                if images is None:
+                    raise ConfigError(
+                        "ClusterObjects: split_touching needs the depth images that the points lie on, but the cloud "
+                        "was downsampled, averaged or moved off its pixels, or merged of images of a lens that bends, "
+                        "or was never one; put ClusterObjects before those steps, or split_touching: false"
+                    )
+                found, separation = self._separated(data, images, b, part)
                 before.append(found)
                 separations.append(separation)
             clusters_of = [in_order_of_rows(part)[0] for part in before]
@@ -105,15 +117,15 @@ class ClusterObjects(DropLimit):
         evidence = _evidence(separations, before, [labels for labels, _ in parts]) if self.split_touching else {}
         return {"labels": torch.cat([labels for labels, _ in parts]), **counts, **evidence}
 
-    def _separated(self, data: PointCloud, grid: ImageGrid, b: int, clusters: Tensor) -> tuple[Tensor, Separation]:
+    def _separated(
+        self, data: PointCloud, images: ImageGrid | list[View], b: int, clusters: Tensor
+    ) -> tuple[Tensor, Separation]:
         """Part the clusters (n,) of cloud ``b`` that are large enough; return their new numbers, and what was found."""
         start, stop = int(data.ptr[b]), int(data.ptr[b + 1])
         size = torch.bincount(clusters + 1, minlength=1)
         size[:1] = 0
         rows = (size[clusters + 1] >= self.min_size).nonzero().squeeze(1)
         points = data.points[start:stop][rows]
-        motion = None if grid.camera_from_points is None else grid.camera_from_points[b : b + 1]
-        own = ImageGrid(grid.pixel_index[start:stop][rows], grid.size, grid.intrinsics[b : b + 1], motion)
         planes, height = planes_in_cloud(data, b), None
         if len(planes):
             plane = planes[-1].to(points.device)
@@ -122,7 +134,13 @@ class ClusterObjects(DropLimit):
                 height = -height  # where no `up` was given, what stands on the plane says which side is above
         noise = data.meta[b].get("planes", [{}])[-1].get("disparity_noise")
         noise = noise if isinstance(noise, float) and math.isfinite(noise) and noise > 0 else None
-        separation = separate_objects(points, own, height=height, noise=noise)
+        if isinstance(images, ImageGrid):
+            motion = None if images.camera_from_points is None else images.camera_from_points[b : b + 1]
+            pixel = images.pixel_index[start:stop][rows]
+            own = ImageGrid(pixel, images.size, images.intrinsics[b : b + 1], motion)
+            separation = separate_objects(points, own, height=height, noise=noise)
+        else:
+            separation = separate_views(points, _picked(images, rows, stop - start), height=height, noise=noise)
         found = torch.full_like(clusters, -1)
         found[rows] = _with_clusters(separation.label, clusters[rows])
         # Clusters that are too small keep numbers of their own, to be counted as such.
@@ -154,6 +172,18 @@ class ClusterObjects(DropLimit):
             return labeled
         member = labels >= 0
         return labeled.select(member, ptr_after_mask(member, data.ptr))
+
+
+def _picked(views: list[View], rows: Tensor, count: int) -> list[View]:
+    """Return what views saw of some rows of a cloud of ``count``, numbered as those."""
+    number = torch.full((count,), -1, dtype=torch.int64, device=rows.device)
+    number[rows] = torch.arange(len(rows), dtype=torch.int64, device=rows.device)
+    picked = []
+    for seen, grid in views:
+        own = number[seen]
+        kept = own >= 0
+        picked.append(View(own[kept], replace(grid, pixel_index=grid.pixel_index[kept])))
+    return picked
 
 
 def _with_clusters(label: Tensor, cluster: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ def test_clouds_of_a_batch_are_parted_each_by_itself():
 
 def test_a_cloud_that_left_its_image_is_refused():
     cloud, _ = scene(*LOW_AND_HIGH)
-    with pytest.raises(ConfigError, match="needs the depth image that the points lie on"):
+    with pytest.raises(ConfigError, match="needs the depth images that the points lie on"):
         STEP(VoxelDownsample(voxel_size=0.004)(cloud))
 
 

@@ -52,12 +52,12 @@ class Objects:
         code = torch.minimum(a, b) * max(scene.num_regions, 1) + torch.maximum(a, b)
         order = torch.argsort(code, stable=True)
         ids, counts = torch.unique_consecutive(code[order], return_counts=True)
-        self._sums: dict[tuple[int, int], tuple[float, int]] = {}
+        self.sums: dict[tuple[int, int], tuple[float, int]] = {}
         self._rows: dict[tuple[int, int], torch.Tensor] = {}
         for one, rows in zip(ids.tolist(), order.split(counts.tolist())):
             pair = divmod(one, max(scene.num_regions, 1))
             self._rows[pair] = rows
-            self._sums[pair] = (float(strength[rows].sum()), len(rows))
+            self.sums[pair] = (float(strength[rows].sum()), len(rows))
         self._faces: dict[tuple[int, ...], Face] = {}
 
     def members(self) -> dict[int, list[int]]:
@@ -86,7 +86,7 @@ class Objects:
     def contacts(self) -> dict[tuple[int, int], tuple[float, int, list[tuple[int, int]]]]:
         """Return (sum of strengths, pixels, pairs of regions) of every two objects that touch."""
         found: dict[tuple[int, int], tuple[float, int, list[tuple[int, int]]]] = {}
-        for (a, b), (total, count) in self._sums.items():
+        for (a, b), (total, count) in self.sums.items():
             x, y = sorted((self.object_of[a], self.object_of[b]))
             if x == y:
                 continue

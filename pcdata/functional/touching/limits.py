@@ -52,8 +52,12 @@ class Limits(NamedTuple):
     # Only contacts look at it. Over an edge that is convex by 25 degrees a step must be twice as large: windows of few
     # pixels reach over rims and edges, and the planes fitted there miss each other.
     rim: float = chord(25)
+    # Times `smooth`: how rough seeds may be. In one image the smoothest alone: borders stay where creases are.
+    roughest: float = 1.0
 
 
+# Times `smooth`, up to `roughest`: a narrow can is nowhere as smooth as a box; what holds no smoother seed is one too.
+SMOOTH = (1.0, 1.5, 2.0)
 # Levels of creases that regions are flooded through, from smooth to full.
 LEVELS = 24
 # Pixels that windows reach: enough to fit a plane, and no more than is worth the time.

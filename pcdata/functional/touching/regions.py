@@ -18,6 +18,7 @@ from pcdata.functional.touching.limits import (
     KINECT_NOISE,
     LEVELS,
     NORMAL_PIXELS,
+    SMOOTH,
     Limits,
 )
 
@@ -260,23 +261,37 @@ def _seeds(
     camera: PixelCamera,
     limits: Limits,
 ) -> Tensor:
-    """Number the parts that are smooth together with all pixels around them, and large enough."""
-    smooth = there & (crease < limits.smooth)
-    smooth[:, 1:] &= ~across
-    smooth[:, :-1] &= ~across
-    smooth[1:] &= ~along
-    smooth[:-1] &= ~along
-    inside = smooth.clone()
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            inside &= shifted(smooth, down, right)
-    part = connected_pixels(inside, across, along)
-    area = torch.where(inside, 1 / (inverse * inverse).clamp(min=1e-12), 0.0) / (camera.fx * camera.fy)
-    size = torch.zeros(inside.numel() + 1, dtype=torch.float64, device=inverse.device)
-    size.index_add_(0, part.flatten(), area.flatten())
-    large = size >= limits.seed_area
-    large[-1] = False
-    return torch.where(large, large.cumsum(0) - 1, -1)[part]
+    """Number the parts that are smooth together with all pixels around them, and large enough.
+
+    First the smoothest, then what is as smooth as the next limit and holds none of them; each in the order of first
+    pixels.
+    """
+    open_ = there.clone()
+    open_[:, 1:] &= ~across
+    open_[:, :-1] &= ~across
+    open_[1:] &= ~along
+    open_[:-1] &= ~along
+    area = torch.where(there, 1 / (inverse * inverse).clamp(min=1e-12), 0.0) / (camera.fx * camera.fy)
+    seeds = torch.full_like(crease, -1, dtype=torch.int64)
+    number = 0
+    for factor in SMOOTH:
+        if factor > limits.roughest:
+            break
+        smooth = open_ & (crease < limits.smooth * factor)
+        inside = smooth.clone()
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                inside &= shifted(smooth, down, right)
+        part = connected_pixels(inside, across, along)
+        size = torch.zeros(inside.numel() + 1, dtype=torch.float64, device=inverse.device)
+        size.index_add_(0, part.flatten(), area.flatten())
+        size[part[inside & (seeds >= 0)]] = 0  # holds a smoother one
+        large = size >= limits.seed_area
+        large[-1] = False
+        own = torch.where(large, large.cumsum(0) - 1 + number, -1)[part]
+        seeds = torch.where(own >= 0, own, seeds)
+        number += int(large.sum())
+    return seeds
 
 
 def connected_pixels(mask: Tensor, across: Tensor, along: Tensor) -> Tensor:

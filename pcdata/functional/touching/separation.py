@@ -70,6 +70,33 @@ def separate_objects(
     limits = limits or Limits()
     if len(points) == 0:
         return Separation(grid.pixel_index.new_zeros(0), noise or KINECT_NOISE, 0, (), ())
+    objects, region = regions_of(points, grid, height, noise, limits, backend)
+    merge_weak_contacts(objects)
+    join_hollows(objects)
+    join_occluded(objects)
+    lookup = torch.tensor([*objects.object_of, -1], dtype=torch.int64, device=points.device)
+    label, names = in_order_of_rows(lookup[region])
+    return Separation(
+        label,
+        objects.scene.noise,
+        objects.scene.num_regions,
+        tuple(
+            Cut((names[a], names[b]), total / count, count)
+            for (a, b), (total, count, _) in objects.contacts().items()
+            if a in names and b in names
+        ),
+        tuple(
+            Join(names[objects.object_of[region]], why)
+            for region, why in objects.joins
+            if objects.object_of[region] in names
+        ),
+    )
+
+
+def regions_of(
+    points: Tensor, grid: ImageGrid, height: Tensor | None, noise: float | None, limits: Limits, backend: str
+) -> tuple[Objects, Tensor]:
+    """Cut one image into smooth regions, each an object of its own as yet; also return the region (N,) of points."""
     inverse, camera, pixel = _image(points, grid)
     if noise is None:
         noise = _measured_noise(inverse)
@@ -82,28 +109,7 @@ def separate_objects(
     regions = smooth_regions(inverse, camera, noise, limits, backend=backend)
     contacts = region_contacts(inverse, regions.label, camera, noise, limits, backend=backend)
     scene = Scene(inverse, regions.label, regions.normals, heights, contacts, camera, noise)
-    objects = Objects(scene)
-    merge_weak_contacts(objects)
-    join_hollows(objects)
-    join_occluded(objects)
-    lookup = torch.tensor([*objects.object_of, -1], dtype=torch.int64, device=points.device)
-    found = lookup[regions.label.view(-1)[pixel]]
-    label, names = in_order_of_rows(found)
-    return Separation(
-        label,
-        noise,
-        scene.num_regions,
-        tuple(
-            Cut((names[a], names[b]), total / count, count)
-            for (a, b), (total, count, _) in objects.contacts().items()
-            if a in names and b in names
-        ),
-        tuple(
-            Join(names[objects.object_of[region]], why)
-            for region, why in objects.joins
-            if objects.object_of[region] in names
-        ),
-    )
+    return Objects(scene), regions.label.view(-1)[pixel]
 
 
 def _image(points: Tensor, grid: ImageGrid) -> tuple[Tensor, PixelCamera, Tensor]:

@@ -35,10 +35,10 @@ CAMERA = PixelCamera(260.0, 250.0, 33.0, 20.0)
 
 
 @pytest.mark.parametrize("noise", [KINECT_NOISE / 2, KINECT_NOISE, 3 * KINECT_NOISE])
-@pytest.mark.parametrize("seed", range(1, 4))
-def test_regions_and_contacts_equal_the_reference(seed, noise):
+@pytest.mark.parametrize(("seed", "roughest"), [(1, 1.0), (2, 1.5), (3, 2.0)])
+def test_regions_and_contacts_equal_the_reference(seed, noise, roughest):
     inverse = heap(seed, noise)
-    limits = Limits(seed_area=4e-5)
+    limits = Limits(seed_area=4e-5, roughest=roughest)
     own = smooth_regions(inverse, CAMERA, noise, limits, backend="cpu")
     expected = smooth_regions(inverse, CAMERA, noise, limits, backend="torch")
     assert int(expected.label.max()) > 0  # several regions
@@ -58,3 +58,11 @@ def test_an_image_of_one_pixel_and_one_without_readings_have_no_region():
         assert (found.normals == 0).all()
     none = torch.zeros(0, dtype=torch.int64)
     assert region_planes(inverse, found.label, none, CAMERA, KINECT_NOISE, Limits(), backend="cpu").shape == (0, 6)
+
+
+def test_what_is_too_rough_for_the_first_seeds_becomes_one_where_rough_ones_are_asked_for():
+    inverse = heap(1, KINECT_NOISE)
+    few, many = (
+        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5, roughest=one)) for one in (1.0, 2.0)
+    )
+    assert int(many.label.max()) > int(few.label.max())

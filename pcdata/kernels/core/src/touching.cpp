@@ -16,13 +16,14 @@ namespace {
 // As pcdata.functional.touching.limits lays them out.
 struct Limits {
   double normal_reach, crease_reach, contact_reach, jump, gate, step, slope, full_crease, convex_part, smooth;
-  double angle_from, angle_full, gap_from, gap_full, seed_area;
+  double angle_from, angle_full, gap_from, gap_full, seed_area, rim, roughest;
 };
 struct Camera {
   double fx, fy, cx, cy;
 };
 
 constexpr int kLevels = 24;
+constexpr double kSmooth[3] = {1, 1.5, 2};  // times the limit
 constexpr double kNormalPixels[2] = {3, 14}, kCreasePixels[2] = {2, 12}, kContactPixels[2] = {5, 16};
 constexpr int64_t kRows = 8;  // image rows that a thread takes at once
 
@@ -274,41 +275,54 @@ class Flood {
       level_[static_cast<size_t>(p)] = static_cast<uint8_t>(std::floor(crease[p] * kLevels));
   }
 
+  // Number the parts that are smooth together with all pixels around them, and large enough: first the smoothest, then
+  // what is as smooth as the next limit and holds none of them.
   void seeds(const double* crease, uint8_t* smooth, std::atomic<uint32_t>* parents, double* area) {
     const int64_t width = image_.width, height = image_.height, size = image_.size();
-    for (int64_t p = 0; p < size; ++p) {
-      const int64_t row = p / width, c = p % width;
-      smooth[p] = image_.there(p) && crease[p] < image_.limits->smooth && !across_[p] && !along_[p] &&
-                  !(c > 0 && across_[p - 1]) && !(row > 0 && along_[p - width]);
-    }
-    cells::UnionFind parts(parents, size);
-    std::vector<uint8_t> inside(static_cast<size_t>(size));
-    for (int64_t row = 1; row + 1 < height; ++row)
-      for (int64_t c = 1; c + 1 < width; ++c) {
-        const int64_t p = row * width + c;
-        bool all = smooth[p];
-        for (int64_t down = -1; down <= 1 && all; ++down)
-          for (int64_t right = -1; right <= 1; ++right) all &= smooth[p + down * width + right] != 0;
-        inside[static_cast<size_t>(p)] = all;
-        if (!all) continue;
-        if (inside[static_cast<size_t>(p - 1)]) parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - 1));
-        if (inside[static_cast<size_t>(p - width)])
-          parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - width));
-      }
-    std::fill_n(area, size, 0.0);
     const double pixels = image_.camera.fx * image_.camera.fy;
-    for (int64_t p = 0; p < size; ++p) {
-      if (!inside[static_cast<size_t>(p)]) continue;
-      const double inverse = image_.inverse[p];
-      area[parts.find(static_cast<uint32_t>(p))] += 1 / std::max(inverse * inverse, 1e-12) / pixels;
-    }
+    std::vector<uint8_t> inside(static_cast<size_t>(size));
+    std::vector<int64_t> of(static_cast<size_t>(size));
     int64_t number = 0;
-    for (int64_t p = 0; p < size; ++p) {
-      label_[p] = -1;
-      if (!inside[static_cast<size_t>(p)]) continue;
-      const int64_t root = parts.find(static_cast<uint32_t>(p));
-      if (!(area[root] >= image_.limits->seed_area)) continue;
-      label_[p] = root == p ? number++ : label_[root];
+    std::fill_n(label_, size, -1);
+    for (const double factor : kSmooth) {
+      if (factor > image_.limits->roughest) break;
+      const double limit = image_.limits->smooth * factor;
+      for (int64_t p = 0; p < size; ++p) {
+        const int64_t row = p / width, c = p % width;
+        smooth[p] = image_.there(p) && crease[p] < limit && !across_[p] && !along_[p] && !(c > 0 && across_[p - 1]) &&
+                    !(row > 0 && along_[p - width]);
+      }
+      cells::UnionFind parts(parents, size);
+      std::fill(inside.begin(), inside.end(), 0);
+      for (int64_t row = 1; row + 1 < height; ++row)
+        for (int64_t c = 1; c + 1 < width; ++c) {
+          const int64_t p = row * width + c;
+          bool all = smooth[p];
+          for (int64_t down = -1; down <= 1 && all; ++down)
+            for (int64_t right = -1; right <= 1; ++right) all &= smooth[p + down * width + right] != 0;
+          inside[static_cast<size_t>(p)] = all;
+          if (!all) continue;
+          if (inside[static_cast<size_t>(p - 1)]) parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - 1));
+          if (inside[static_cast<size_t>(p - width)])
+            parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - width));
+        }
+      std::fill_n(area, size, 0.0);
+      std::fill(of.begin(), of.end(), -1);  // -2 = holds a smoother part
+      for (int64_t p = 0; p < size; ++p) {
+        if (!inside[static_cast<size_t>(p)]) continue;
+        const double inverse = image_.inverse[p];
+        const int64_t root = parts.find(static_cast<uint32_t>(p));
+        area[root] += 1 / std::max(inverse * inverse, 1e-12) / pixels;
+        if (label_[p] >= 0) of[static_cast<size_t>(root)] = -2;
+      }
+      for (int64_t p = 0; p < size; ++p) {
+        if (!inside[static_cast<size_t>(p)]) continue;
+        const int64_t root = parts.find(static_cast<uint32_t>(p));
+        int64_t& own = of[static_cast<size_t>(root)];
+        if (own == -2 || !(area[root] >= image_.limits->seed_area)) continue;
+        if (own < 0) own = number++;
+        label_[p] = own;
+      }
     }
   }
 
