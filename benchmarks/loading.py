@@ -20,14 +20,24 @@ What the rates stand beside:
 - ``webdataset``: the tars that pcdata builds, by key at random, and streamed shard by shard.
 - WebDataset, LitData, Zarr and Lance, each as its documentation shows, where they are installed.
 
+The set is some times as large as the processor's last cache (``cache`` in the JSON says how large that is), so that
+rows come from memory, and from the system's cache of files. ``memcpy, larger set`` and ``packed, larger set`` are of
+one eight times as large again: where they are as fast, no cache helps the others.
+
+The time of the processors for a batch, in the process that takes it and in all workers, is told beside the rates: it
+hardly depends on what else a machine does.
+
 Augmented are every sample by RandomRotation, RandomScale and RandomJitter, and also by RandomPointDropout.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import json
+import math
+import multiprocessing
 import os
 import platform
 import statistics
@@ -35,9 +45,9 @@ import tarfile
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -325,19 +335,53 @@ def _lance(folder: Path, clouds: _Clouds, workers: int, passes: int) -> _Loaded:
     return loader_of(_LanceSamples(str(folder / "samples.lance"), len(clouds)), _as_it_is, workers, passes)
 
 
-def rate(way: _Loaded, batches: int, waiting: int) -> float:
-    """Samples a second over so many batches, after those that workers made while others were measured."""
+class _Rate(NamedTuple):
+    """Of some batches."""
+
+    samples_per_second: float
+    own_time: float  # of the processors for a batch, in milliseconds: in this process
+    workers_time: float  # and in its workers; NaN = some began or ended meanwhile, or the system does not say
+
+
+def rate(way: _Loaded, batches: int, waiting: int) -> _Rate:
+    """Measure so many batches, after those that workers made while others were measured."""
     for _ in way.batches(waiting):
         pass
-    begun = time.perf_counter()
+    before, own, begun = _times_of_workers(), time.process_time(), time.perf_counter()
     for _ in way.batches(batches):
         pass
-    return batches * BATCH / (time.perf_counter() - begun)
+    wall, own, after = time.perf_counter() - begun, time.process_time() - own, _times_of_workers()
+    workers = sum(after[one] - before[one] for one in after) if before.keys() == after.keys() != set() else math.nan
+    return _Rate(batches * BATCH / wall, 1e3 * own / batches, 1e3 * workers / batches)
+
+
+def _times_of_workers() -> dict[int, float]:
+    """Return the seconds of the processors that each worker of this process has had; none where nobody says."""
+    found = {}
+    for worker in multiprocessing.active_children():
+        with contextlib.suppress(OSError):
+            found[worker.pid or 0] = int(Path(f"/proc/{worker.pid}/schedstat").read_text().split()[0]) / 1e9
+    return found
+
+
+def last_cache() -> int | None:
+    """Return the bytes of the processor's last cache, where the system says."""
+    sizes = []
+    for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
+        with contextlib.suppress(OSError, ValueError):
+            sizes.append(int(path.read_text().strip().removesuffix("K")) << 10)
+    return max(sizes, default=None)
+
+
+def _median(values: Iterable[float]) -> float | None:
+    known = [value for value in values if not math.isnan(value)]
+    return round(statistics.median(known), 3) if known else None
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--samples", type=int, default=1024)
+    parser.add_argument("--larger", type=int, default=8, help="times the samples, of the larger set; 0 = none")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--batches", type=int, default=96, help="of a stretch; slow ways have an eighth")
     parser.add_argument("--repeats", type=int, default=7)
@@ -347,7 +391,8 @@ def main() -> None:
     warnings.simplefilter("ignore", UserWarning)  # a second pass in one epoch: the order is of many passes
     clouds = _Clouds(arguments.samples)
     samples = np.stack([_arrays(clouds, sample_id) for sample_id in clouds.ids])
-    passes = max(1, 64 * BATCH * arguments.repeats // arguments.samples)
+    stretch = arguments.batches + 4 * arguments.workers
+    passes = 1 + stretch * BATCH * (arguments.repeats + 1) // arguments.samples  # workers begin once
 
     def loaded(data: Dataset, collate: Callable[..., Any]) -> _Loaded:
         return loader_of(data, collate, arguments.workers, passes)
@@ -374,15 +419,20 @@ def main() -> None:
         build_dataset(config_from_yaml("cloud: [Center]\noutput: {format: webdataset}\n"), clouds, built)
         ways["webdataset"] = loaded(CachedCloudDataset(built), collate_fixed)
         ways["webdataset, streamed"] = streamed(CachedCloudDataset(built), arguments.workers, passes)
+        if arguments.larger:
+            many = _Clouds(arguments.samples * arguments.larger)
+            built = folder / "larger"
+            build_dataset(config_from_yaml("cloud: [Center]\noutput: {format: packed}\n"), many, built)
+            ways["memcpy, larger set"] = copied(np.ones((len(many), POINTS, 6), np.float32))
+            ways["packed, larger set"] = loaded(CachedCloudDataset(built), collate_fixed)
+            rate(ways["packed, larger set"], len(many) // BATCH, 0)  # records are compared when they are first read
         skipped = {}
         for name, way in peers(folder, clouds, arguments.workers, passes).items():
             (skipped if isinstance(way, str) else ways)[name] = way
-        rates: dict[str, list[float]] = {name: [] for name in ways}
+        rates: dict[str, list[_Rate]] = {name: [] for name in ways}
         for number in range(arguments.repeats + 1):  # the first stretch begins workers and fills caches
             for name, way in list(ways.items()):
-                is_ours = name in ("memcpy", "a number", "memcpy in workers", "torch's ceiling") or name.startswith(
-                    ("packed", "webdataset")
-                )
+                is_ours = name.startswith(("memcpy", "a number", "torch's ceiling", "packed", "webdataset"))
                 count = arguments.batches if is_ours else max(8, arguments.batches // 8)
                 try:
                     found = rate(way, count, 4 * arguments.workers)
@@ -393,7 +443,8 @@ def main() -> None:
                 if number:
                     rates[name].append(found)
         del ways
-    per_second = {name: round(statistics.median(found)) for name, found in rates.items()}
+    walls = {name: [one.samples_per_second for one in found] for name, found in rates.items()}
+    per_second = {name: round(statistics.median(found)) for name, found in walls.items()}
     packed = per_second["packed"]
     document = {
         "benchmark": "loading",
@@ -405,11 +456,26 @@ def main() -> None:
         "cores": os.cpu_count(),
         "machine": platform.machine(),
         "torch": torch.__version__,
+        "cache": {
+            "last_level_bytes": last_cache(),
+            "set_bytes": arguments.samples * BYTES,
+            "larger_set_bytes": arguments.samples * arguments.larger * BYTES,
+        },
         "samples_per_second": per_second,
-        "quartiles": {name: [round(part) for part in np.percentile(found, [25, 75])] for name, found in rates.items()},
+        "quartiles": {name: [round(part) for part in np.percentile(found, [25, 75])] for name, found in walls.items()},
+        "cpu_ms_per_batch": {
+            name: {
+                "this process": _median(one.own_time for one in found),
+                "workers": _median(one.workers_time for one in found),
+            }
+            for name, found in rates.items()
+        },
         "gigabytes_per_second": {name: round(found * BYTES / 1e9, 2) for name, found in per_second.items()},
         "packed_over": {name: round(packed / found, 2) for name, found in per_second.items() if name != "packed"},
         "share_of_memcpy": {name: round(found / per_second["memcpy"], 3) for name, found in per_second.items()},
+        "share_of_memcpy_in_workers": {
+            name: round(found / per_second["memcpy in workers"], 3) for name, found in per_second.items()
+        },
         "rate_lost_to_augmentation": {name: round(1 - per_second[f"packed, {name}"] / packed, 3) for name in SUFFIXES},
         "not_measured": skipped,
     }

@@ -127,6 +127,12 @@ class Streams:
         """Return (B,) the key of a stream that begins with the next word of each."""
         return (self._keys + np.uint64(self.place * _GOLDEN % 2**64)).view(np.int64)
 
+    def take(self, count: int) -> Tensor:
+        """Draw (B,) int64 keys of streams whose first ``count`` words are the next ones of these."""
+        keys = torch.from_numpy(self.here())
+        self.place += count
+        return keys
+
     def __len__(self) -> int:
         return len(self._keys)
 

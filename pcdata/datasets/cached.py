@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -228,17 +228,18 @@ class CachedCloudDataset(SampleDataset):
         return error
 
     def _load_at_once(
-        self, numbers: NDArray[np.int64], *, leave_points: bool = False
-    ) -> tuple[PointCloud | None, Tensor | None]:
+        self, numbers: NDArray[np.int64], *, leave: Collection[str] = ()
+    ) -> tuple[PointCloud | None, Mapping[str, Tensor] | None]:
         """Return the clouds of some samples as one batch; None where that of one by one would be another.
 
-        And where their points lie, if they were left there: ``leave_points`` allows it.
+        And where the rows of fields lie, if they were left there: of the fields to ``leave`` they may.
         """
-        rows, sources = self._rows_of(numbers), None
+        rows = self._rows_of(numbers)
+        sources: Mapping[str, Tensor] | None = None
         with self._shards.held(rows):
             record = None
             if self._compared(rows):
-                record = self._shards.read_joined(rows, batch_memory, leave_points=leave_points)
+                record = self._shards.read_joined(rows, batch_memory, leave=leave)
         if record is None:
             single = [self._load(number) for number in numbers.tolist()]
             if any(one.frames.keys() != single[0].frames.keys() for one in single):
@@ -246,7 +247,8 @@ class CachedCloudDataset(SampleDataset):
             clouds = PointCloud.cat(single)
         else:
             clouds = self._forms.cloud(record)
-            sources = None if record.sources is None else torch.from_numpy(record.sources)
+            if record.sources is not None:
+                sources = {name: torch.from_numpy(addresses) for name, addresses in record.sources.items()}
         # One cloud each, since none has fewer.
         ptr, wanted = clouds.ptr.numpy(), self.manifest.index.num_points[rows]
         fits = len(ptr) == len(wanted) + 1 and bool((ptr[1:] - ptr[:-1] == wanted).all())
@@ -257,9 +259,9 @@ class CachedCloudDataset(SampleDataset):
             return None
         batches = []
         chain = self.transform if type(self.transform) is Compose and len(self.transform) else None
-        leave_points = chain is not None and chain.begins_with_motions
+        leave = () if chain is None else chain.fields_read_once
         for part in self._parts(numbers):
-            clouds, sources = self._load_at_once(numbers[part], leave_points=leave_points)
+            clouds, sources = self._load_at_once(numbers[part], leave=leave)
             if clouds is None:
                 return None
             own = None if streams is None else streams.part(part)

@@ -6,16 +6,15 @@ square roots alone, which every processor rounds in the same way; no library's l
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
-from pcdata.functional.rows import cloud_of_rows, transform_points
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts, transform_points
+from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import words
 
 # Of log(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1], and of sine and cosine in the square of quarter turns within
@@ -92,10 +91,7 @@ def move_points(
     the addresses of each cloud's points, in memory that somebody holds; then ``points`` is room for the result alone.
     """
     if sources is not None:
-        in_place, held = True, points.numpy()
-        for address, (start, stop) in zip(sources.tolist(), pairwise(ptr.tolist())):
-            if stop > start:
-                held[start:stop].reshape(-1)[:] = (ctypes.c_float * (3 * (stop - start))).from_address(address)
+        in_place, points = True, gather_kept({"points": points}, {"points": sources}, ptr)["points"]
     before = points
     for step in steps:
         if isinstance(step, Tensor):
@@ -125,6 +121,24 @@ def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
         mask[rows] = number == few
         masks.append(mask)
     return torch.from_numpy(np.concatenate([np.zeros(0, bool), *masks]))
+
+
+@inner
+def dropped_rows(
+    keys: Tensor,  # (B,) int64, of streams that begin with word 0, on the CPU
+    ptr: Tensor,  # (B+1,) int64, on the CPU
+    low: float,
+    high: float,
+) -> tuple[Tensor, Tensor]:
+    """Return a (N,) bool mask of what stays of each cloud without a part of it in [low, high), and its row pointers.
+
+    The first word of a stream gives the part, the second the seed of the rows that stay; of any rows, one at least.
+    """
+    counts = ptr[1:] - ptr[:-1]
+    drawn = words(keys[:, None], torch.arange(2, dtype=torch.int64, device="cpu"))
+    part = low + (high - low) * (((drawn[:, 0] >> 11) & ((1 << 53) - 1)).double() * 2.0**-53)
+    kept = torch.maximum(counts - (counts * part).round().long(), counts.clamp(max=1))
+    return random_rows(counts, kept, (drawn[:, 1] >> 2) & ((1 << 62) - 1)), ptr_from_counts(kept)
 
 
 def _first_different(count: int, few: int, seed: Tensor) -> np.ndarray:

@@ -14,8 +14,10 @@ one int64 table of C columns and R records, which the core writes in one pass an
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -143,3 +145,29 @@ def gather_records(into: Tensor, form: StoredForm, table: Tensor) -> None:
             if size:
                 stop = start + end * row
                 held[stop - size : stop] = (ctypes.c_uint8 * size).from_address(source)
+
+
+@inner
+def gather_kept(
+    rooms: Mapping[str, Tensor],  # name -> (N, ...), without gaps, which is written over
+    sources: Mapping[
+        str, Tensor
+    ],  # name -> (B,) int64, the address of each cloud's rows, in memory that somebody holds
+    ptr: Tensor,  # (B+1,) int64
+    kept: tuple[Tensor, Tensor]
+    | None = None,  # a (N,) bool mask, and the (B+1,) row pointers of what stays; None = all
+) -> dict[str, Tensor]:
+    """Copy the rows that stay of every field, one after another; return them, in the memory of the rooms."""
+    copied = {}
+    for name, room in rooms.items():
+        to, row_bytes, end = room.numpy().reshape(-1).view(np.uint8), room.nbytes // max(1, len(room)), 0
+        for address, (start, stop) in zip(sources[name].tolist(), pairwise(ptr.tolist())):
+            if stop == start:
+                continue
+            rows = np.array((ctypes.c_uint8 * ((stop - start) * row_bytes)).from_address(address))
+            rows = rows.reshape(stop - start, row_bytes)
+            rows = rows if kept is None else rows[kept[0][start:stop].numpy()]
+            to[end : end + rows.size] = rows.reshape(-1)
+            end += rows.size
+        copied[name] = room[: len(room) if kept is None else int(kept[1][-1])]
+    return copied

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import DTypeError, FrameError, OutOfRangeError, UnitError
+from pcdata.functional.motions import led_back
 from pcdata.geometry import rigid
 from pcdata.structures.image_layout import ImageLayout, joined_layout
 from pcdata.structures.kinds import KINDS, METRE, NORMALIZED, Kind, kind_of
@@ -175,19 +176,21 @@ class CloudBatch(Structure):
             "recorded_signals": signals,
         }
 
-    def _facts_moved(self, matrices: Sequence[Tensor], frame_id: str | None, unit: str | None) -> dict[str, Any]:
-        """Return what the clouds know after motions by (B, 4, 4): the way back to the source absorbs their inverses."""
+    def _facts_moved(self, matrices: Tensor, frame_id: str | None, unit: str | None) -> dict[str, Any]:
+        """Return what the clouds know after motions (S, B, 4, 4): the way back to the source absorbs their inverses."""
         viewpoint, layout, source_from_cloud = self.viewpoint, self.layout, self.source_from_cloud
-        inverses = torch.linalg.inv(matrices[0] if len(matrices) == 1 else torch.cat(list(matrices)))
-        for matrix, inverse in zip(matrices, inverses.split(len(source_from_cloud))):
+        for matrix in matrices:
             if self.recorded_signals:  # they stay as recorded: how the clouds moved is in source_from_cloud
                 refuse_mirror(type(self).__name__, self.recorded_signals, matrix)
             if viewpoint is not None:
                 one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=viewpoint.device)
                 viewpoint = KINDS[Kind.POSITION].move(viewpoint, one_row_each, matrix)
-            source_from_cloud = source_from_cloud @ inverse
-            if layout is not None and not rigid.is_rigid(source_from_cloud):
-                layout = None
+        if layout is None:
+            source_from_cloud = led_back(source_from_cloud, matrices)
+        else:
+            for matrix in matrices:
+                source_from_cloud = led_back(source_from_cloud, matrix[None])
+                layout = layout if rigid.is_rigid(source_from_cloud) else None
         known = {"frame_id": frame_id if frame_id is not None else self.frame_id, "unit": unit or self.unit}
         check_names(type(self).__name__, **known)
         return {

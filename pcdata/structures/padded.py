@@ -66,7 +66,7 @@ class PaddedClouds(CloudBatch):
         for name, value in rows.items():
             real = self.mask.reshape(-1, *[1] * (value.ndim - 1))
             rows[name] = torch.where(real, value, flat[name]).unflatten(0, (batch, width))
-        return derived(self, **attributes(rows), **self._facts_moved([matrix], frame, METRE))
+        return derived(self, **attributes(rows), **self._facts_moved(matrix[None], frame, METRE))
 
     def __getitem__(self, which: int | slice) -> PaddedClouds:
         """Return one cloud, or a slice of the batch, at the same length; the memory is shared."""

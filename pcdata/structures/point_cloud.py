@@ -14,6 +14,7 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.motions import are_plain_motions
 from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_rows, pick_rows, ptr_from_counts
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
@@ -282,32 +283,35 @@ class PointCloud(CloudBatch):
             ShapeError: there is not one matrix for each cloud.
             PoseError: a matrix is not affine (is it made for row vectors?), not finite, or singular.
         """
-        matrix = self._checked_motion("PointCloud.transformed", matrix)
-        rows = moved(self.fields(), self.kinds, self.ptr, matrix)
-        return self._with_rows(rows, **self._facts_moved([matrix], frame_id, unit))
+        matrices = self._checked_motions("PointCloud.transformed", matrix[None])
+        rows = moved(self.fields(), self.kinds, self.ptr, matrices[0])
+        return self._with_rows(rows, **self._facts_moved(matrices, frame_id, unit))
 
-    def with_facts_moved(self, matrices: Sequence[Tensor]) -> PointCloud:
+    def with_facts_moved(self, matrices: Tensor) -> PointCloud:
         """Do what :meth:`transformed` does, by one matrix after another, but leave the points: the caller moves them.
 
         Args:
-            matrices: new_from_old, (B, 4, 4) float64 each.
+            matrices: new_from_old, (S, B, 4, 4) float64.
 
         Raises:
             ShapeError, PoseError: as :meth:`transformed`.
         """
-        matrices = [self._checked_motion("PointCloud.with_facts_moved", matrix) for matrix in matrices]
+        matrices = self._checked_motions("PointCloud.with_facts_moved", matrices)
         fields = self.fields()
         points = fields.pop("points")
         for matrix in matrices:
             fields = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
         return self._with_rows({"points": points, **fields}, **self._facts_moved(matrices, None, None))
 
-    def _checked_motion(self, where: str, matrix: Tensor) -> Tensor:
-        """Require one affine matrix for each cloud; return it as coordinates are multiplied by it."""
-        if tuple(matrix.shape) != (self.num_clouds, 4, 4):
-            raise ShapeError(f"{where}: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrix.shape)}")
-        check_affine(where, matrix)
-        return matrix.to(dtype=torch.float64, device=self.device)
+    def _checked_motions(self, where: str, matrices: Tensor) -> Tensor:
+        """Require affine matrices, (S, B, 4, 4), one for each cloud; return them as coordinates are multiplied."""
+        if tuple(matrices.shape[1:]) != (self.num_clouds, 4, 4):
+            raise ShapeError(f"{where}: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrices.shape[1:])}")
+        wide = matrices.to(dtype=torch.float64, device=self.device)
+        if not are_plain_motions(wide.detach()):
+            for matrix in matrices:
+                check_affine(where, matrix)
+        return wide
 
     def in_source_frame(self) -> PointCloud:
         """Undo every spatial step: the same rows with coordinates in the source frame, in metres."""

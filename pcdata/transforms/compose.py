@@ -12,7 +12,7 @@ from torch import Generator, Tensor, nn
 
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
-from pcdata.functional.noise import move_points
+from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import PointCloud
 from pcdata.structures.showing import shown_page
@@ -22,7 +22,7 @@ from pcdata.transforms.chain_rules import check_chain, warn_of_order
 from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
-from pcdata.transforms.fused_motions import motions_from, moves_blindly, run_motions
+from pcdata.transforms.fused_motions import motions_from, read_by_motions, run_motions
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -94,20 +94,25 @@ class Compose(Transform):
         return self._run(data, generator)
 
     def consume(
-        self, data: PointCloud, *, generator: GeneratorLike | None = None, sources: Tensor | None = None
+        self, data: PointCloud, *, generator: GeneratorLike | None = None, sources: Mapping[str, Tensor] | None = None
     ) -> Any:
         """Run every step on clouds that nobody else holds: their memory may be used for the result.
 
         Args:
             data: the clouds.
             generator: as of any step.
-            sources: (B,) int64 addresses where the points of each cloud lie, in memory that somebody holds; the clouds
-                have only room for them. None = they have them.
+            sources: by the name of a field, (B,) int64 addresses where the rows of each cloud lie, in memory that
+                somebody holds; the clouds have only room for them. None = they have all.
         """
         return self._run(data, generator, is_own=not data.points.requires_grad, sources=sources)
 
     def _run(
-        self, data: Data, generator: GeneratorLike | None, *, is_own: bool = False, sources: Tensor | None = None
+        self,
+        data: Data,
+        generator: GeneratorLike | None,
+        *,
+        is_own: bool = False,
+        sources: Mapping[str, Tensor] | None = None,
     ) -> Any:
         position, generator = self._enter(data, generator)
         steps = list(self.steps)
@@ -129,9 +134,9 @@ class Compose(Transform):
                 if cloud is not None:
                     data, position, sources = cloud, position + together, None
                     continue
-            if sources is not None and isinstance(data, PointCloud):
-                move_points(data.points, data.ptr, (), sources=sources)
-                sources = None
+            if sources and isinstance(data, PointCloud):
+                gather_kept({name: getattr(data, name) for name in sources}, sources, data.ptr)
+            sources = None
             # What a step gives may share its memory with what it got, or with its params.
             is_own = False
             data, generator = _step(steps[position], data, generator)
@@ -139,9 +144,9 @@ class Compose(Transform):
         return data
 
     @property
-    def begins_with_motions(self) -> bool:
-        """Whether clouds are moved, or jittered, before anybody looks at their points: see :meth:`consume`."""
-        return moves_blindly(list(self.steps)[self._captures :])
+    def fields_read_once(self) -> Sequence[str]:
+        """The fields of clouds that are read by one pass alone, before anybody looks at them: see :meth:`consume`."""
+        return read_by_motions(list(self.steps)[self._captures :])
 
     def step_through(self, data: Data, *, generator: GeneratorLike | None = None) -> Iterator[tuple[Transform, Any]]:
         """Yield ``(step, data)`` after every step, for looking inside."""

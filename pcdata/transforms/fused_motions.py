@@ -8,21 +8,30 @@ of the single steps, bit for bit; and whatever they would refuse is left to them
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import PcdataError
+from pcdata.functional.motions import draw_motions
 from pcdata.functional.noise import PointStep, move_points
 from pcdata.functional.rows import listed_counts, pick_rows
+from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.structures.kinds import attributes
 from pcdata.structures.structure import derived
-from pcdata.transforms.base import Transform
+from pcdata.transforms.base import Params, Transform
+from pcdata.transforms.drawn_motions import Drawn, DrawnMotion, drawn_table, num_words
 from pcdata.transforms.families import SpatialTransform
 from pcdata.transforms.random_jitter import RandomJitter, RandomPointDropout
-from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomTranslation
+from pcdata.transforms.random_motions import RandomFlip, RandomRotation, RandomScale, RandomShear, RandomTranslation
+
+# Fields that no motion changes, and the points, which one pass changes.
+_UNMOVED = ("points", "colors", "source_index")
 
 
 def motions_from(steps: Sequence[Transform], position: int) -> int:
@@ -39,15 +48,18 @@ def motions_from(steps: Sequence[Transform], position: int) -> int:
     return count
 
 
-def moves_blindly(steps: Sequence[Transform]) -> bool:
-    """Whether the first of some steps moves points, or adds noise, in a way that :func:`run_motions` takes."""
-    return bool(steps) and motions_from(steps[:1], 0) == 1 and _is_blind(steps[0])
+def read_by_motions(steps: Sequence[Transform]) -> Sequence[str]:
+    """Return the fields that :func:`run_motions` reads once of the first of some steps: where they lie will do."""
+    together = motions_from(steps, 0)
+    if not together:
+        return ()
+    return _UNMOVED if type(steps[together - 1]) is RandomPointDropout else ("points",)
 
 
 def _is_blind(step: Transform) -> bool:
     """Whether a step moves points, or adds noise, without having looked at them."""
     # Exact types: a subclass may do something else.
-    if type(step) in (RandomRotation, RandomScale, RandomFlip):
+    if type(step) in (RandomRotation, RandomScale, RandomShear, RandomFlip):
         return vars(step)["about"] == "origin"
     return type(step) is RandomTranslation or (type(step) is RandomJitter and step.is_plain)
 
@@ -58,12 +70,12 @@ def run_motions(
     streams: Streams,
     *,
     in_place: bool = False,
-    sources: Tensor | None = None,
+    sources: Mapping[str, Tensor] | None = None,
 ) -> PointCloud | None:
     """Run steps that :func:`motions_from` found; None where they must be run one by one, with the same draws.
 
-    ``in_place``: the rows are nobody else's, and their memory takes the result. ``sources`` are the addresses where the
-    points of each cloud lie, which the cloud does not hold yet.
+    ``in_place``: the rows are nobody else's, and their memory takes the result. ``sources`` are the addresses where
+    the rows of each cloud lie, by the names of the fields that the cloud does not hold yet.
     """
     before = streams.place
     try:
@@ -74,38 +86,67 @@ def run_motions(
 
 
 def _run(
-    steps: Sequence[Transform], cloud: PointCloud, streams: Streams, in_place: bool, sources: Tensor | None
+    steps: Sequence[Transform],
+    cloud: PointCloud,
+    streams: Streams,
+    in_place: bool,
+    sources: Mapping[str, Tensor] | None,
 ) -> PointCloud:
     points, ptr = cloud.points, cloud.ptr
+    decided = _decided(steps, cloud, streams)
     done: list[PointStep] = []
     kept: tuple[Tensor, Tensor] | None = None
-    decided, counts = [], listed_counts(ptr)
-    for step in steps:  # none changes the frame or the unit, or looks at the points
-        step.check_input(cloud)
-        drawn = streams.here()
-        params = step.make_params(cloud, streams)
-        decided.append((params, drawn, step.told_rows(cloud, params)))
+    motions = [one["matrix"] for one, _ in decided if "matrix" in one]
+    if motions:
+        cloud = cloud.with_facts_moved(torch.stack(motions))
+    counts = listed_counts(ptr)
+    for step, (params, drawn) in zip(steps, decided, strict=True):
+        before, told = counts, counts if step.decides_by == "count" else None
         if isinstance(step, SpatialTransform):
             done.append(params["matrix"])
         elif isinstance(step, RandomJitter):
             done.append(step.point_step(params))
         else:
             kept = params["index"], params["ptr"]
-    motions = [one for one in done if isinstance(one, Tensor)]
-    if motions:
-        cloud = cloud.with_facts_moved(motions)
+            counts = listed_counts(kept[1])
+        cloud = step.recorded_counts(cloud, before, counts, params, drawn=drawn, rows=told)
     layout = cloud.layout if len(motions) == len(done) else None  # noise leaves no point on its pixel
-    for step, (params, drawn, told) in zip(steps, decided, strict=True):
-        after = listed_counts(params["ptr"]) if "ptr" in params else counts
-        cloud = step.recorded_counts(cloud, counts, after, params, drawn=drawn, rows=told)
-        counts = after
     # Nothing is refused from here on: memory may change.
-    rows = cloud.fields()
+    rows, left = cloud.fields(), dict(sources or {})
     if kept is not None:
         cloud = derived(cloud, ptr=kept[1])
-    if done or sources is not None:
-        rows["points"] = move_points(points, ptr, done, kept, in_place=in_place, sources=sources)
-    if kept is not None:
-        others = {name: value for name, value in rows.items() if name != "points" or not (done or sources is not None)}
+    others = dict(rows)
+    if done:
+        moved = move_points(points, ptr, done, kept, in_place=in_place, sources=left.pop("points", None))
+        rows["points"] = moved
+        del others["points"]
+    if left:
+        rows |= gather_kept({name: others.pop(name) for name in left}, left, ptr, kept)
+    if kept is not None and others:
         rows |= pick_rows(others, kept[0], in_place=in_place)
     return derived(cloud, **attributes(rows), layout=layout)
+
+
+def _decided(steps: Sequence[Transform], cloud: PointCloud, streams: Streams) -> list[tuple[Params, NDArray[np.int64]]]:
+    """Return what each step decides, and the streams as they were before; none looks at what another does.
+
+    Motions are drawn all at once.
+    """
+    begin, keys = streams.place, torch.from_numpy(streams.here())
+    decided: list[tuple[Params, NDArray[np.int64]]] = []
+    together: dict[int, tuple[Drawn, int]] = {}
+    for number, step in enumerate(steps):
+        step.check_input(cloud)
+        before = streams.here()
+        drawn = step.drawn() if isinstance(step, DrawnMotion) else None
+        if drawn is None:
+            decided.append((step.make_params(cloud, streams), before))
+        else:
+            decided.append(({}, before))
+            together[number] = drawn, streams.place - begin
+            streams.take(num_words(drawn))
+    if together:
+        table = drawn_table(*map(tuple, zip(*together.values(), strict=True)))
+        for number, matrix in zip(together, draw_motions(keys, table, len(together)), strict=True):
+            decided[number][0]["matrix"] = matrix
+    return decided

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, FrameError
 from pcdata.functional.nearest import sum_of_squares
-from pcdata.functional.noise import PointStep, move_points, normal_rows, random_rows
-from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
+from pcdata.functional.noise import PointStep, dropped_rows, move_points, normal_rows
+from pcdata.functional.rows import cloud_of_rows
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -93,11 +93,9 @@ class RandomPointDropout(SelectTransform):
             raise ConfigError(f"RandomPointDropout: low {self.low} exceeds high {self.high}")
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
-        """Draw the fraction, then which points."""
-        fractions, counts = streams.uniform(self.low, self.high), cloud.counts.cpu()
-        kept = torch.maximum(counts - (counts * fractions).round().long(), counts.clamp(max=1))
-        keep = random_rows(counts, kept, streams.seeds())
-        return keep.to(cloud.device), ptr_from_counts(kept, cloud.device)
+        """Draw the part, then which points."""
+        keep, ptr = dropped_rows(streams.take(2), cloud.ptr.cpu(), self.low, self.high)
+        return keep.to(cloud.device), ptr.to(cloud.device)
 
 
 class RandomColorJitter(Transform):

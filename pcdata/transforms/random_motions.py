@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from annotated_types import Interval
 from torch import Tensor
 
 from pcdata.errors import ConfigError
-from pcdata.functional.rows import segment_mean
+from pcdata.functional.motions import ENTRY, SIGN, TURN
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params
-from pcdata.transforms.families import SpatialTransform
+from pcdata.transforms.drawn_motions import About, Drawn, DrawnMotion, about_point
 from pcdata.transforms.field_types import Fraction, Positive, Vec3
 
-# The point that stays: the origin, the mean of each cloud, or a point in the cloud's unit.
-About = Literal["origin", "centroid"] | Vec3
 Angles = tuple[float, float]  # degrees, from and to
 
 
-class RandomRotation(SpatialTransform):
+class RandomRotation(DrawnMotion):
     """Rotate every cloud about an axis by a random angle, about all three, or by a random rotation.
 
     Args:
@@ -54,35 +52,36 @@ class RandomRotation(SpatialTransform):
             if not -360 <= low <= high <= 360:
                 raise ConfigError(f"RandomRotation: degrees from {low} to {high} are no range within -360 to 360")
 
+    def drawn(self) -> Drawn | None:
+        """The angles; a rotation about any axis is drawn from normal numbers."""
+        if self.degrees_xyz is None and self.axis is None:
+            return None
+        return _turns(self.axis, self.degrees, self.degrees_xyz)
+
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw one rotation per cloud."""
-        if self.degrees_xyz is not None:
-            low, high = torch.tensor(self.degrees_xyz, dtype=torch.float64, device="cpu").unbind(1)
-            angles = torch.deg2rad(low + (high - low) * streams.uniform(0.0, 1.0, 3))
-            axes = torch.eye(3, dtype=torch.float64, device="cpu")
-            x, y, z = (
-                rigid.rotation_about_axis(axes[i].expand(len(angles), 3), angle)
-                for i, angle in enumerate(angles.unbind(1))
-            )
-            rotation = z @ y @ x
-        elif self.axis is None:
-            quaternion = streams.normal(4)  # a normalized Gaussian quaternion is uniform over rotations
-            rotation = rigid.rotation_from_quaternion(quaternion)
-        else:
-            from_, to = self.degrees if isinstance(self.degrees, tuple) else (-self.degrees, self.degrees)
-            rotation = rigid.rotation_about_axis(
-                _direction(self.axis), streams.uniform(math.radians(from_), math.radians(to))
-            )
-        return {"matrix": _about(self.about, data, rotation)}
+        if self.drawn() is not None:
+            return super().make_params(data, streams)
+        quaternion = streams.normal(4)  # a normalized Gaussian quaternion is uniform over rotations
+        return {"matrix": about_point(self.about, data, rigid.rotation_from_quaternion(quaternion))}
 
 
 @functools.lru_cache(maxsize=64)
-def _direction(axis: tuple[float, float, float]) -> Tensor:
-    """Return an axis of unit length, (1, 3); not to be changed."""
-    return torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64, device="cpu"), dim=0)[None]
+def _turns(axis: Vec3 | None, degrees: float | Angles, degrees_xyz: tuple[Angles, Angles, Angles] | None) -> Drawn:
+    if degrees_xyz is not None:
+        rows = [
+            (TURN, math.radians(low), math.radians(high), float(i == 0), float(i == 1), float(i == 2))
+            for i, (low, high) in enumerate(degrees_xyz)
+        ]
+        return tuple(rows), (0, 1, 2)
+    assert axis is not None
+    length = math.hypot(*axis)
+    ends = degrees if isinstance(degrees, tuple) else (-degrees, degrees)
+    x, y, z = (one / length for one in axis)
+    return ((TURN, math.radians(ends[0]), math.radians(ends[1]), x, y, z),), (0,)
 
 
-class RandomTranslation(SpatialTransform):
+class RandomTranslation(DrawnMotion):
     """Shift every cloud by a random offset, drawn per axis.
 
     Args:
@@ -108,15 +107,22 @@ class RandomTranslation(SpatialTransform):
             return -high, high
         return torch.tensor(self.min_offset, dtype=torch.float64, device="cpu"), high
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw one offset per cloud."""
-        low, high = self._ends()
-        drawn = streams.uniform(-1.0, 1.0, 3)
-        offset = drawn * high if self.min_offset is None else low + (high - low) * (drawn + 1.0) / 2
-        return {"matrix": rigid.from_rotation_translation(torch.eye(3, dtype=torch.float64, device="cpu"), offset)}
+    def drawn(self) -> Drawn:
+        """The offset along each axis."""
+        return _shifts(self.max_offset, self.min_offset)
 
 
-class RandomScale(SpatialTransform):
+@functools.lru_cache(maxsize=64)
+def _shifts(high: float | Vec3, low: float | Vec3 | None) -> Drawn:
+    highs, lows = _of_axes(high), _of_axes(low) if low is not None else [-one for one in _of_axes(high)]
+    return tuple((ENTRY, lows[i], highs[i], float(i), 3.0, 0.0) for i in range(3)), (0, 1, 2)
+
+
+def _of_axes(value: float | Vec3) -> list[float]:
+    return [float(one) for one in (value if isinstance(value, tuple) else (value,) * 3)]
+
+
+class RandomScale(DrawnMotion):
     """Scale every cloud by a random factor; the unit stays, so objects really become larger or smaller.
 
     Args:
@@ -145,18 +151,23 @@ class RandomScale(SpatialTransform):
         low, high = (torch.tensor(end, dtype=torch.float64, device="cpu") for end in (self.low, self.high))
         return low, high
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw one factor, or three, per cloud."""
-        low, high = self._ends()
-        factors = low + (high - low) * streams.uniform(0.0, 1.0, 3 if self.per_axis else 1)
-        return {"matrix": _about(self.about, data, torch.diag_embed(factors.expand(-1, 3)))}
+    def drawn(self) -> Drawn:
+        """One factor for all axes, or one for each."""
+        return _factors(self.low, self.high, self.per_axis)
+
+
+@functools.lru_cache(maxsize=64)
+def _factors(low: float | Vec3, high: float | Vec3, per_axis: bool) -> Drawn:
+    lows, highs = _of_axes(low), _of_axes(high)
+    rows = tuple((ENTRY, lows[i], highs[i], float(i), float(i), 0.0) for i in range(3))
+    return rows, (0, 1, 2) if per_axis else (0, 0, 0)
 
 
 Row3 = tuple[float, float, float]
 Shears = tuple[Row3, Row3, Row3]
 
 
-class RandomShear(SpatialTransform):
+class RandomShear(DrawnMotion):
     """Shear every cloud: each coordinate moves along each other axis by a random part of it.
 
     A point (x, y, z) goes to (x + a y + b z, c x + y + d z, e x + f y + z). Normals stay at right angles to their
@@ -199,14 +210,21 @@ class RandomShear(SpatialTransform):
             ends.append(matrix if matrix.ndim else matrix.repeat(3, 3).fill_diagonal_(0.0))
         return ends[0], ends[1]
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw six shears per cloud."""
-        low, high = self._ends()
-        linear = torch.eye(3, dtype=torch.float64, device="cpu") + low + (high - low) * streams.uniform(0.0, 1.0, 3, 3)
-        return {"matrix": _about(self.about, data, linear)}
+    def drawn(self) -> Drawn:
+        """The six shears, row by row."""
+        return _shears(self.low, self.high)
 
 
-class RandomFlip(SpatialTransform):
+@functools.lru_cache(maxsize=64)
+def _shears(low: float | Shears, high: float | Shears) -> Drawn:
+    ends = [[[end] * 3 for _ in range(3)] if isinstance(end, float | int) else end for end in (low, high)]
+    rows = [
+        (ENTRY, ends[0][i][j], ends[1][i][j], float(i), float(j), 0.0) for i in range(3) for j in range(3) if i != j
+    ]
+    return tuple(rows), tuple(range(6))
+
+
+class RandomFlip(DrawnMotion):
     """Mirror every cloud along each axis with a probability.
 
     A mirrored scene has mirrored objects: poses (grasps) cannot follow, and ``rigid.map_poses`` refuses them.
@@ -221,20 +239,6 @@ class RandomFlip(SpatialTransform):
     probability: tuple[Fraction, Fraction, Fraction] = (0.5, 0.0, 0.0)
     about: About = "origin"
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw the signs per cloud."""
-        flipped = streams.uniform(0.0, 1.0, 3) < torch.tensor(self.probability, dtype=torch.float64, device="cpu")
-        signs = torch.ones_like(flipped, dtype=torch.float64).masked_fill_(flipped, -1.0)
-        return {"matrix": _about(self.about, data, torch.diag_embed(signs))}
-
-
-def _about(point: About, data: PointCloud, linear: Tensor) -> Tensor:
-    """Return (B, 4, 4) that apply (B, 3, 3) about the origin, about each cloud's mean, or about a point."""
-    if point == "origin":
-        return rigid.from_rotation_translation(linear, linear.new_zeros((len(linear), 3)))
-    if point == "centroid":
-        center = segment_mean(data.points, data.ptr).to(linear.device)
-    else:
-        center = linear.new_tensor(point).expand(len(linear), 3)
-    shift = center - (linear @ center[:, :, None]).squeeze(-1)
-    return rigid.from_rotation_translation(linear, shift)
+    def drawn(self) -> Drawn:
+        """The sign of each axis."""
+        return tuple((SIGN, part, 0.0, float(i), 0.0, 0.0) for i, part in enumerate(self.probability)), (0, 1, 2)

@@ -59,25 +59,29 @@ def test_clouds_of_ones_own_come_out_the_same_in_their_memory(steps):
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_points_are_moved_from_where_each_cloud_has_them(steps, backend, monkeypatch):
     if backend == "torch":
-        monkeypatch.setattr(INNER["move_points"], "kernels", {})
+        for name in ("move_points", "gather_kept"):
+            monkeypatch.setattr(INNER[name], "kernels", {})
     chain, cloud = Compose(steps), cloud_in_base((70, 0, 333, 1))
     wanted = chain(cloud, generator=Streams([1, 2, 3, 4]))
-    parts = [part.points.clone() for part in reversed(cloud.unbatch())][::-1]  # elsewhere, and in another order
-    sources = torch.tensor([part.data_ptr() for part in parts])
-    empty = derived(cloud, points=torch.full_like(cloud.points, torch.nan))
-    made = chain.consume(empty, generator=Streams([1, 2, 3, 4]), sources=sources)
+    fields = chain.fields_read_once
+    assert fields == (("points",) if len(steps) == 2 else ("points", "colors", "source_index"))
+    parts = {name: [getattr(part, name).clone() for part in reversed(cloud.unbatch())][::-1] for name in fields}
+    sources = {name: torch.tensor([part.data_ptr() for part in own]) for name, own in parts.items()}
+    rooms = {name: torch.full_like(getattr(cloud, name), -77) for name in fields}
+    made = chain.consume(derived(cloud, **rooms), generator=Streams([1, 2, 3, 4]), sources=sources)
     assert_same(made, wanted)
     assert made.history == wanted.history
 
 
-def test_points_that_were_left_are_there_for_steps_that_run_alone():
-    chain, cloud = Compose([RandomRotation(), RandomScale()]), cloud_in_base((20, 5))
+def test_rows_that_were_left_are_there_for_steps_that_run_alone():
+    chain, cloud = Compose([RandomRotation(), RandomPointDropout()]), cloud_in_base((20, 5))
     wanted = chain(cloud, generator=Streams([1, 2]))
-    parts = [part.points.clone() for part in cloud.unbatch()]
-    empty = derived(cloud, points=torch.full_like(cloud.points, torch.nan))
+    parts = {name: [getattr(one, name).clone() for one in cloud.unbatch()] for name in chain.fields_read_once}
+    sources = {name: torch.tensor([part.data_ptr() for part in own]) for name, own in parts.items()}
+    empty = derived(cloud, **{name: torch.full_like(getattr(cloud, name), -77) for name in sources})
     chain.steps[0].register_forward_hook(lambda *_: None)  # somebody watches it
-    assert not chain.begins_with_motions
-    made = chain.consume(empty, generator=Streams([1, 2]), sources=torch.tensor([part.data_ptr() for part in parts]))
+    assert chain.fields_read_once == ()
+    made = chain.consume(empty, generator=Streams([1, 2]), sources=sources)
     assert_same(made, wanted)
 
 

@@ -46,8 +46,9 @@ class Record:
     arrays: Mapping[str, np.ndarray]
     info: Mapping[str, Any]
     form: Any = None  # the same for records that differ in the rows, the meta and the history alone; None = unknown
-    # (B,) int64 addresses where the points of each cloud lie, while the store is open: `points` is room for them alone.
-    sources: np.ndarray | None = None
+    # By name (B,) int64 addresses where the rows of each cloud lie, while the store is open: the arrays of these names
+    # are room for them alone.
+    sources: Mapping[str, np.ndarray] | None = None
 
     def info_text(self) -> str:
         """The facts as canonical JSON."""

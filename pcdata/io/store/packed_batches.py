@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,12 @@ from pcdata.io.store.packed_file import PackedColumn, PackedFile, PackedGroup
 from pcdata.io.store.store import INFO
 from pcdata.structures.read_later import StoredMeta, StoredSteps, StoredTexts
 
+# What clouds hold of these fields as it is stored: a file may have other dtypes, which clouds do not.
+_PLAIN = {
+    "points": (np.dtype(np.float32), (3,)),
+    "colors": (np.dtype(np.float32), (3,)),
+    "source_index": (np.dtype(np.int64), ()),
+}
 HISTORY = f"{INFO}.history"  # apart from the other facts: it is long, and seldom read
 
 
@@ -79,10 +85,12 @@ class PackedBatches:
         form.update()
         self._groups = StoredGroups(self._firsts.tensor, self._which.tensor, self._pointers.tensor)
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+    def read(
+        self, places: NDArray[np.int64], room: Room | None = None, *, leave: Collection[str] = ()
+    ) -> Record | None:
         """Return the record of all clouds in a row; None where facts differ, or arrays in name, dtype or row.
 
-        With ``leave_points`` float32 points stay where they lie, if each record is one cloud.
+        Arrays to ``leave`` stay where they lie, if each record is one cloud, and they are what clouds hold.
         """
         forms = list(self._forms.values())
         form = forms[0] if len(forms) == 1 else forms[self._form_of(int(places[0]))]
@@ -96,9 +104,10 @@ class PackedBatches:
         if memory is None:
             memory = torch.empty(starts[-1], dtype=torch.uint8, device="cpu")
         sources = None
-        if leave_points and found.kind == CLOUDS and form.points is not None:
-            sources = found.sources[form.points]
-            found.sizes[form.points] = 0  # nothing is copied
+        if leave and found.kind == CLOUDS:
+            left = {name: column for name, column in form.plain.items() if name in leave}
+            sources = {name: found.sources[column] for name, column in left.items()}
+            found.sizes[[*left.values()]] = 0  # nothing is copied
         gather_records(memory, stored, table)
         totals = found.ends[:, -1].tolist()
         if found.kind == CLOUDS:
@@ -130,9 +139,10 @@ class _Form:
         # of each begin among those of all, -1 = it needs none.
         self.tables = _Grown(np.int64, len(columns), 3)
         self._kinds = [(one.values.dtype, one.values.shape[1:]) for one in columns.values()]
-        # The column of points that can be moved where they lie.
-        are_plain = "points" in columns and self._kinds[self.names.index("points")] == (np.dtype(np.float32), (3,))
-        self.points = self.names.index("points") if are_plain else None
+        # The columns whose rows can be left where they lie, by name.
+        self.plain = {
+            name: self.names.index(name) for name, kind in zip(columns, self._kinds) if _PLAIN.get(name) == kind
+        }
         row_bytes = [kind.itemsize * math.prod(row) for kind, row in self._kinds]
         self._row_bytes = torch.tensor(row_bytes, dtype=torch.int64, device="cpu")
         self._roles = torch.tensor(_roles(columns, facts), dtype=torch.int64, device="cpu")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,8 @@ class _Reader:
             numbers = {key: number for number, key in enumerate(file.keys, start=first)}
             return np.array([numbers.get(key, -1) for key in keys], dtype=np.int64)
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+    def read(
+        self, places: NDArray[np.int64], room: Room | None = None, *, leave: Collection[str] = ()
+    ) -> Record | None:
         """Return the record of all clouds."""
-        return self._batches.read(places, room, leave_points=leave_points)
+        return self._batches.read(places, room, leave=leave)

@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -180,12 +180,12 @@ class Shards:
         return self.store(int(self._index.shards[number])).digest(key_of(self._index.ids[number]))
 
     def read_joined(
-        self, numbers: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False
+        self, numbers: NDArray[np.int64], room: Room | None = None, *, leave: Collection[str] = ()
     ) -> Record | None:
         """Read the records of some samples as one, in this order; None where the store, or these records, cannot.
 
-        ``room`` gives memory for the arrays, (bytes,) uint8, or None; a store may leave it unasked. With
-        ``leave_points`` it may leave the points where they lie: see :class:`Record`.
+        ``room`` gives memory for the arrays, (bytes,) uint8, or None; a store may leave it unasked. Arrays
+        to ``leave`` it may leave where they lie: see :class:`Record`.
 
         Raises:
             CacheError: as for :meth:`read`.
@@ -202,7 +202,7 @@ class Shards:
                 found = self._reader.places(self.store(shard), keys_of(self._index.ids.part(own)))
                 self._places[own.start : own.stop] = found + 1
             places = self._places[numbers]
-        return self._reader.read(places - 1, room, leave_points=leave_points) if places.all() else None
+        return self._reader.read(places - 1, room, leave=leave) if places.all() else None
 
     def identities(self, numbers: NDArray[np.int64]) -> dict[int, tuple[int, ...]] | None:
         """Return what tells the files of the shards of some samples from others of their names, by shard.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal, Protocol
@@ -40,11 +40,13 @@ class BatchReader(Protocol):
         """
         ...
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+    def read(
+        self, places: NDArray[np.int64], room: Room | None = None, *, leave: Collection[str] = ()
+    ) -> Record | None:
         """Return the record of all clouds of some places in a row; None where these records can have none.
 
-        ``room`` gives memory for the arrays; a reader may leave it unasked. With ``leave_points`` it may leave the
-        points where they lie, and say where: see :class:`Record`.
+        ``room`` gives memory for the arrays; a reader may leave it unasked. Arrays to ``leave`` it may leave where
+        they lie, and say where: see :class:`Record`.
 
         Raises:
             CacheError: as for :meth:`Store.read`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
@@ -232,7 +232,9 @@ class _Reader:
         self._records += [(store, key) for key in keys]
         return np.arange(first, len(self._records))
 
-    def read(self, places: NDArray[np.int64], room: Room | None = None, *, leave_points: bool = False) -> Record | None:
+    def read(
+        self, places: NDArray[np.int64], room: Room | None = None, *, leave: Collection[str] = ()
+    ) -> Record | None:
         """Return the record of all clouds, points and all."""
         parts: list[_Parts] = []
         records = [self._records[place] for place in places.tolist()]

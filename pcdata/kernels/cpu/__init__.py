@@ -8,6 +8,7 @@ from pcdata.kernels.cpu import grasps as cpu_grasps
 from pcdata.kernels.cpu import image_windows as cpu_image_windows
 from pcdata.kernels.cpu import images as cpu_images
 from pcdata.kernels.cpu import lenses as cpu_lenses
+from pcdata.kernels.cpu import motions as cpu_motions
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
 from pcdata.kernels.cpu import noise as cpu_noise
 from pcdata.kernels.cpu import rendering as cpu_rendering
@@ -25,6 +26,7 @@ __all__ = [
     "cpu_image_windows",
     "cpu_images",
     "cpu_lenses",
+    "cpu_motions",
     "cpu_neighbors",
     "cpu_noise",
     "cpu_registration",

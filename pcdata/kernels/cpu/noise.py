@@ -71,3 +71,11 @@ def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
     mask = room(int(counts.sum()), torch.bool)
     call("pc_random_rows", len(counts), counts.contiguous(), wanted.contiguous(), seeds.contiguous(), mask)
     return mask
+
+
+@kernel("dropped_rows", "cpu")
+def dropped_rows(keys: Tensor, ptr: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """Draw the part and the rows of one cloud after another."""
+    mask, kept_ptr = room(int(ptr[-1]), torch.bool), room(ptr.shape, torch.int64)
+    call("pc_dropped_rows", keys, ptr.contiguous(), ptr.shape[0] - 1, low, high, mask, kept_ptr)
+    return mask, kept_ptr

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xB0BEABD7E19569B
+INTERFACE_NUMBER = 0x68B39ABDA423279
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -21,6 +21,8 @@ pc_register_depth: float* depth, int64 views, int64 height, int64 width, float* 
     possible
 pc_count_kept: uint8* mask, int64 rows, int64* starts
 pc_keep_rows: uint8* mask, int64 rows, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64* picked
+pc_gather_kept: int64* ptr, int64 num_clouds, uint8* kept, int64* kept_ptr, int64 num_fields, int64* sources, int64*
+    row_bytes, int64* picked
 pc_take_rows: int64* index, int64 num_picked, int64 rows, int64 num_fields, int64* sources, int64* row_bytes, int64*
     picked, int64* possible
 pc_place_rows: int64 num_parts, int64* counts, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64*
@@ -32,7 +34,12 @@ pc_transform_points: float* points, int64* ptr, int64 num_clouds, double* matric
 pc_transform_directions: float* directions, int64* ptr, int64 num_clouds, double* linear, float* turned
 pc_move_points: float* points, int64* sources, int64* ptr, int64 num_clouds, int64 num_steps, int64* is_noise, double*
     matrices, int64* seeds, double* sigma, double* clip, uint8* kept, int64* kept_ptr, float* moved
+pc_draw_motions: int64* keys, int64 num_clouds, double* draws, int64 num_draws, int64 num_steps, double* matrices
+pc_led_back: double* matrices, int64 num_steps, int64 num_clouds, double* source_from_cloud, double* result, int64*
+    possible
+pc_are_plain_motions: double* matrices, int64 count, int64* plain
 pc_random_rows: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, uint8* mask
+pc_dropped_rows: int64* keys, int64* ptr, int64 num_clouds, double low, double high, uint8* mask, int64* kept_ptr
 pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
 pc_box_mask: float* points, int64* ptr, int64 num_clouds, float* lower, float* upper, uint8* inside
 pc_polygon_mask: float* points, int64 rows, double* corners, int64 num_corners, uint8* inside

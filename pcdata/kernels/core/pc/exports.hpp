@@ -84,6 +84,12 @@ PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, i
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked);
 
+// Copy the rows of clouds where the mask kept (N,) is true, from where each cloud has those of a field: sources
+// (fields, clouds), addresses. Those of a cloud go to row kept_ptr[cloud] of each field's picked.
+PC_EXPORT int32_t pc_gather_kept(const pc_context* context, const int64_t* ptr, int64_t num_clouds, const uint8_t* kept,
+                                 const int64_t* kept_ptr, int64_t num_fields, const int64_t* sources,
+                                 const int64_t* row_bytes, const int64_t* picked);
+
 // Copy the rows index (num_picked,) of `rows`; *possible becomes 0, and nothing is certain, if one lies outside.
 PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, int64_t num_picked, int64_t rows,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
@@ -133,10 +139,28 @@ PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points,
                                  const double* matrices, const int64_t* seeds, const double* sigma, const double* clip,
                                  const uint8_t* kept, const int64_t* kept_ptr, float* moved);
 
+// matrices (steps, clouds, 4, 4) as draw_motions draws them of the streams of keys (clouds,): draws (num_draws, 8).
+PC_EXPORT int32_t pc_draw_motions(const pc_context* context, const int64_t* keys, int64_t num_clouds,
+                                  const double* draws, int64_t num_draws, int64_t num_steps, double* matrices);
+
+// result (clouds, 4, 4) = source_from_cloud (clouds, 4, 4) @ the inverse of one of matrices (steps, clouds, 4, 4) after
+// another. *possible becomes 0, and nothing else is certain, if one is nearly flat.
+PC_EXPORT int32_t pc_led_back(const pc_context* context, const double* matrices, int64_t num_steps, int64_t num_clouds,
+                              const double* source_from_cloud, double* result, int64_t* possible);
+
+// *plain = 1 if all matrices (count, 4, 4) are finite and affine, and far from being flat; else 0.
+PC_EXPORT int32_t pc_are_plain_motions(const pc_context* context, const double* matrices, int64_t count,
+                                       int64_t* plain);
+
 // mask (sum of counts,): of each cloud's counts (clouds,) rows the wanted (clouds,) become 1 that its seed chooses, the
 // others 0.
 PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
                                  const int64_t* wanted, const int64_t* seeds, uint8_t* mask);
+
+// mask (N,) and kept_ptr (clouds + 1,) of what stays of clouds without a part of each within [low, high), by the first
+// two words of the streams of keys (clouds,).
+PC_EXPORT int32_t pc_dropped_rows(const pc_context* context, const int64_t* keys, const int64_t* ptr,
+                                  int64_t num_clouds, double low, double high, uint8_t* mask, int64_t* kept_ptr);
 
 // inside (N,) becomes 1 where lower <= point <= upper on every axis; *finite 0 if a coordinate is not.
 PC_EXPORT int32_t pc_inside_box(const pc_context* context, const float* points, int64_t rows, const float* lower,

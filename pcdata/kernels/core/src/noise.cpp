@@ -26,16 +26,11 @@ struct Block {
   }
   // Write the rows that are kept one after another; returns how many.
   int64_t store_kept(float* points, const uint8_t* kept, int64_t count) const {
-    Block packed;
-    int64_t written = 0;
-    for (int a = 0; a < 3; ++a) {
-      int32_t words[kBlock + kLanes] = {};  // what is behind the kept ones is not written
-      written = rows::pack_rows<1>(reinterpret_cast<const char*>(axis[a]), kept, count, words);
-      std::memcpy(packed.axis[a], words, sizeof packed.axis[a]);
-    }
     float together[3 * kBlock];
-    packed.store(together, kBlock);
-    std::memcpy(points, together, static_cast<size_t>(3 * written) * sizeof(float));
+    store_rows(together, std::integral_constant<int, kBlock>());
+    int32_t packed[3 * kBlock + kLanes];
+    const int64_t written = rows::pack_rows<3>(reinterpret_cast<const char*>(together), kept, count, packed);
+    std::memcpy(points, packed, static_cast<size_t>(3 * written) * sizeof(float));
     return written;
   }
   void move(const double* matrix) {
@@ -95,6 +90,24 @@ struct Steps {
     }
   }
 };
+
+// mask (count,) = 1 at so many rows that a seed chooses, else 0.
+void choose_rows(int64_t count, int64_t wanted, uint64_t seed, uint8_t* mask) {
+  const int64_t few = std::min(wanted, count - wanted);
+  const uint8_t chosen = few == wanted;
+  std::memset(mask, 1 - chosen, static_cast<size_t>(count));
+  int64_t left = few;
+  for (uint64_t number = 0; left > 0; ++number) {
+    const uint64_t mixed = word(seed, number);
+    for (const uint64_t half : {mixed & 0xFFFFFFFFu, mixed >> 32}) {
+      uint8_t& place = mask[(half * static_cast<uint64_t>(count)) >> 32];
+      if (left > 0 && place != chosen) {
+        place = chosen;
+        --left;
+      }
+    }
+  }
+}
 
 }  // namespace
 }  // namespace pc::noise
@@ -156,21 +169,27 @@ PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, 
   (void)context;
   return guarded([&] {
     for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
-      const int64_t count = counts[cloud], few = std::min(wanted[cloud], count - wanted[cloud]);
-      const uint8_t chosen = few == wanted[cloud];
-      std::memset(mask, 1 - chosen, static_cast<size_t>(count));
-      int64_t left = few;
-      for (uint64_t number = 0; left > 0; ++number) {
-        const uint64_t mixed = word(static_cast<uint64_t>(seeds[cloud]), number);
-        for (const uint64_t half : {mixed & 0xFFFFFFFFu, mixed >> 32}) {
-          uint8_t& place = mask[(half * static_cast<uint64_t>(count)) >> 32];
-          if (left > 0 && place != chosen) {
-            place = chosen;
-            --left;
-          }
-        }
-      }
-      mask += count;
+      choose_rows(counts[cloud], wanted[cloud], static_cast<uint64_t>(seeds[cloud]), mask);
+      mask += counts[cloud];
+    }
+  });
+}
+
+PC_EXPORT int32_t pc_dropped_rows(const pc_context* context, const int64_t* keys, const int64_t* ptr,
+                                  int64_t num_clouds, double low, double high, uint8_t* mask, int64_t* kept_ptr) {
+  using namespace pc;
+  using namespace pc::noise;
+  (void)context;
+  return guarded([&] {
+    kept_ptr[0] = 0;
+    for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
+      const int64_t count = ptr[cloud + 1] - ptr[cloud];
+      const auto key = static_cast<uint64_t>(keys[cloud]);
+      const double part = low + (high - low) * (static_cast<double>(word(key, 0) >> 11) * 0x1p-53);
+      const auto dropped = static_cast<int64_t>(std::nearbyint(static_cast<double>(count) * part));
+      const int64_t kept = std::max(count - dropped, std::min<int64_t>(count, 1));
+      choose_rows(count, kept, word(key, 1) >> 2, mask + ptr[cloud]);
+      kept_ptr[cloud + 1] = kept_ptr[cloud] + kept;
     }
   });
 }

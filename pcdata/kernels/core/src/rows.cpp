@@ -107,6 +107,37 @@ PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, i
   });
 }
 
+PC_EXPORT int32_t pc_gather_kept(const pc_context* context, const int64_t* ptr, int64_t num_clouds, const uint8_t* kept,
+                                 const int64_t* kept_ptr, int64_t num_fields, const int64_t* sources,
+                                 const int64_t* row_bytes, const int64_t* picked) {
+  using namespace pc;
+  using namespace pc::rows;
+  return guarded([&] {
+    parallel_for(*context, num_clouds, 1, [&](int64_t first_cloud, int64_t last_cloud, int64_t) {
+      Run runs[kRowsPerPiece / 2];
+      for (int64_t cloud = first_cloud; cloud < last_cloud; ++cloud) {
+        const uint8_t* mask = kept + ptr[cloud];
+        const int64_t count = ptr[cloud + 1] - ptr[cloud];
+        for (int64_t f = 0; f < num_fields; ++f) {
+          const auto* source = reinterpret_cast<const char*>(sources[f * num_clouds + cloud]);
+          char* to = reinterpret_cast<char*>(picked[f]) + kept_ptr[cloud] * row_bytes[f];
+          if (row_bytes[f] == 12) {
+            copy_kept<3>(source, mask, 0, count, to);
+          } else if (row_bytes[f] == 4) {
+            copy_kept<1>(source, mask, 0, count, to);
+          } else {
+            for (int64_t begin = 0; begin < count; begin += kRowsPerPiece) {
+              const int64_t num_runs = find_runs(mask, begin, std::min(count, begin + kRowsPerPiece), runs);
+              copy_runs(source, row_bytes[f], runs, num_runs, to);
+              for (int64_t r = 0; r < num_runs; ++r) to += runs[r].length * row_bytes[f];
+            }
+          }
+        }
+      }
+    });
+  });
+}
+
 PC_EXPORT int32_t pc_take_rows(const pc_context* context, const int64_t* index, int64_t num_picked, int64_t rows,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
                                const int64_t* picked, int64_t* possible) {
