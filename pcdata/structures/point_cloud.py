@@ -31,6 +31,7 @@ from pcdata.structures.signals import told_signals
 from pcdata.structures.structure import checked_copy, derived
 from pcdata.structures.unbatched import Unbatched
 
+_FEW_MOTIONS = 4  # so many are looked at sooner than the core is called
 _SELECTED = {"points": "N 3", "ptr": "ptr N B"}
 
 
@@ -308,7 +309,7 @@ class PointCloud(CloudBatch):
         if tuple(matrices.shape[1:]) != (self.num_clouds, 4, 4):
             raise ShapeError(f"{where}: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrices.shape[1:])}")
         wide = matrices.to(dtype=torch.float64, device=self.device)
-        if not are_plain_motions(wide.detach()):
+        if len(matrices) * self.num_clouds <= _FEW_MOTIONS or not are_plain_motions(wide.detach()):
             for matrix in matrices:
                 check_affine(where, matrix)
         return wide
