@@ -350,7 +350,7 @@ def test_a_matrix_that_is_not_affine_moves_no_cloud(spoil, words, num_clouds):
     with pytest.raises(PoseError, match=rf"PointCloud.transformed: {words}"):
         cloud.transformed(spoil(matrix))
     with pytest.raises(PoseError, match=rf"PointCloud.with_facts_moved: {words}"):
-        cloud.with_facts_moved([matrix, spoil(matrix)])
+        cloud.with_facts_moved(torch.stack([matrix, spoil(matrix)]))
     cloud = dataclasses.replace(cloud, recorded_signals={})
     with pytest.raises(PoseError, match=rf"PointCloud: source_from_cloud: {words}"):
         dataclasses.replace(cloud, source_from_cloud=spoil(matrix))
