@@ -360,4 +360,4 @@ def test_a_matrix_that_is_not_affine_moves_no_cloud(spoil, words, num_clouds):
 
 def test_motions_of_other_clouds_move_none():
     with pytest.raises(ShapeError, match=r"PointCloud.with_facts_moved: matrix must be \(2, 4, 4\)"):
-        cloud_in_base((5, 4)).with_facts_moved([torch.eye(4, dtype=torch.float64)])
+        cloud_in_base((5, 4)).with_facts_moved(torch.eye(4, dtype=torch.float64)[None, None])
