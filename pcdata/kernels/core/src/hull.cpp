@@ -3,7 +3,7 @@
 
 #include "pc/threads.hpp"
 
-namespace pc::hull {
+namespace pc::outline {
 namespace {
 
 constexpr double kOff = 1e-12;  // of an edge's squared length: twice the area of the flattest triangle that counts
@@ -64,12 +64,12 @@ class Hull {
 };
 
 }  // namespace
-}  // namespace pc::hull
+}  // namespace pc::outline
 
 PC_EXPORT int32_t pc_convex_hull(const pc_context* context, const double* points, int64_t count, int64_t* corners,
                                  int64_t* num_corners) {
   using namespace pc;
-  using namespace pc::hull;
+  using namespace pc::outline;
   return guarded([&] {
     *num_corners = 0;
     if (count == 0) return;

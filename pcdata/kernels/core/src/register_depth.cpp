@@ -12,7 +12,7 @@ namespace pc::images {
 namespace {
 
 constexpr int64_t kDepthRowsPerPiece = 64;  // of the depth image: two more are projected for every piece
-constexpr int64_t kPixelsPerPiece = 1 << 16;
+constexpr int64_t kColorPixelsPerPiece = 1 << 16;
 constexpr uint64_t kEmpty = ~uint64_t{0};  // as an index: -1
 
 // The corners above or below a row of pixels, outer ones included; each (width + 1,).
@@ -86,7 +86,7 @@ void cut_cells(const float* __restrict center, const float* __restrict half, con
 
 // The nearest reading of every color pixel so far: the bits of its depth, which are ordered as positive floats are,
 // above its index. The smallest stays, so the order of painting does not matter.
-struct ZBuffer {
+struct KeyBuffer {
   uint64_t* nearest;
   int64_t height, width;
   bool shared;  // by several threads
@@ -130,7 +130,7 @@ struct RowBuffers {
 };
 
 // Paint the rows [first, last) of a view. Returns false where `project` does.
-bool paint_rows(const DepthView& view, int64_t first, int64_t last, float max_jump, const ZBuffer& buffer,
+bool paint_rows(const DepthView& view, int64_t first, int64_t last, float max_jump, const KeyBuffer& buffer,
                 const RowBuffers& own) {
   const int64_t width = view.width;
   bool possible = true;
@@ -238,8 +238,8 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
       float* image = registered + number * color_pixels;
       auto* keys = reinterpret_cast<uint64_t*>(pixel_index + number * color_pixels);
       uint8_t* marks = occluding + number * color_pixels;
-      const ZBuffer buffer{keys, color_height, color_width, threads > 1};
-      parallel_for(*context, color_pixels, kPixelsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      const KeyBuffer buffer{keys, color_height, color_width, threads > 1};
+      parallel_for(*context, color_pixels, kColorPixelsPerPiece, [&](int64_t first, int64_t last, int64_t) {
         std::fill(keys + first, keys + last, kEmpty);
         std::fill(marks + first, marks + last, uint8_t{0});
       });
@@ -247,7 +247,7 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
         if (!paint_rows(view, first, last, jump, buffer, rows_of_threads[static_cast<size_t>(thread)]))
           all_possible.store(false, std::memory_order_relaxed);
       });
-      parallel_for(*context, color_pixels, kPixelsPerPiece,
+      parallel_for(*context, color_pixels, kColorPixelsPerPiece,
                    [&](int64_t first, int64_t last, int64_t) { read_keys(keys, image, first, last); });
       parallel_for(*context, height, kDepthRowsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
         for (int64_t row = first; row < last; ++row)
