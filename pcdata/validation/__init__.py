@@ -2,7 +2,8 @@
 
 from pcdata.validation.capture_check import CHECKS, Check, register_check
 from pcdata.validation.capture_limits import CaptureLimits
-from pcdata.validation.drift import CameraDrift, DriftLimits, DriftPoint, DriftResult, measure_drift
+from pcdata.validation.drift import measure_drift
+from pcdata.validation.drift_result import CameraDrift, DriftLimits, DriftPoint, DriftResult
 from pcdata.validation.grading import Grade, Grading
 from pcdata.validation.overlap import verify_overlap
 from pcdata.validation.overlap_result import CameraOverlap, OverlapLimits, OverlapResult, PairOverlap

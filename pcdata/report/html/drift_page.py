@@ -7,7 +7,7 @@ import numpy as np
 from pcdata.report.html.charts import time_line
 from pcdata.report.html.page import Section, page_of
 from pcdata.report.html.text import shown
-from pcdata.validation.drift import MOVING, CameraDrift, DriftResult
+from pcdata.validation.drift_result import MOVING, CameraDrift, DriftResult
 from pcdata.verdicts import Verdict
 
 _COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
