@@ -20,6 +20,7 @@ from pcdata.files import scratch
 from pcdata.io.clouds.ply import write_ply
 from pcdata.structures import Episode
 from tests.build.test_builder import FORMATS, Clouds, cloud, tree
+from tests.forks import ended, forked
 
 SIZE = 2
 CONFIG = "cloud: [Center]\noutput: {format: FORMAT, shard_size: 2}"
@@ -282,11 +283,12 @@ def test_what_dead_processes_left_is_taken_over_with_locks_and_without(tmp_path,
     if not locks:  # as on some network file systems
         monkeypatch.setattr(scratch, "try_lock", lambda path: (None, False))
     build(tmp_path / "whole")
-    pid = os.fork()
-    if not pid:
-        build(tmp_path / "out", progress=lambda done, *_: os.kill(os.getpid(), signal.SIGKILL) if done == 6 else None)
-        os._exit(1)
-    os.waitpid(pid, 0)
+
+    def dies(done: int, *_: object) -> None:
+        if done == 6:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    assert ended(forked(lambda: build(tmp_path / "out", progress=dies) and 1)) == -signal.SIGKILL
     left = [path.name for path in (tmp_path / ".out.building").rglob("*")]
     assert any(name.startswith("all.") for name in left)
     assert any(name.startswith(".00002.partial-") for name in left)
@@ -312,14 +314,15 @@ def test_builds_killed_at_any_moment_end_in_the_same_bytes(tmp_path):
     build(tmp_path / "whole", source=_Slow())  # whose class is in the identity
     for workers in (0, 2):
         for _ in range(4):
-            pid = os.fork()
-            if not pid:
+
+            def builds(workers: int = workers) -> None:
                 os.setpgid(0, 0)
-                build(tmp_path / "out", workers=workers, source=_Slow())
-                os._exit(0)
+                build(tmp_path / "out", workers=workers, source=_Slow(), overwrite=True)
+
+            pid = forked(builds)
             time.sleep(random.uniform(0.02, 0.25))
             os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
+            assert ended(pid) in (0, -signal.SIGKILL)  # 0: it was done before
             while scratch.living_claims(tmp_path / ".out.building" / "claims"):
                 time.sleep(0.02)  # forked workers hold the lock of their parent, until they find that it is gone
         build(tmp_path / "out", workers=workers, source=_Slow(), overwrite=True)
@@ -330,7 +333,7 @@ def test_builds_killed_at_any_moment_end_in_the_same_bytes(tmp_path):
 
 class _Slow(Counted):
     def load(self, sample_id):
-        time.sleep(0.02)
+        time.sleep(0.04)
         return super().load(sample_id)
 
 

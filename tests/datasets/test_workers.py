@@ -17,6 +17,7 @@ from pcdata.io.store.cloud_record import record_from_cloud
 from pcdata.io.store.sample_index import Sample
 from pcdata.io.store.stores import STORES
 from pcdata.transforms import Compose, RandomJitter
+from tests.forks import ended, forked
 from tests.io.forged import edit_samples, first_shard, write_manifest
 from tests.loaders import packed_loader
 
@@ -146,12 +147,13 @@ def test_an_hdf5_handle_opened_before_the_fork_corrupts_nothing(big_h5):
 def test_a_child_that_closes_an_inherited_handle_leaves_the_parent_s_alone(caches):
     dataset = CachedCloudDataset(caches["hdf5"], augment=None)
     wanted = dataset[0].points
-    child = os.fork()
-    if child == 0:  # pragma: no cover
+
+    def closes() -> int:
         dataset._shards.close()
         dataset._shards.close()
-        os._exit(0 if torch.equal(dataset[0].points, wanted) else 1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        return int(not torch.equal(dataset[0].points, wanted))
+
+    assert ended(forked(closes)) == 0
     assert torch.equal(dataset[0].points, wanted)
     assert dataset[5].num_points == 64
 

@@ -13,6 +13,7 @@ import pytest
 from pcdata.errors import CacheError, ConfigError, MissingExtraError
 from pcdata.files import urls
 from pcdata.files.urls import UrlFolder, is_url, path_of
+from tests.forks import ended, forked
 
 
 @pytest.fixture
@@ -95,11 +96,12 @@ def test_it_travels_as_its_url_and_connects_anew(folder):
     copy = pickle.loads(pickle.dumps(folder))
     assert copy._opened is None
     assert copy.read("a.bin", 1, 2) == b"\1"
-    child = os.fork()
-    if child == 0:  # pragma: no cover
+
+    def reads() -> int:
         folder.read("a.bin", 1, 2)
-        os._exit(0 if folder._opened[0] == os.getpid() else 1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        return int(folder._opened[0] != os.getpid())
+
+    assert ended(forked(reads)) == 0
 
 
 def test_a_password_in_a_url_is_not_shown(folder):

@@ -110,7 +110,7 @@ def test_every_name_comes_back_as_it_was(name):
             "- RandomApply: {step: {RandomFlip: {about: me}}}",
             "p.yaml:1:44: RandomFlip.about: Input should be 'origin' or 'centroid' (got 'me')",
         ),
-        ("- RandomApply: {step: Flip}", "p.yaml:1:23: unknown transform 'Flip'; known: Center, Cl"),
+        ("- RandomApply: {step: Flip}", "p.yaml:1:23: unknown transform 'Flip'; known: BilateralFilterDepth, Center"),
         ("- MaskDepth: {near: 1, near: 2}", "p.yaml:1:24: MaskDepth: 'near' is given twice"),
         ("- Center: &c\n- *c", "p.yaml:2:3: YAML aliases (*name) are not allowed; write the value out"),
         (

@@ -32,6 +32,8 @@ OWN_CHECKS = {"estimate_normals", "ransac_plane"}
 OWN_CHECKS |= {"f_score", "hausdorff_distance", "interpolate_features"}
 # Its second step alone, below.
 OWN_CHECKS |= {"neighborhood_covariance"}
+# Neighbors that the fuzzed searches find, looked at in torch.
+OWN_CHECKS |= {"boundary_mask", "iterate_closest_points"}
 # Planes that ransac_plane's steps find, chosen among in torch; a surface whose steps are fuzzed below.
 OWN_CHECKS |= {"segment_planes", "supporting_plane", "table_surface"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
