@@ -119,8 +119,27 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "count_near_planes", "two", lambda: ((cloud, ptr, planes, distance), {})
     yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
     yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
+    yield from _calls_of_motions()
     yield from _calls_of_searches()
     yield from _calls_of_images()
+
+
+def _calls_of_motions() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
+    keys = torch.arange(-3, 4) * 0x1234567
+    # Step, word, kind (an entry, a sign, a turn about an axis), and the numbers of each.
+    rows = [(0, 0, 2, -3.0, 3.0, 0.6, 0.8, 0), (1, 1, 0, 0.9, 1.1, 0, 0, 0), (1, 2, 1, 0.5, 0, 2, 0, 0)]
+    yield "draw_motions", "seven", lambda: ((keys, torch.tensor(rows, dtype=torch.float64), 2), {})
+    yield "led_back", "two steps", lambda: ((poses(2), torch.stack([poses(4)[2:], poses(6)[4:]])), {})
+    yield "are_plain_motions", "poses", lambda: ((poses(3),), {})
+    yield "dropped_rows", "two", lambda: ((keys[:2], ptr_of(50, 40), 0.1, 0.6), {})
+    kept = torch.arange(20) % 3 > 0, torch.tensor([0, 5, 13])
+    addresses = torch.tensor([_ROWS.ctypes.data, _ROWS.ctypes.data + 8 * 12])
+    for name, rest in (("all", None), ("thinned", kept)):
+        yield "gather_kept", name, partial(_gathered, addresses, rest)
+
+
+def _gathered(addresses: Tensor, kept: tuple[Tensor, Tensor] | None) -> Arguments:
+    return ({"points": torch.zeros(20, 3)}, {"points": addresses}, ptr_of(8, 12), kept), {}
 
 
 def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:

@@ -10,10 +10,10 @@ import pytest
 
 from pcdata.calibration import CalibrationLimits
 from pcdata.errors import ConfigError
-from pcdata.validation import CaptureLimits, OverlapLimits
+from pcdata.validation import CaptureLimits, DriftLimits, OverlapLimits
 from pcdata.verdicts import Finding, Limits, Verdict, at_least, at_most, graded, judged, worst
 
-TABLES = (CaptureLimits, OverlapLimits, CalibrationLimits)
+TABLES = (CaptureLimits, OverlapLimits, CalibrationLimits, DriftLimits)
 
 
 def test_unknown_is_worse_than_a_pass_and_better_than_a_warning():

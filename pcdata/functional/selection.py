@@ -183,8 +183,8 @@ def over_hull(
     margin: float,
 ) -> Tensor:  # (n,) bool
     """Mark points over or under the convex hull of base in a plane, or within ``margin`` of the lines of its edges."""
-    axes = plane_axes(plane)
-    flat, flat_base = points.double() @ axes, base.double() @ axes
+    axes = plane_axes(plane.detach())
+    flat, flat_base = points.detach().double() @ axes, base.detach().double() @ axes
     corners = flat_base[hull_rows(flat_base)]
     if len(corners) < 3:
         return torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -76,7 +76,13 @@ def test_a_gradient_comes_through_the_tree():
     assert bool((found[0] != 0).any())
 
 
-_SEARCHES = ("core_point_mask", "neighborhood_covariance", "radius_neighbors")
+_SEARCHES = (
+    "boundary_mask",
+    "core_point_mask",
+    "iterate_closest_points",
+    "neighborhood_covariance",
+    "radius_neighbors",
+)
 
 
 def test_the_tree_serves_every_search():
