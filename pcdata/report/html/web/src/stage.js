@@ -162,6 +162,7 @@ export class Stage {
 
   /** Where a point is drawn: [x, y] in CSS pixels of the canvas. */
   drawnAt(place) {
+    this.camera.updateMatrixWorld(); // it may have been moved since the last frame
     const at = new Vector3(...place).project(this.camera);
     return [((at.x + 1) / 2) * this.canvas.clientWidth, ((1 - at.y) / 2) * this.canvas.clientHeight];
   }
