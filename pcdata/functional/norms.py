@@ -23,6 +23,7 @@ Searches = tuple[Callable[..., tuple[Tensor, Tensor]], Callable[..., tuple[Tenso
 
 _PAIRS = 1 << 20  # looked at together
 _QUERIES = 1 << 15  # whose candidates are listed together
+_LOOKED_AT = 16  # straight nearest at least: the bound of a few more saves most candidates where clouds lie apart
 # Of straight distances, by which float32 sums of up to 4 columns err by far less.
 _MARGIN = 1 + 1e-5
 # Columns up to which straight balls hold few points more: of 4 the ball around a cube has 5 times its volume.
@@ -100,10 +101,18 @@ def _of_candidates(
     own = {"queries": queries, "queries_ptr": queries_ptr}
     wider = _MARGIN * (1.0 if norm == "l1" else math.sqrt(points.shape[1]))
     largest = float(limit.max()) if len(limit) else torch.inf
-    index, _ = nearest_rows(points, ptr, k, **own, radius=wider * largest if largest < 1e19 else None, backend=backend)
-    index, distance = _measured(points, norm, queries, index)
-    # The k straight nearest bound the distance within which all k lie; where there are fewer, these are all.
-    for some in distance[:, -1].isfinite().nonzero().squeeze(1).split(_QUERIES):
+    looked_at, radius = max(k, _LOOKED_AT), wider * largest if largest < 1e19 else None
+    straight, _ = nearest_rows(points, ptr, looked_at, **own, radius=radius, backend=backend)
+    index, distance = _measured(points, norm, queries, straight)
+    index, distance = index[:, :k].contiguous(), distance[:, :k].contiguous()
+    # The straight nearest bound the distance within which all k lie; where there are fewer, these are all, and where
+    # the last of them is beyond that bound, no other is within it.
+    last = straight[:, -1]
+    is_full = last < len(points)
+    beyond = torch.full((len(queries),), torch.inf, dtype=torch.float64, device=points.device)
+    beyond[is_full] = (queries[is_full].double() - points[last[is_full]].double()).square().sum(1).sqrt()
+    bound = torch.minimum(distance[:, -1], limit).double() * wider
+    for some in (distance[:, -1].isfinite() & (beyond < bound)).nonzero().squeeze(1).split(_QUERIES):
         bounds = torch.searchsorted(some, queries_ptr.contiguous())
         reach = (torch.minimum(distance[some, -1], limit[some]) * wider).clamp(min=_LEAST_RADIUS, max=1e19)
         row, _, found_ptr = rows_within(points, ptr, reach, queries=queries[some], queries_ptr=bounds, backend=backend)
