@@ -153,6 +153,9 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
         yield name, "own", lambda more=more: ((cloud, ptr, *more, 0.03), {"exclude_self": True})
         yield name, "queries", lambda more=more: ((*searched, *more, 0.04), asked)
     found = functional.knn(cloud, ptr, k=7)[0]
+    reach = torch.full((len(cloud),), torch.inf)
+    for norm in ("l1", "linf"):
+        yield "nearest_by_norm", norm, lambda norm=norm: ((cloud, ptr, norm, 4, cloud, ptr, reach), {})
     yield "neighborhood_shapes", "two", lambda: ((cloud, found, cloud), {})
     yield "sorted_rows", "two", lambda: ((cloud, ptr), {})
     yield "density_clusters", "two", lambda: ((cloud, ptr, 0.03, 4, None), {})

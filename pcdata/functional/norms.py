@@ -1,7 +1,7 @@
 """Neighbors by other distances than the straight one: sums of the coordinates' differences, or the largest of them.
 
-A ball of such a distance lies within a straight ball, so the compiled searches find all that could be a neighbor, and
-these are measured and sorted again. All answers are those of looking at every pair.
+The core has trees for them. Other backends search straight: a ball of such a distance lies within a straight ball, so
+all that could be a neighbor is found, measured and sorted again. All answers are those of looking at every pair.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import REFERENCE
+from pcdata.contracts.dispatch import REFERENCE, inner
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 
 NORMS = ("l2", "l1", "linf")
@@ -55,14 +55,25 @@ def nearest_in_norm(
     if queries is None or queries_ptr is None:
         queries, queries_ptr = points, ptr
     limit = _limits(math.inf if radius is None else radius, queries)
-    if backend == REFERENCE or points.shape[1] > _MOST_COLUMNS:
-        return _of_all_pairs(points, ptr, norm, k, queries, queries_ptr, limit)
+    asked = points, ptr, norm, k, queries, queries_ptr, limit
+    if backend in (REFERENCE, "cpu") or points.shape[1] > _MOST_COLUMNS:
+        return nearest_by_norm(*asked, backend=backend)
     return _of_candidates(points, ptr, norm, searches, k, queries, queries_ptr, limit, backend)
 
 
-def _of_all_pairs(
-    points: Tensor, ptr: Tensor, norm: str, k: int, queries: Tensor, queries_ptr: Tensor, limit: Tensor
+@inner
+def nearest_by_norm(
+    points: Tensor,
+    ptr: Tensor,
+    norm: str,
+    k: int,
+    queries: Tensor,
+    queries_ptr: Tensor,
+    limit: Tensor,  # (Q,) float32: neighbors have d < limit
+    *,
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
+    """Look at every pair; rows of equal distance ascend."""
     index = torch.full((len(queries), k), len(points), dtype=torch.int64, device=points.device)
     distance = torch.full((len(queries), k), torch.inf, dtype=torch.float32, device=points.device)
     for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):

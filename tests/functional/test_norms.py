@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from pcdata import functional as F
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import BackendError, ConfigError
+from pcdata.functional.norms import nearest_by_norm
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import seeded
 
@@ -94,3 +95,24 @@ def test_unknown_norms_are_refused():
     if why_unavailable("torch_cluster") is None:
         with pytest.raises(BackendError, match="norm"):
             F.ball_query(points, radius=0.1, max_neighbors=2, norm="l1", backend="torch_cluster")
+
+
+@pytest.mark.skipif(why_unavailable("cpu") is not None, reason="the compiled core is not there")
+@pytest.mark.parametrize("width", [1, 2, 3, 5, 9, 17])
+@pytest.mark.parametrize("norm", ["l1", "linf"])
+def test_the_trees_give_the_bits_of_looking_at_every_pair(norm, width):
+    """Ties, repeats, zeros of both signs, empty clouds, more neighbors than points, limits of each query."""
+    generator = torch.Generator().manual_seed(width)
+    points = torch.randint(-3, 4, (400, width), generator=generator).float() * 0.25
+    points = torch.where(torch.rand(points.shape, generator=generator) < 0.2, -0.0, points)
+    points[200:] += 1e-3 * torch.randn(200, width, generator=generator)
+    queries = points[torch.randperm(400, generator=generator)[:90]] + 0.125
+    ptr, queries_ptr = torch.tensor([0, 150, 150, 155, 400]), torch.tensor([0, 30, 40, 60, 90])
+    limit = torch.rand(90, generator=generator) * width
+    limit[::3] = torch.inf
+    for k in (1, 7, 40):
+        asked = points, ptr, norm, k, queries, queries_ptr, limit
+        index, distance = nearest_by_norm(*asked, backend="cpu")
+        wanted, apart = nearest_by_norm(*asked, backend="torch")
+        assert torch.equal(index, wanted)
+        assert torch.equal(distance.view(torch.int32), apart.view(torch.int32))

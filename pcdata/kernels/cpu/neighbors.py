@@ -21,6 +21,7 @@ from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.metrics import mean_per_cloud
 from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, widest
+from pcdata.functional.norms import NORMS
 from pcdata.functional.radius import largest_squared, require_cells
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.kernels.cpu.native import call, room, room_for
@@ -45,13 +46,29 @@ def nearest_rows(
 ) -> tuple[Tensor, Tensor]:
     """Run the reference's contract in the core; a radius per query is cut out of the largest in its wide trees."""
     if points.shape[1] not in (0, 3) and max(k, len(points)) <= _MAX_ROWS:
-        found = _wide_neighbors(points, ptr, k, widest(radius), queries, queries_ptr)
+        found = _wide_neighbors(points, ptr, k, _limit(widest(radius)), queries, queries_ptr)
         return cut_to_radii(found, points, queries, radius) if isinstance(radius, Tensor) else found
     if k > _MAX_ROWS or points.shape[1] != 3:
         others = {"queries": queries, "queries_ptr": queries_ptr, "radius": radius, "grid": grid}
         fallen: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **others)
         return fallen
     return _neighbors(points, ptr, k, radius, queries, queries_ptr, grid)
+
+
+@kernel("nearest_by_norm", "cpu")
+def nearest_by_norm(
+    points: Tensor, ptr: Tensor, norm: str, k: int, queries: Tensor, queries_ptr: Tensor, limit: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Search in the wide trees within the largest limit, then leave out what is beyond each query's own."""
+    if not points.shape[1] or max(k, len(points)) > _MAX_ROWS:
+        fallen: tuple[Tensor, Tensor] = INNER["nearest_by_norm"].reference(
+            points, ptr, norm, k, queries, queries_ptr, limit
+        )
+        return fallen
+    most = min(float(limit.max()) if len(limit) else 0.0, float(torch.finfo(torch.float32).max))
+    index, distance = _wide_neighbors(points, ptr, k, most, queries, queries_ptr, norm)
+    outside = distance >= limit[:, None]
+    return index.masked_fill_(outside, len(points)), distance.masked_fill_(outside, torch.inf)
 
 
 @kernel("rows_within", "cpu")
@@ -275,9 +292,15 @@ def _neighbors(
 
 
 def _wide_neighbors(
-    points: Tensor, ptr: Tensor, k: int, radius: float | None, queries: Tensor | None, queries_ptr: Tensor | None
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    limit: float,
+    queries: Tensor | None,
+    queries_ptr: Tensor | None,
+    norm: str = "l2",
 ) -> tuple[Tensor, Tensor]:
-    """Search in trees of boxes of any number of columns."""
+    """Search in trees of boxes of any number of columns; ``limit`` is of squares of straight distances."""
     points, ptr = _rows(points, ptr)
     num_queries = len(points)
     if queries is not None:
@@ -286,7 +309,7 @@ def _wide_neighbors(
         num_queries = len(queries)
     index, distance = room((num_queries, k), torch.int64), room((num_queries, k), torch.float32)
     arrays = points, ptr, len(ptr) - 1, points.shape[1], queries, queries_ptr
-    call("pc_wide_neighbors", *arrays, k, _limit(radius), index, distance)
+    call("pc_wide_neighbors", *arrays, k, limit, NORMS.index(norm), index, distance)
     return index, distance
 
 

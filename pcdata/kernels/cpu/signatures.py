@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x68B39ABDA423279
+INTERFACE_NUMBER = 0xB36838B5ED45661
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -71,7 +71,7 @@ pc_sample_depth: float* depth, int64 views, int64 height, int64 width, double* p
 pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
     float* limits, int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
 pc_wide_neighbors: float* points, int64* ptr, int64 num_clouds, int64 width, float* queries, int64* queries_ptr, int64
-    k, double limit, int64* index, float* distance
+    k, double limit, int64 norm, int64* index, float* distance
 pc_index_points: float* points, int64* ptr, int64 num_clouds, int64 copies, float* leaves, int64* leaf_ptr, float*
     boxes, int64* kept
 pc_indexed_neighbors: float* leaves, int64* leaf_ptr, int64 num_clouds, float* boxes, int64 num_points, float* queries,

@@ -287,10 +287,11 @@ PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, c
                                const float* limits, const int64_t* pixel, int64_t width, const double* camera,
                                int64_t* index, float* distance, int64_t* count);
 
-// The same for points (N, width) and queries (Q, width), without a grid; rows are less than 2^32 - 1.
+// The same for points (N, width) and queries (Q, width), without a grid; rows are less than 2^32 - 1. norm: 0 straight
+// distances, 1 sums of the columns' differences, 2 the largest of them; of those, limit is of the distance itself.
 PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* points, const int64_t* ptr,
                                     int64_t num_clouds, int64_t width, const float* queries, const int64_t* queries_ptr,
-                                    int64_t k, double limit, int64_t* index, float* distance);
+                                    int64_t k, double limit, int64_t norm, int64_t* index, float* distance);
 
 // Points sorted into leaves (sum of ceil(n / 16), 64) with leaf_ptr (num_clouds + 1,), and boxes over them, 96 floats
 // for every sixteen leaves, boxes of sixteen and so on of each cloud: both aligned to 64 bytes. Of consecutive equal

@@ -1,5 +1,6 @@
 // Nearest neighbors among points of any number of columns, exact, on ragged batches.
 #include <cmath>
+#include <type_traits>
 
 #include "pc/neighbors/nearest_keys.hpp"
 #include "pc/wide/search.hpp"
@@ -14,14 +15,15 @@ using neighbors::NearKey;
 
 struct Wanted {
   int64_t k;
-  float limit;      // neighbors have d2 <= limit
+  float limit;      // neighbors have d <= limit, or d2 of straight ones
   int64_t missing;  // the row of a neighbor that is not there
   int64_t* index;   // (Q, k)
   float* distance;  // (Q, k)
 };
 
-template <class Nearest>
-void write(const Wanted& wanted, const QueryGroup& group, const uint32_t* rows, const Nearest& nearest) {
+template <class Norm, class Nearest>
+void write(const Wanted& wanted, const QueryGroup<Norm>& group, const uint32_t* rows, const Nearest& nearest) {
+  constexpr bool kIsSquared = std::is_same_v<Norm, Straight>;
   for (PackMask left = group.active(); left != 0; left &= left - 1) {
     const int lane = __builtin_ctz(left);
     const int64_t start = int64_t{rows[lane]} * wanted.k;
@@ -29,12 +31,13 @@ void write(const Wanted& wanted, const QueryGroup& group, const uint32_t* rows, 
       const uint64_t key = nearest.key(static_cast<int>(i), lane);
       const bool real = NearKey::id(key) != kNoId;
       wanted.index[start + i] = real ? int64_t{NearKey::id(key)} : wanted.missing;
-      wanted.distance[start + i] = real ? std::sqrt(NearKey::squared(key)) : kInfinity;
+      const float found = NearKey::squared(key);
+      wanted.distance[start + i] = !real ? kInfinity : kIsSquared ? std::sqrt(found) : found;
     }
   }
 }
 
-template <class Nearest>
+template <class Norm, class Nearest>
 void find(const pc_context& context, const std::vector<Tree>& points, const std::vector<Tree>& queries, int64_t width,
           const Wanted& wanted) {
   struct Work {
@@ -46,17 +49,24 @@ void find(const pc_context& context, const std::vector<Tree>& points, const std:
     for (int64_t leaf = 0; leaf < queries[b].num_leaves(); ++leaf) work.push_back({b, leaf});
   // A group of sixteen looks at every leaf of its cloud where nothing can be passed by: a few milliseconds.
   parallel_for(context, static_cast<int64_t>(work.size()), 8, [&](int64_t begin, int64_t end, int64_t) {
-    QueryGroup group(width);
+    QueryGroup<Norm> group(width);
     Nearest nearest;
     for (int64_t i = begin; i < end; ++i) {
       const Work& one = work[static_cast<size_t>(i)];
       group.take(queries[one.cloud], one.leaf);
       nearest.start(static_cast<int>(wanted.k), group.limits(wanted.limit));
-      Search<Nearest>(points[one.cloud], group, nearest).run();
+      Search<Norm, Nearest>(points[one.cloud], group, nearest).run();
       nearest.finish();
       write(wanted, group, queries[one.cloud].rows(one.leaf), nearest);
     }
   });
+}
+
+template <class Norm>
+void find_by(const pc_context& context, const std::vector<Tree>& points, const std::vector<Tree>& queries,
+             int64_t width, const Wanted& wanted) {
+  const auto search = wanted.k <= NearestKeys::kMax ? find<Norm, NearestKeys> : find<Norm, NearestMany>;
+  search(context, points, queries, width, wanted);
 }
 
 }  // namespace
@@ -64,7 +74,7 @@ void find(const pc_context& context, const std::vector<Tree>& points, const std:
 
 PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* points, const int64_t* ptr,
                                     int64_t num_clouds, int64_t width, const float* queries, const int64_t* queries_ptr,
-                                    int64_t k, double limit, int64_t* index, float* distance) {
+                                    int64_t k, double limit, int64_t norm, int64_t* index, float* distance) {
   using namespace pc;
   using namespace pc::wide;
   return guarded([&] {
@@ -73,7 +83,7 @@ PC_EXPORT int32_t pc_wide_neighbors(const pc_context* context, const float* poin
     std::vector<Tree> own;
     if (queries != nullptr) own = build_trees(*context, scratch, {queries, queries_ptr, num_clouds, width});
     const Wanted wanted{k, static_cast<float>(limit), ptr[num_clouds], index, distance};
-    const auto search = k <= NearestKeys::kMax ? find<NearestKeys> : find<NearestMany>;
+    const auto search = norm == 0 ? find_by<Straight> : norm == 1 ? find_by<Summed> : find_by<Largest>;
     search(*context, trees, queries == nullptr ? trees : own, width, wanted);
   });
 }

@@ -12,7 +12,23 @@ namespace pc::wide {
 using neighbors::Ids;
 using neighbors::kOff;
 
+// What the differences of the columns add up to: a distance, or its square. Never less than over fewer columns.
+struct Straight {
+  static FloatPack add(const FloatPack& sum, const FloatPack& difference) { return sum + difference * difference; }
+};
+struct Summed {  // the sum of their sizes
+  static FloatPack add(const FloatPack& sum, const FloatPack& difference) {
+    return sum + maximum(difference, FloatPack(0.0F) - difference);
+  }
+};
+struct Largest {
+  static FloatPack add(const FloatPack& sum, const FloatPack& difference) {
+    return maximum(sum, maximum(difference, FloatPack(0.0F) - difference)) + FloatPack(0.0F);  // never -0
+  }
+};
+
 // Sixteen queries, one per lane, and the box around them.
+template <class Norm>
 class QueryGroup {
  public:
   explicit QueryGroup(int64_t width)
@@ -46,7 +62,7 @@ class QueryGroup {
     return FloatPack::load(value);
   }
 
-  // Squared gaps between the box of the group and sixteen boxes.
+  // Gaps between the box of the group and sixteen boxes, as Norm has distances.
   FloatPack gaps(const Columns& low, const Columns& high) const {
     FloatPack sum(0.0F);
     for (size_t column = 0; column < columns_.size(); ++column) {
@@ -54,7 +70,7 @@ class QueryGroup {
       const FloatPack gap = maximum(maximum(FloatPack::load(low[c]) - FloatPack(high_[column]),
                                             FloatPack(low_[column]) - FloatPack::load(high[c])),
                                     FloatPack(0.0F));
-      sum = sum + gap * gap;
+      sum = Norm::add(sum, gap);
     }
     return sum;
   }
@@ -67,7 +83,7 @@ class QueryGroup {
       const FloatPack& at = columns_[column];
       const FloatPack gap =
           maximum(maximum(FloatPack(low[c][slot]) - at, at - FloatPack(high[c][slot])), FloatPack(0.0F));
-      sum = sum + gap * gap;
+      sum = Norm::add(sum, gap);
     }
     return less_equal(sum, reach);
   }
@@ -81,10 +97,11 @@ class QueryGroup {
 // Walks a tree from its root, the nearest boxes first. A box is passed by only when its computed gap exceeds what is
 // wanted: a gap takes the operations of a point's distance in the same order and rounding is monotone, so it never
 // exceeds the computed distance of a point inside. So do sums over the first few columns.
-template <class Nearest>
+template <class Norm, class Nearest>
 class Search {
  public:
-  Search(const Tree& tree, const QueryGroup& group, Nearest& nearest) : tree_(tree), group_(group), nearest_(nearest) {}
+  Search(const Tree& tree, const QueryGroup<Norm>& group, Nearest& nearest)
+      : tree_(tree), group_(group), nearest_(nearest) {}
 
   void run() {
     if (tree_.num_leaves() > 0) descend(tree_.num_levels() - 1, 0);
@@ -135,7 +152,7 @@ class Search {
         const size_t end = std::min(width, column + kTogether);
         for (; column < end; ++column) {
           const FloatPack offset = FloatPack(points[static_cast<int64_t>(column)][i]) - group_.column(column);
-          squared = squared + offset * offset;
+          squared = Norm::add(squared, offset);
         }
         if (!nearest_.wants(squared)) break;
         if (column < width) continue;
@@ -147,7 +164,7 @@ class Search {
   }
 
   const Tree& tree_;
-  const QueryGroup& group_;
+  const QueryGroup<Norm>& group_;
   Nearest& nearest_;
 };
 
