@@ -9,7 +9,7 @@ from typing import Any
 
 from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import SENSORS
-from pcdata.cli.options import add_capture_options, open_captures
+from pcdata.cli.options import add_capture_options, given_options, open_captures
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -42,17 +42,33 @@ def _limits(arguments: argparse.Namespace) -> Any:
     return CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
 
 
+def _is_dataset(arguments: argparse.Namespace) -> bool:
+    """Whether a build wrote what is at the path; refuse then what says how captures are read and gone through."""
+    from pcdata.errors import ConfigError
+    from pcdata.io.store.manifest import Manifest
+
+    if not Manifest.is_one(Path(arguments.path)):
+        return False
+    of_captures = ("config", "limit", "sensor", "kind", "only", "skip", "skip_file", "skip_refused")
+    given = [name for name in of_captures if getattr(arguments, name, None)] + [*given_options(arguments)]
+    if given:
+        raise ConfigError(
+            f"{', '.join(given)}: of captures, and {arguments.path} is a dataset, whose clouds are looked at as they "
+            "are, with the steps that made them; leave it out, or give the captures"
+        )
+    return True
+
+
 def _report(arguments: argparse.Namespace) -> int:
     from pcdata.build import load_config
     from pcdata.files.opening import replacing
     from pcdata.io.sources.capture_source import check_apart
-    from pcdata.io.store.manifest import Manifest
     from pcdata.report.html.capture_report import capture_page
     from pcdata.report.html.dataset_report import dataset_page
 
     check_apart("--out", arguments.out, arguments.path)
     with replacing("report --out", arguments.out) as temporary, ProgressBar("report") as progress:
-        if Manifest.is_one(Path(arguments.path)):
+        if _is_dataset(arguments):
             page, grading = dataset_page(arguments.path, num_shown=arguments.samples, progress=progress)
         else:
             page, grading = capture_page(
@@ -74,16 +90,20 @@ def _report(arguments: argparse.Namespace) -> int:
 def _grade(arguments: argparse.Namespace) -> int:
     from pcdata.files.opening import replacing
     from pcdata.io.sources.capture_source import episodes_of
+    from pcdata.report.html.dataset_report import dataset_page
     from pcdata.validation import validate_source
     from pcdata.validation.grading import LETTERS, Grading
 
-    source = open_captures(arguments.path, arguments, limit=arguments.limit)
-    grading = Grading(source.ids, episodes_of(source))
     with ProgressBar("grade") as progress:
-        for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
-            grading.add(report)
-            if not report.whole:
-                progress(done, len(source.ids), report.sample_id)
+        if _is_dataset(arguments):
+            _, grading = dataset_page(arguments.path, num_shown=1, progress=progress)
+        else:
+            source = open_captures(arguments.path, arguments, limit=arguments.limit)
+            grading = Grading(source.ids, episodes_of(source))
+            for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
+                grading.add(report)
+                if not report.whole:
+                    progress(done, len(source.ids), report.sample_id)
     if arguments.json:
         with replacing("grade --json", arguments.json) as temporary:
             Path(temporary).write_text(json.dumps(grading.to_json(), indent=1, allow_nan=False), encoding="utf-8")

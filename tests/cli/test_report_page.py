@@ -124,3 +124,17 @@ def test_drift_tells_a_moved_camera_by_its_exit_code(capsys, tmp_path):
     assert (code, out.splitlines()[0]) == (1, "drift: fail")
     assert json.loads(told.read_text())["cameras"][0]["shift"] == pytest.approx(0.006, rel=0.2)
     assert "moved by" in page.read_text(encoding="utf-8")
+
+
+def test_a_dataset_is_shown_and_graded_as_it_is(capsys, made, tmp_path):
+    (tmp_path / "c.yaml").write_text("depth: [Deproject]\ncloud: [FarthestPointSample: {num_points: 64}]\n")
+    assert run(capsys, "build", tmp_path / "c.yaml", "--source", made, "--out", tmp_path / "set")[0] == 0
+    code, out, _ = run(capsys, "report", tmp_path / "set", "--out", tmp_path / "set.html")
+    assert code == 0
+    text = (tmp_path / "set.html").read_text(encoding="utf-8")
+    assert "2. FarthestPointSample" in text.split("<svg")[1]  # the funnel of the build
+    assert run(capsys, "grade", tmp_path / "set")[1][0] == out.split()[1]
+    for option in (["--config", tmp_path / "c.yaml"], ["--limit", 1], ["--frame", "base"]):
+        code, _, err = run(capsys, "report", tmp_path / "set", "--out", tmp_path / "set.html", *option)
+        assert code == 2
+        assert "is a dataset" in err
