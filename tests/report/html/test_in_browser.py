@@ -28,9 +28,18 @@ GRID = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 2, torch.zeros(1), inde
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    drawing = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    drawing = [
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--ignore-gpu-blocklist",
+    ]
     with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=drawing)
+        try:
+            opened = driver.chromium.launch(executable_path=CHROMIUM, args=drawing)
+        except playwright.Error as error:
+            pytest.skip(f"chromium does not start here: {str(error).splitlines()[0]}")
         yield opened
         opened.close()
 
