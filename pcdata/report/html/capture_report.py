@@ -14,7 +14,7 @@ import torch
 from pcdata import __version__
 from pcdata.errors import PcdataError
 from pcdata.io.sources.capture_source import CaptureSource, episodes_of
-from pcdata.report.html.charts import bars, histogram, time_line
+from pcdata.report.html.charts import VERDICT_COLORS, bars, histogram, time_line
 from pcdata.report.html.page import Section, page_of
 from pcdata.report.html.pictures import color_picture, confidence_picture, depth_picture, edges_picture
 from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
@@ -30,7 +30,6 @@ NUM_SHOWN = 12  # samples with pictures and clouds, unless more are asked for
 _MOST_BYTES = 18 << 20  # of packed clouds in a page; as text, with pictures, that is below 30 MB
 _BYTES_PER_POINT = 7  # of a packed point with colors, as measured on captures of Kinect-like sensors
 _MOST_TRENDS = 24  # time lines
-_COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
 Progress = Callable[[int, int, str], None]
 
 
@@ -262,7 +261,7 @@ def _trends(grading: Grading) -> str:
     parts = []
     for trend in sorted(told, key=rank)[:_MOST_TRENDS]:
         values = np.array(trend.values)
-        colors = [_COLORS[severity] for severity in trend.verdicts]
+        colors = [VERDICT_COLORS[severity] for severity in trend.verdicts]
         name = " ".join(filter(None, [trend.name, grading.name_of(trend.view)]))
         chart = (
             time_line(values, colors, limit=trend.worst.threshold)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pcdata.report.html.text import shown
 
 _ROW = 24
+VERDICT_COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
 
 
 def bars(rows: Sequence[tuple[str, float, str]], *, width: int = 720) -> str:  # name, value, what stands beside it

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcdata.report.html.charts import time_line
+from pcdata.report.html.charts import VERDICT_COLORS, time_line
 from pcdata.report.html.page import Section, page_of
 from pcdata.report.html.text import shown
 from pcdata.validation.drift_result import MOVING, CameraDrift, DriftResult
-from pcdata.verdicts import Verdict
-
-_COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
 
 
 def drift_page(result: DriftResult, title: str) -> str:
@@ -28,7 +25,7 @@ def drift_page(result: DriftResult, title: str) -> str:
 
 def _way(camera: CameraDrift, result: DriftResult) -> str:
     limits = result.limits
-    colors = [_COLORS[list(Verdict).index(point.verdict)] for point in camera.points]
+    colors = [VERDICT_COLORS[point.verdict.severity] for point in camera.points]
     shifts = np.array([1e3 * point.shift for point in camera.points])
     turns = np.array([point.rotation_degrees for point in camera.points])
     first, last = camera.points[0].first, camera.points[-1].last
