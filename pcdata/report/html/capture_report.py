@@ -2,63 +2,27 @@
 
 from __future__ import annotations
 
-import heapq
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
 from pcdata import __version__
-from pcdata.errors import PcdataError
-from pcdata.io.sources.capture_source import CaptureSource, episodes_of
+from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.report.html.charts import VERDICT_COLORS, bars, histogram, time_line
+from pcdata.report.html.gathering import NUM_SHOWN, Gathered, Known, Looked, Progress, gather_captures
 from pcdata.report.html.page import Section, page_of
-from pcdata.report.html.pictures import color_picture, confidence_picture, depth_picture, edges_picture
-from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
+from pcdata.report.html.pictures import png_uri
 from pcdata.report.html.text import shown
-from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Compose
-from pcdata.validation import CaptureLimits, validate_source
+from pcdata.validation import CaptureLimits
 from pcdata.validation.grading import LETTERS, Grading
-from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict
 
-NUM_SHOWN = 12  # samples with pictures and clouds, unless more are asked for
-_MOST_BYTES = 18 << 20  # of packed clouds in a page; as text, with pictures, that is below 30 MB
-_BYTES_PER_POINT = 7  # of a packed point with colors, as measured on captures of Kinect-like sensors
 _MOST_TRENDS = 24  # time lines
-Progress = Callable[[int, int, str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Known:
-    """What is known of a whole dataset besides its clouds.
-
-    Args:
-        findings: about all of it.
-        funnel: (step, median points after it, words) in order.
-        sections: parts of the page of its own.
-        pipeline: the steps that made it, as YAML.
-    """
-
-    findings: tuple[Finding, ...] = ()
-    funnel: tuple[tuple[str, float, str], ...] = ()
-    sections: tuple[Section, ...] = ()
-    pipeline: str = ""
-
-
-@dataclass(frozen=True)
-class _Looked:
-    """What is shown of one capture."""
-
-    sample_id: str
-    scene: SampleScene | None
-    pictures: tuple[tuple[str, str], ...]  # caption, data URI
-    funnel: tuple[tuple[str, int], ...]  # step, points after it
-    problem: str = ""  # why it cannot be shown
+_MOST_LISTED = 200  # captures that were left out
 
 
 def capture_page(
@@ -73,8 +37,6 @@ def capture_page(
 ) -> tuple[str, Grading]:
     """Judge every capture of a source and return a self-contained page, and the grades it tells of.
 
-    Captures are judged one at a time; then the worst are shown, and of the others some from the whole length.
-
     Args:
         source: anything with ``ids`` and ``load``.
         pipeline: steps to be shown too; its random ones are left out. None = the cloud that each capture shows.
@@ -87,99 +49,27 @@ def capture_page(
     Raises:
         CaptureError: the source has no captures, or two with one id.
     """
-    known = known or Known()
-    grading = Grading(source.ids, episodes_of(source))
-    grading.together += [("the build", finding) for finding in known.findings]
-    worst: list[tuple[int, int]] = []  # (severity, -place) of the worst captures
-    total = len(source.ids)
-    for report in validate_source(source, limits=limits):
-        grading.add(report)
-        if not report.whole:
-            place = int((grading.sample_verdicts >= 0).sum()) - 1
-            entry = (report.verdict.severity, -place)
-            (heapq.heappush if len(worst) < num_shown else heapq.heappushpop)(worst, entry)
-            if progress is not None:
-                progress(place + 1, total, report.sample_id)
-    looked = [_look(source, place, pipeline, num_shown, grading) for place in _places_shown(worst, total, num_shown)]
-    return _page(source, grading, looked, pipeline, title or str(source), known), grading
+    gathered = gather_captures(
+        source, pipeline=pipeline, limits=limits, num_shown=num_shown, title=title, progress=progress, known=known
+    )
+    return page_of_captures(gathered), gathered.grading
 
 
-def _places_shown(worst: list[tuple[int, int]], total: int, num_shown: int) -> list[int]:
-    """The worst captures first, then others spread over the whole length."""
-    bad = [-place for severity, place in sorted(worst, reverse=True) if severity >= Verdict.WARN.severity]
-    spread = np.unique(np.linspace(0, total - 1, min(num_shown, total)).round().astype(int)).tolist()
-    kept = bad[: max(1, (3 * num_shown) // 4)] if len(bad) < total else spread  # where all are bad none is the worst
-    return list(dict.fromkeys([*kept, *spread]))[:num_shown]
-
-
-def _look(source: CaptureSource, place: int, pipeline: Compose | None, num_shown: int, grading: Grading) -> _Looked:
-    sample_id = source.ids[place]
-    most_points = min(2 * MOST_POINTS, _MOST_BYTES // (_BYTES_PER_POINT * max(num_shown, 1)))
-    try:
-        capture = source.load(sample_id)
-        if isinstance(capture, DepthFrame) and not grading.names:
-            grading.names = view_names(capture.provenance, capture.num_views)
-    except PcdataError as error:
-        return _Looked(sample_id, None, (), (), f"cannot be read: {error}")
-    pictures = tuple(_pictures(capture)) if isinstance(capture, DepthFrame) else ()
-    stages, funnel, problem = _stages(capture, pipeline, most_points)
-    return _Looked(sample_id, SampleScene(sample_id, stages) if stages else None, pictures, funnel, problem)
-
-
-def _stages(
-    capture: DepthFrame | PointCloud, pipeline: Compose | None, most_points: int
-) -> tuple[tuple[Stage, ...], tuple[tuple[str, int], ...], str]:
-    """Return the clouds after the steps, the points of each, and why there are none; then the capture is shown."""
-    problem = ""
-    if pipeline is not None:
-        try:
-            steps = list(pipeline.split()[0].step_through(capture))
-            funnel = tuple(
-                (type(step).__name__, data.num_points) for step, data in steps if isinstance(data, PointCloud)
-            )
-            return stages_of(steps, most_points=most_points), funnel, ""
-        except PcdataError as error:
-            problem = "; ".join([str(error), *getattr(error, "__notes__", ())])
-    try:
-        cloud = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
-        return (stage_of("capture", cloud, most_points=min(most_points, MOST_POINTS)),), (), problem
-    except PcdataError as error:
-        return (), (), problem or str(error)
-
-
-def _pictures(frame: DepthFrame) -> Iterator[tuple[str, str]]:
-    names = view_names(frame.provenance, frame.num_views)
-    for view in range(min(frame.num_views, 8)):
-        depth = frame.depth[view]
-        valid = depth > 0
-        near, far = (float(depth[valid].min()), float(depth[valid].max())) if bool(valid.any()) else (0.0, 0.0)
-        share = float(valid.float().mean())
-        caption = f"{names[view]}: depth {near:.2f} to {far:.2f} m, {share:.1%} of pixels read (magenta: none)"
-        yield caption, depth_picture(frame, view)
-        if (edges := edges_picture(frame, view)) is not None:
-            yield f"{names[view]}: rims of depth (red) over color", edges
-        if (confidence := confidence_picture(frame, view)) is not None:
-            yield f"{names[view]}: confidence", confidence
-    if frame.num_views > 8:
-        yield f"{frame.num_views - 8} views more are not shown", color_picture(frame, 8) or depth_picture(frame, 8)
-
-
-def _page(
-    source: CaptureSource, grading: Grading, looked: list[_Looked], pipeline: Compose | None, title: str, known: Known
-) -> str:
+def page_of_captures(gathered: Gathered) -> str:
+    """Return the self-contained page that tells what was gathered."""
+    grading, looked = gathered.grading, gathered.looked
     scenes = [one.scene for one in looked if one.scene is not None]
     place_of = {scene.name: place for place, scene in enumerate(scenes)}
-    funnel = known.funnel or _funnel(looked)
     sections = [
         Section("Verdict", _verdict(grading)),
-        *([Section("Points after each step (median)", bars(funnel))] if funnel else []),
-        *known.sections,
+        *([Section("Points after each step (median)", bars(funnel_rows(gathered.funnel)))] if gathered.funnel else []),
+        *([Section("Left out", _left_out(gathered.left_out))] if gathered.left_out else []),
         Section("Samples", _captures(grading, looked, place_of)),
         Section("Numbers over the samples", _trends(grading)),
         *([Section("Episodes", _episodes(grading))] if grading.episodes else []),
-        Section("How this was made", _made(source, known.pipeline or (pipeline.to_yaml() if pipeline else ""))),
+        Section("How this was made", _made(gathered)),
     ]
-    return page_of(title, sections, scenes)
+    return page_of(gathered.title, sections, scenes)
 
 
 def _verdict(grading: Grading) -> str:
@@ -214,17 +104,6 @@ def _finding(finding: Finding, view: str, where: str) -> str:
     )
 
 
-def _funnel(looked: list[_Looked]) -> tuple[tuple[str, float, str], ...]:
-    """The median points after each step of the samples that are shown."""
-    chains = [one.funnel for one in looked if one.funnel]
-    if not chains:
-        return ()
-    names = [name for name, _ in chains[0]]
-    same = [chain for chain in chains if [name for name, _ in chain] == names]
-    medians = np.median(np.array([[count for _, count in chain] for chain in same]), axis=0).tolist()
-    return funnel_rows(list(zip(names, medians)))
-
-
 def funnel_rows(steps: Sequence[tuple[str, float]]) -> tuple[tuple[str, float, str], ...]:
     """Return rows for bars from (step, median points after it): each with its share of the step before."""
     rows = []
@@ -235,7 +114,16 @@ def funnel_rows(steps: Sequence[tuple[str, float]]) -> tuple[tuple[str, float, s
     return tuple(rows)
 
 
-def _captures(grading: Grading, looked: list[_Looked], place_of: Mapping[str, int]) -> str:
+def _left_out(left_out: Mapping[str, str]) -> str:
+    rows = "".join(
+        f"<tr><td>{shown(sample_id, 200)}</td><td>{shown(why, 500)}</td></tr>"
+        for sample_id, why in list(left_out.items())[:_MOST_LISTED]
+    )
+    more = f"<p>{len(left_out) - _MOST_LISTED:,} more.</p>" if len(left_out) > _MOST_LISTED else ""
+    return f"<table><tr><th>capture</th><th>why</th></tr>{rows}</table>{more}"
+
+
+def _captures(grading: Grading, looked: Sequence[Looked], place_of: Mapping[str, int]) -> str:
     parts = []
     numbers = {sample_id: place for place, sample_id in enumerate(grading.ids)}
     for one in looked:
@@ -247,7 +135,7 @@ def _captures(grading: Grading, looked: list[_Looked], place_of: Mapping[str, in
         problem = f'<p class="fail">{shown(one.problem)}</p>' if one.problem else ""
         figures = "".join(
             f'<figure><img src="{uri}" alt="{told}" width="220"><figcaption>{told}</figcaption></figure>'
-            for told, uri in ((shown(caption), uri) for caption, uri in one.pictures)
+            for told, uri in ((shown(picture.caption), png_uri(picture.png)) for picture in one.pictures)
         )
         parts.append(f'<h3>{name} <span class="{verdict}">{verdict}</span></h3>{problem}{figures}')
     return "".join(parts)
@@ -289,7 +177,7 @@ def _episodes(grading: Grading) -> str:
     return f"<table><tr><th>episode</th><th>captures</th>{head}</tr>{''.join(rows[:500])}</table>{more}"
 
 
-def _made(source: CaptureSource, pipeline: str) -> str:
+def _made(gathered: Gathered) -> str:
     versions = f"pcdata {__version__}, torch {torch.__version__}, Python {platform.python_version()}"
-    steps = f"<pre>{shown(pipeline, 20_000)}</pre>" if pipeline else "<p>No pipeline was given.</p>"
-    return f"<p>Of {shown(source)}. {shown(versions)}.</p>{steps}"
+    steps = f"<pre>{shown(gathered.pipeline, 20_000)}</pre>" if gathered.pipeline else "<p>No pipeline was given.</p>"
+    return f"<p>Of {shown(gathered.source)}. {shown(versions)}.</p>{steps}"

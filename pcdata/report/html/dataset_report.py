@@ -10,14 +10,11 @@ import yaml
 
 from pcdata.datasets import CachedCloudDataset
 from pcdata.io.store.manifest import Manifest
-from pcdata.report.html.capture_report import NUM_SHOWN, Known, Progress, capture_page, funnel_rows
-from pcdata.report.html.page import Section
-from pcdata.report.html.text import shown
+from pcdata.report.html.capture_report import page_of_captures
+from pcdata.report.html.gathering import NUM_SHOWN, Gathered, Known, Progress, gather_captures
 from pcdata.structures import Episode, PointCloud
 from pcdata.validation.grading import Grading
 from pcdata.verdicts import Finding, Verdict
-
-_MOST_LISTED = 200  # captures that were left out
 
 
 def dataset_page(
@@ -34,14 +31,25 @@ def dataset_page(
     Raises:
         CacheError: the dataset is damaged.
     """
+    gathered = gather_dataset(folder, num_shown=num_shown, title=title, progress=progress)
+    return page_of_captures(gathered), gathered.grading
+
+
+def gather_dataset(
+    folder: str | Path, *, num_shown: int = NUM_SHOWN, title: str = "", progress: Progress | None = None
+) -> Gathered:
+    """Judge every stored cloud of a dataset, and look at some; arguments and errors as :func:`dataset_page`."""
     dataset = CachedCloudDataset(folder, augment=None)
-    known = _known(dataset.manifest)
-    return capture_page(
-        _Stored(dataset), num_shown=num_shown, title=title or str(dataset), progress=progress, known=known
+    return gather_captures(
+        StoredClouds(dataset),
+        num_shown=num_shown,
+        title=title or str(dataset),
+        progress=progress,
+        known=_known(dataset.manifest),
     )
 
 
-class _Stored:
+class StoredClouds:
     """The stored clouds as a source."""
 
     name = "dataset"
@@ -80,18 +88,10 @@ def _known(manifest: Manifest) -> Known:
                 advice="see why below; mend them and build again with --retry-quarantined",
             ),
         )
-    sections = []
-    if left_out:
-        rows = "".join(
-            f"<tr><td>{shown(sample_id, 200)}</td><td>{shown(why, 500)}</td></tr>"
-            for sample_id, why in list(left_out.items())[:_MOST_LISTED]
-        )
-        more = f"<p>{len(left_out) - _MOST_LISTED:,} more.</p>" if len(left_out) > _MOST_LISTED else ""
-        sections.append(Section("Left out", f"<table><tr><th>capture</th><th>why</th></tr>{rows}</table>{more}"))
     return Known(
         findings=tuple(findings),
-        funnel=funnel_rows(steps),
-        sections=tuple(sections),
+        funnel=tuple(steps),
+        left_out=left_out,
         pipeline=yaml.safe_dump(_plain(manifest.pipeline), sort_keys=False, width=120),
     )
 

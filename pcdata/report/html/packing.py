@@ -24,10 +24,15 @@ _MOST_PIXELS = 1 << 32
 
 @dataclass(frozen=True)
 class PackedCloud:
-    """What the page says of a cloud, and its bytes as text."""
+    """What the page says of a cloud, and its bytes."""
 
     said: dict[str, Any]
-    text: str  # base64 of deflated columns
+    content: bytes  # deflated columns
+
+    @property
+    def text(self) -> str:
+        """The bytes as base64."""
+        return base64.b64encode(self.content).decode("ascii")
 
 
 def pack_cloud(cloud: PointCloud, *, most_points: int) -> PackedCloud:
@@ -57,7 +62,7 @@ def pack_cloud(cloud: PointCloud, *, most_points: int) -> PackedCloud:
             fields.append(_field(columns, name, value, cloud.kinds.get(name)))
     order = {"color": 0, "category": 1, "normal": 2, "scalar": 3, "pixel": 4}
     said["fields"] = sorted(filter(None, fields), key=lambda field: order[field["kind"]])
-    return PackedCloud(said, base64.b64encode(zlib.compress(columns.bytes(), 6)).decode("ascii"))
+    return PackedCloud(said, zlib.compress(columns.bytes(), 6))
 
 
 class _Columns:

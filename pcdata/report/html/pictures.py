@@ -24,37 +24,37 @@ _NO_READING = (214, 64, 159)  # not in viridis
 _STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Kinect-like sensors up to some metres
 
 
-def depth_picture(frame: DepthFrame, view: int) -> str:
-    """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a data URI."""
+def depth_picture(frame: DepthFrame, view: int) -> bytes:
+    """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a PNG."""
     depth = _reduced(frame.depth[view].cpu().numpy())
     valid = depth > 0
     near, far = np.quantile(depth[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
     image = viridis((depth - near) / max(far - near, 1e-9))
     image[~valid] = _NO_READING
-    return png_uri(image)
+    return png(image)
 
 
-def confidence_picture(frame: DepthFrame, view: int) -> str | None:
+def confidence_picture(frame: DepthFrame, view: int) -> bytes | None:
     """Confidence from low (dark) to high, None where the capture has none."""
     if frame.confidence is None:
         return None
     confidence = _reduced(frame.confidence[view].cpu().numpy().astype(np.float64))
-    return png_uri(viridis(confidence / max(float(confidence.max()), 1e-9)))
+    return png(viridis(confidence / max(float(confidence.max()), 1e-9)))
 
 
-def edges_picture(frame: DepthFrame, view: int) -> str | None:
+def edges_picture(frame: DepthFrame, view: int) -> bytes | None:
     """The color image with the rims of depth in red: they lie on the outlines of things where both are registered."""
     if frame.colors is None:
         return None
     depth = _reduced(frame.depth[view].cpu().numpy())
     image = _reduced(frame.colors[view].cpu().numpy()).copy()
     image[rims(depth)] = (255, 40, 40)
-    return png_uri(image)
+    return png(image)
 
 
-def color_picture(frame: DepthFrame, view: int) -> str | None:
+def color_picture(frame: DepthFrame, view: int) -> bytes | None:
     """The color image, None where the capture has none."""
-    return None if frame.colors is None else png_uri(_reduced(frame.colors[view].cpu().numpy()))
+    return None if frame.colors is None else png(_reduced(frame.colors[view].cpu().numpy()))
 
 
 def rims(depth: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -78,11 +78,16 @@ def viridis(share: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(_VIRIDIS[low] + (place - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])).astype(np.uint8)
 
 
-def png_uri(image: NDArray[np.uint8]) -> str:
-    """Return an image (H, W, 3) as a data URI of a PNG."""
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image (H, W, 3) as the bytes of a PNG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
+
+
+def png_uri(picture: bytes) -> str:
+    """Return a PNG as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
 
 
 def _reduced(image: NDArray) -> NDArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import zlib
 from typing import Any
 
@@ -13,7 +12,7 @@ from pcdata.report.html.packing import PackedCloud
 
 def decoded(packed: PackedCloud) -> dict[str, np.ndarray]:
     """Return positions and every field by name, as numbers that the page shows."""
-    content = zlib.decompress(base64.b64decode(packed.text))
+    content = zlib.decompress(packed.content)
     said = packed.said
     found = {"points": np.array(said["lower"]) + np.array(said["step"]) * _columns(content, said, "uint16", 3)}
     for field in said["fields"]:

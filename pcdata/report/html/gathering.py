@@ -1,0 +1,229 @@
+"""What a page on captures tells, before it is a page: grades, and of some captures pictures, clouds and counts."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pcdata.errors import PcdataError
+from pcdata.io.sources.capture_source import CaptureSource, episodes_of
+from pcdata.report.html.pictures import color_picture, confidence_picture, depth_picture, edges_picture
+from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms import Compose
+from pcdata.validation import CaptureLimits, validate_source
+from pcdata.validation.grading import Grading
+from pcdata.validation.view_names import view_names
+from pcdata.verdicts import Finding, Verdict
+
+NUM_SHOWN = 12  # samples with pictures and clouds, unless more are asked for
+_MOST_BYTES = 18 << 20  # of packed clouds in a page; as text, with pictures, that is below 30 MB
+_BYTES_PER_POINT = 7  # of a packed point with colors, as measured on captures of Kinect-like sensors
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of a whole dataset besides its clouds.
+
+    Args:
+        findings: about all of it.
+        funnel: (step, median points after it) in order.
+        left_out: captures that are not in it, and why.
+        pipeline: the steps that made it, as YAML.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    funnel: tuple[tuple[str, float], ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    pipeline: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a capture.
+
+    Args:
+        caption: what is seen in it.
+        png: the file.
+    """
+
+    caption: str
+    png: bytes
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What is shown of one capture.
+
+    Args:
+        sample_id: which.
+        scene: its clouds, None where there are none.
+        pictures: of its depth images.
+        funnel: (step, points after it) in order.
+        problem: why it cannot be shown.
+    """
+
+    sample_id: str
+    scene: SampleScene | None
+    pictures: tuple[Picture, ...]
+    funnel: tuple[tuple[str, int], ...]
+    problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gathered:
+    """All that a page or a picture tells of captures.
+
+    Args:
+        title: of the page.
+        source: what the source says of itself.
+        grading: of every capture.
+        looked: the captures that are shown, the worst first.
+        funnel: (step, median points after it) in order.
+        left_out: captures that are not in the dataset, and why.
+        pipeline: the steps as YAML, "" = none.
+    """
+
+    title: str
+    source: str
+    grading: Grading
+    looked: tuple[Looked, ...]
+    funnel: tuple[tuple[str, float], ...]
+    left_out: Mapping[str, str]
+    pipeline: str
+
+
+def gather_captures(
+    source: CaptureSource,
+    *,
+    pipeline: Compose | None = None,
+    limits: CaptureLimits | None = None,
+    num_shown: int = NUM_SHOWN,
+    title: str = "",
+    progress: Progress | None = None,
+    known: Known | None = None,
+) -> Gathered:
+    """Judge every capture of a source, and look at some.
+
+    Captures are judged one at a time; then the worst are looked at, and of the others some from the whole length.
+
+    Args:
+        source: anything with ``ids`` and ``load``.
+        pipeline: steps to be shown too; its random ones are left out. None = the cloud that each capture shows.
+        limits: of the checks; None = the defaults, for a camera above a table.
+        num_shown: captures with pictures and clouds.
+        title: of the page; "" = what the source says of itself.
+        progress: told (captures judged, all, which).
+        known: what is known of a dataset besides its clouds.
+
+    Raises:
+        CaptureError: the source has no captures, or two with one id.
+    """
+    known = known or Known()
+    grading = Grading(source.ids, episodes_of(source))
+    grading.together += [("the build", finding) for finding in known.findings]
+    worst: list[tuple[int, int]] = []  # (severity, -place) of the worst captures
+    total = len(source.ids)
+    for report in validate_source(source, limits=limits):
+        grading.add(report)
+        if not report.whole:
+            place = int((grading.sample_verdicts >= 0).sum()) - 1
+            entry = (report.verdict.severity, -place)
+            (heapq.heappush if len(worst) < num_shown else heapq.heappushpop)(worst, entry)
+            if progress is not None:
+                progress(place + 1, total, report.sample_id)
+    places = _places_shown(worst, total, num_shown)
+    looked = tuple(look(source, place, pipeline=pipeline, num_shown=num_shown, grading=grading) for place in places)
+    return Gathered(
+        title=title or str(source),
+        source=str(source),
+        grading=grading,
+        looked=looked,
+        funnel=known.funnel or _funnel(looked),
+        left_out=known.left_out,
+        pipeline=known.pipeline or (pipeline.to_yaml() if pipeline else ""),
+    )
+
+
+def _places_shown(worst: list[tuple[int, int]], total: int, num_shown: int) -> list[int]:
+    """The worst captures first, then others spread over the whole length."""
+    bad = [-place for severity, place in sorted(worst, reverse=True) if severity >= Verdict.WARN.severity]
+    spread = np.unique(np.linspace(0, total - 1, min(num_shown, total)).round().astype(int)).tolist()
+    kept = bad[: max(1, (3 * num_shown) // 4)] if len(bad) < total else spread  # where all are bad none is the worst
+    return list(dict.fromkeys([*kept, *spread]))[:num_shown]
+
+
+def look(
+    source: CaptureSource,
+    place: int,
+    *,
+    pipeline: Compose | None = None,
+    num_shown: int = 1,
+    grading: Grading | None = None,
+) -> Looked:
+    """Return what is shown of one capture of ``num_shown``; a grading without names of views is given them."""
+    sample_id = source.ids[place]
+    most_points = min(2 * MOST_POINTS, _MOST_BYTES // (_BYTES_PER_POINT * max(num_shown, 1)))
+    try:
+        capture = source.load(sample_id)
+        if isinstance(capture, DepthFrame) and grading is not None and not grading.names:
+            grading.names = view_names(capture.provenance, capture.num_views)
+    except PcdataError as error:
+        return Looked(sample_id, None, (), (), f"cannot be read: {error}")
+    pictures = tuple(_pictures(capture)) if isinstance(capture, DepthFrame) else ()
+    stages, funnel, problem = _stages(capture, pipeline, most_points)
+    return Looked(sample_id, SampleScene(sample_id, stages) if stages else None, pictures, funnel, problem)
+
+
+def _stages(
+    capture: DepthFrame | PointCloud, pipeline: Compose | None, most_points: int
+) -> tuple[tuple[Stage, ...], tuple[tuple[str, int], ...], str]:
+    """Return the clouds after the steps, the points of each, and why there are none; then the capture is shown."""
+    problem = ""
+    if pipeline is not None:
+        try:
+            steps = list(pipeline.split()[0].step_through(capture))
+            funnel = tuple(
+                (type(step).__name__, data.num_points) for step, data in steps if isinstance(data, PointCloud)
+            )
+            return stages_of(steps, most_points=most_points), funnel, ""
+        except PcdataError as error:
+            problem = "; ".join([str(error), *getattr(error, "__notes__", ())])
+    try:
+        cloud = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
+        return (stage_of("capture", cloud, most_points=min(most_points, MOST_POINTS)),), (), problem
+    except PcdataError as error:
+        return (), (), problem or str(error)
+
+
+def _pictures(frame: DepthFrame) -> Iterator[Picture]:
+    names = view_names(frame.provenance, frame.num_views)
+    for view in range(min(frame.num_views, 8)):
+        depth = frame.depth[view]
+        valid = depth > 0
+        near, far = (float(depth[valid].min()), float(depth[valid].max())) if bool(valid.any()) else (0.0, 0.0)
+        share = float(valid.float().mean())
+        caption = f"{names[view]}: depth {near:.2f} to {far:.2f} m, {share:.1%} of pixels read (magenta: none)"
+        yield Picture(caption, depth_picture(frame, view))
+        if (edges := edges_picture(frame, view)) is not None:
+            yield Picture(f"{names[view]}: rims of depth (red) over color", edges)
+        if (confidence := confidence_picture(frame, view)) is not None:
+            yield Picture(f"{names[view]}: confidence", confidence)
+    if frame.num_views > 8:
+        picture = color_picture(frame, 8) or depth_picture(frame, 8)
+        yield Picture(f"{frame.num_views - 8} views more are not shown", picture)
+
+
+def _funnel(looked: Sequence[Looked]) -> tuple[tuple[str, float], ...]:
+    """The median points after each step of the samples that are shown."""
+    chains = [one.funnel for one in looked if one.funnel]
+    if not chains:
+        return ()
+    names = [name for name, _ in chains[0]]
+    same = [chain for chain in chains if [name for name, _ in chain] == names]
+    medians = np.median(np.array([[count for _, count in chain] for chain in same]), axis=0).tolist()
+    return tuple(zip(names, medians))
