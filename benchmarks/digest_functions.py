@@ -82,6 +82,8 @@ def _function_calls() -> Iterator[Case]:
         "voxel_minimum": lambda g: f.voxel_minimum(torch.arange(300) % 7, g.inverse, g.count),
         "NeighborIndex": lambda g: _searched_often(f.NeighborIndex(g.source, ptr_of(170, 130)), points(40, 9)),
         "convex_hull": lambda g: f.convex_hull(g.source[:, :2]),
+        "convex_hull_3d": lambda g: f.convex_hull_3d(g.source),
+        "smallest_box": lambda g: f.smallest_box(g.source),
         "shape_features": lambda g: f.shape_features(f.neighborhood_covariance(g.source, max_neighbors=12)[1]),
         "smallest_rectangle": lambda g: f.smallest_rectangle(g.source[:, :2]),
         "voxel_cells": lambda g: f.voxel_cells(g.source, 0.04),

@@ -8,6 +8,7 @@ normals, ``register_depth``, rendering, ``spatial_filter`` and TSDF volumes.
 """
 
 from pcdata.functional.boundaries import boundary_mask
+from pcdata.functional.boxes import smallest_box
 from pcdata.functional.closest_points import ClosestPoints, iterate_closest_points
 from pcdata.functional.clusters import core_point_mask, dbscan
 from pcdata.functional.depth.average import DepthAverage, average_depth
@@ -22,6 +23,7 @@ from pcdata.functional.depth.undistortion import undistort_depth, undistort_imag
 from pcdata.functional.depth.window_filters import bilateral_filter, median_filter
 from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
 from pcdata.functional.hard_voxels import HardVoxels, hard_voxels
+from pcdata.functional.hulls import ConvexHull, convex_hull_3d
 from pcdata.functional.image_clusters import image_clusters
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.interpolation import interpolate_features
@@ -74,6 +76,7 @@ from pcdata.geometry.lens import distort_normalized, undistort_normalized
 __all__ = [
     "SHAPE_FEATURES",
     "ClosestPoints",
+    "ConvexHull",
     "DepthAverage",
     "FoundCircle",
     "FoundCylinder",
@@ -99,6 +102,7 @@ __all__ = [
     "check_grasps",
     "cloud_of_rows",
     "convex_hull",
+    "convex_hull_3d",
     "core_point_mask",
     "dbscan",
     "decimate_depth",
@@ -149,6 +153,7 @@ __all__ = [
     "resize_depth",
     "segment_planes",
     "shape_features",
+    "smallest_box",
     "smallest_rectangle",
     "spatial_filter",
     "statistical_outlier_mask",

@@ -15,9 +15,8 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_image_size, checked_places, checked_positive
 from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import projected
+from pcdata.functional.hulls import hull_surface
 from pcdata.functional.voxels import numbered_rows
-
-_FLAT = 1e-7  # as a part of a set's extent: thinner than this it has a dimension less
 
 
 def _checked_near(where: str, name: str, arguments: Mapping[str, Any]) -> float:
@@ -126,22 +125,5 @@ def _seen(rays: NDArray[np.float64], radius_factor: float) -> NDArray[np.int64]:
         return near
     length = distance[away, None]
     flipped = rays[away] * (2 * radius_factor * length.max() / length - 1)
-    corners = _hull_corners(np.concatenate([flipped, np.zeros((1, 3))]))
+    corners, _ = hull_surface(np.concatenate([flipped, np.zeros((1, 3))]))
     return np.concatenate([near, away[corners[corners < len(away)]]])
-
-
-def _hull_corners(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the corners of the convex hull of (n, 3) points, which may lie in a plane or on a line."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    centered = points - points.mean(0)
-    squares, axes = np.linalg.eigh(centered.T @ centered)
-    dimensions = int((squares > _FLAT**2 * squares[2]).sum())
-    while dimensions > 1:
-        try:
-            places = points if dimensions == 3 else points @ axes[:, 3 - dimensions :]
-            return ConvexHull(places).vertices.astype(np.int64)
-        except QhullError:  # flat to its eyes
-            dimensions -= 1
-    along = points @ axes[:, 2]
-    return np.array([along.argmin(), along.argmax()], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Where labeled objects are and how large: centers, heights, oriented boxes, outlines, and labels back on the image."""
+"""Where labeled objects are and how large: centers, heights, boxes, hulls, outlines, and labels back on the image."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
+from pcdata.functional.boxes import smallest_box
+from pcdata.functional.hulls import convex_hull_3d
 from pcdata.functional.rectangles import smallest_rectangle
 from pcdata.functional.selection import convex_hull, plane_axes
 from pcdata.structures import PointCloud
@@ -27,6 +29,11 @@ class ObjectFacts:
             x along the longer side, z up.
         size: (3,) float64 edges of the box along its x, y, z.
         outline: (C, 3) float64 corners of the convex hull seen from above, on the table, counterclockwise from above.
+        hull: (P, 3) float64 corners of the convex hull of its points in space.
+        volume: of that hull, in the cube of the unit: less than the object's own where a side of it was not seen.
+        tight_box: (4, 4) float64 pose of the smallest box around its points, turned in any way: origin in the middle, x
+            along the longest edge, z along the shortest.
+        tight_size: (3,) float64 edges of that box along its x, y, z.
     """
 
     label: int
@@ -36,12 +43,17 @@ class ObjectFacts:
     box: Tensor
     size: Tensor
     outline: Tensor
+    hull: Tensor
+    volume: float
+    tight_box: Tensor
+    tight_size: Tensor
 
 
 def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None) -> list[ObjectFacts]:
     """Return what is known of every label from 0 up in cloud ``b``, in the order of labels.
 
-    Boxes reach from the table to the top where the table is known: what a camera sees of an object ends above its foot.
+    Upright boxes reach from the table to the top where the table is known: what a camera sees of an object ends above
+    its foot. Hull, volume and tight box are of the points alone.
 
     Args:
         cloud: labeled points.
@@ -72,6 +84,8 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
         box = torch.eye(4, dtype=torch.float64, device="cpu")
         x = axes @ along
         box[:3, :3] = torch.stack([x, torch.linalg.cross(plane[:3], x), plane[:3]], 1)
+        hull = convex_hull_3d(rows)
+        tight_box, tight_size = smallest_box(rows[hull.corners])
         foot = -plane[3] * plane[:3]  # the point of the plane that is nearest to the origin
         box[:3, 3] = foot + axes @ center + plane[:3] * (low + high) / 2
         found.append(
@@ -83,6 +97,10 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
                 box=box,
                 size=torch.cat([size, size.new_tensor([high - low])]),
                 outline=foot + corners @ axes.T,
+                hull=rows[hull.corners],
+                volume=hull.volume,
+                tight_box=tight_box,
+                tight_size=tight_size,
             )
         )
     return found

@@ -135,8 +135,16 @@ OPEN3D = Section(
         ),
         Call(
             "pcd.get_minimal_oriented_bounding_box()",
-            "F.smallest_rectangle(points[:, :2])",
-            "of boxes that stand upright, exactly; of objects: `pcdata.transforms.describe_objects`",
+            "F.smallest_box(points)",
+            "pose and edges, the longest first; of boxes that stand upright: `F.smallest_rectangle(points[:, :2])`; both "
+            "of objects: `pcdata.transforms.describe_objects`",
+            by(lambda a: float(np.cbrt(np.prod(a.extent))), lambda b: float(b[1].prod()) ** (1 / 3), 0.002),
+        ),
+        Call(
+            "pcd.compute_convex_hull()[0].get_volume()",
+            "F.convex_hull_3d(points).volume",
+            "with rows of the corners and of the triangles, and the area",
+            by(float, float, 1e-6),
         ),
         Call(
             "pcd.compute_nearest_neighbor_distance()",
@@ -553,6 +561,7 @@ PCL = Section(
             "a polygon, also concave",
         ),
         Call("ConvexHull (2D)", "F.convex_hull(points[:, :2])", "rows of the corners, counterclockwise"),
+        Call("ConvexHull (3D)", "F.convex_hull_3d(points)", "with triangles, volume and area"),
         Call(
             "ExtractPolygonalPrismData.setHeightLimits(0.0, 0.1)",
             "pcdata.CropPolygon(frame='base', polygon=((0, 0), (0.2, 0), (0, 0.2)), low=0.0, high=0.1)(cloud)",

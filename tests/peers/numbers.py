@@ -107,6 +107,12 @@ SCIPY = Section(
             by(np.sort, lambda b: np.sort(b.numpy())),
         ),
         Call(
+            "spatial.ConvexHull(points.numpy()).volume",
+            "F.convex_hull_3d(points).volume",
+            "triangles run counterclockwise seen from outside; flat sets are answered too",
+            by(float, float, 1e-6),
+        ),
+        Call(
             "transform.Rotation.from_quat([0.0, 0.6, 0.0, 0.8]).as_matrix()",
             "pcdata.geometry.rotations.rotation_from_quaternion(torch.tensor([0.8, 0.0, 0.6, 0.0]))",
             "w comes first",
