@@ -136,8 +136,8 @@ OPEN3D = Section(
         Call(
             "pcd.get_minimal_oriented_bounding_box()",
             "F.smallest_box(points)",
-            "pose and edges, the longest first; of boxes that stand upright: `F.smallest_rectangle(points[:, :2])`; both "
-            "of objects: `pcdata.transforms.describe_objects`",
+            "pose and edges, the longest first; of boxes that stand upright: `F.smallest_rectangle(points[:, :2])`; "
+            "both of objects: `pcdata.transforms.describe_objects`",
             by(lambda a: float(np.cbrt(np.prod(a.extent))), lambda b: float(b[1].prod()) ** (1 / 3), 0.002),
         ),
         Call(

@@ -65,7 +65,7 @@ def test_the_box_of_a_block_is_the_block(degrees):
         edge = outline.roll(-1, 0) - outline
         area = 0.5 * float((outline[:, 0] * edge[:, 1] - outline[:, 1] * edge[:, 0]).sum())
         assert area == pytest.approx(0.2 * 0.08, rel=0.08)
-        assert first.volume == pytest.approx(0.2 * 0.08 * 0.1, rel=0.05)
+        assert first.volume == pytest.approx(0.2 * 0.08 * 0.1, rel=0.08)
         assert first.tight_size.tolist() == pytest.approx([0.2, 0.1, 0.08], abs=0.004)
         tight = pose @ first.tight_box
         assert abs(float(tight[2, 1])) > 0.999  # of 20, 10 and 8 cm the middle one stands up
@@ -82,7 +82,7 @@ def test_a_block_that_leans_has_a_tight_box_of_its_own_size():
     (found,) = describe_objects(cloud, up=UP)
     assert found.tight_size.tolist() == pytest.approx([0.2, 0.1, 0.08], abs=0.004)
     assert float(found.size.prod()) > 1.5 * float(found.tight_size.prod())
-    assert found.volume == pytest.approx(0.2 * 0.08 * 0.1, rel=0.05)
+    assert found.volume == pytest.approx(0.2 * 0.08 * 0.1, rel=0.08)
 
 
 @pytest.mark.parametrize("seed", range(4))
