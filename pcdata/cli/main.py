@@ -91,7 +91,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
 def _refuse_empty(arguments: argparse.Namespace) -> None:
     """Refuse a path without a letter, which would stand for the folder that one is in."""
-    for name in ("path", "dataset", "source", "config", "out", "file", "json", "figure", "calibration", "table"):
+    for name in ("path", "dataset", "source", "config", "out", "file", "json", "figure", "png", "calibration", "table"):
         if getattr(arguments, name, None) == "":
             raise ConfigError(f"{name}: is empty; give a path, or leave it out (is a variable of the shell not set?)")
 
@@ -108,7 +108,7 @@ def _refuse_url(arguments: argparse.Namespace) -> None:
 
 def _refuse_replacing(arguments: argparse.Namespace) -> None:
     """Refuse what is written among what is read: it could replace a file there, or be taken for one of them."""
-    for written in ("json", "figure", "out"):
+    for written in ("json", "figure", "png", "out"):
         place = getattr(arguments, written, None)
         if not isinstance(place, str) or place == "-" or (written == "out" and hasattr(arguments, "out_may_be_url")):
             continue

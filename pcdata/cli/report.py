@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,12 @@ def add_to(commands: Any) -> None:
     """Add the commands to the parser."""
     report = commands.add_parser("report", help="write one page that shows whether captures are good, and why not")
     _add_captures(report)
-    report.add_argument("--out", metavar="FILE.html", default="report.html", help="the page (default: report.html)")
+    report.add_argument("--out", metavar="FILE.html", help="the page (default: report.html, unless --png is given)")
+    report.add_argument(
+        "--png",
+        metavar="FOLDER",
+        help="the same as pictures, drawn without a display: a folder of them, or one where it ends in .png",
+    )
     report.add_argument("--config", metavar="FILE.yaml", help="show the steps of this pipeline too")
     report.add_argument("--samples", type=positive, metavar="N", default=12, help="captures shown (default: 12)")
     report.set_defaults(run=_report)
@@ -60,30 +66,46 @@ def _is_dataset(arguments: argparse.Namespace) -> bool:
 
 
 def _report(arguments: argparse.Namespace) -> int:
+    from pcdata import extras
     from pcdata.build import load_config
     from pcdata.files.opening import replacing
     from pcdata.io.sources.capture_source import check_apart
-    from pcdata.report.html.capture_report import capture_page
-    from pcdata.report.html.dataset_report import dataset_page
+    from pcdata.report.html.capture_report import page_of_captures
+    from pcdata.report.html.dataset_report import gather_dataset
+    from pcdata.report.html.gathering import gather_captures
 
-    check_apart("--out", arguments.out, arguments.path)
-    with replacing("report --out", arguments.out) as temporary, ProgressBar("report") as progress:
-        if _is_dataset(arguments):
-            page, grading = dataset_page(arguments.path, num_shown=arguments.samples, progress=progress)
-        else:
-            page, grading = capture_page(
-                open_captures(arguments.path, arguments, limit=arguments.limit),
-                pipeline=None if arguments.config is None else load_config(arguments.config).pipeline,
-                limits=_limits(arguments),
-                num_shown=arguments.samples,
-                progress=progress,
-            )
-        Path(temporary).write_text(page, encoding="utf-8")
-    grade = grading.grade()
+    out = arguments.out if arguments.out or arguments.png else "report.html"
+    if out:
+        check_apart("--out", out, arguments.path)
+    if arguments.png:
+        extras.require("matplotlib")
+    with ExitStack() as opened:
+        temporary = opened.enter_context(replacing("report --out", out)) if out else None
+        with ProgressBar("report") as progress:
+            if _is_dataset(arguments):
+                gathered = gather_dataset(arguments.path, num_shown=arguments.samples, progress=progress)
+            else:
+                gathered = gather_captures(
+                    open_captures(arguments.path, arguments, limit=arguments.limit),
+                    pipeline=None if arguments.config is None else load_config(arguments.config).pipeline,
+                    limits=_limits(arguments),
+                    num_shown=arguments.samples,
+                    progress=progress,
+                )
+        if temporary is not None:
+            page = page_of_captures(gathered).encode()
+            Path(temporary).write_bytes(page)
+    grade = gathered.grading.grade()
     print(f"grade    {grade.letter}")
     for reason in grade.reasons[:3]:
         print(f"  {reason}")
-    print(f"page     {arguments.out} ({len(page.encode()) / 1e6:.1f} MB)")
+    if out:
+        print(f"page     {out} ({len(page) / 1e6:.1f} MB)")
+    if arguments.png:
+        from pcdata.report.figures.report_pictures import write_pictures
+
+        written = write_pictures(gathered, arguments.png)
+        print(f"pictures {arguments.png} ({len(written)})")
     return 0
 
 

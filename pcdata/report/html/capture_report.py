@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ import torch
 from pcdata import __version__
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.report.html.charts import VERDICT_COLORS, bars, histogram, time_line
-from pcdata.report.html.gathering import NUM_SHOWN, Gathered, Known, Looked, Progress, gather_captures
+from pcdata.report.html.gathering import NUM_SHOWN, Gathered, Known, Looked, Progress, gather_captures, told_trends
 from pcdata.report.html.page import Section, page_of
 from pcdata.report.html.pictures import png_uri
 from pcdata.report.html.text import shown
@@ -142,15 +141,11 @@ def _captures(grading: Grading, looked: Sequence[Looked], place_of: Mapping[str,
 
 
 def _trends(grading: Grading) -> str:
-    def rank(trend: Any) -> tuple[int, int]:
-        return -trend.verdict.severity, 0
-
-    told = [trend for trend in grading.trends.values() if np.isfinite(np.array(trend.values)).any()]
+    told = told_trends(grading)
     parts = []
-    for trend in sorted(told, key=rank)[:_MOST_TRENDS]:
+    for name, trend in told[:_MOST_TRENDS]:
         values = np.array(trend.values)
         colors = [VERDICT_COLORS[severity] for severity in trend.verdicts]
-        name = " ".join(filter(None, [trend.name, grading.name_of(trend.view)]))
         chart = (
             time_line(values, colors, limit=trend.worst.threshold)
             if len(values) > 1

@@ -15,7 +15,7 @@ from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud,
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms import Compose
 from pcdata.validation import CaptureLimits, validate_source
-from pcdata.validation.grading import Grading
+from pcdata.validation.grading import Grading, Trend
 from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict
 
@@ -227,3 +227,10 @@ def _funnel(looked: Sequence[Looked]) -> tuple[tuple[str, float], ...]:
     same = [chain for chain in chains if [name for name, _ in chain] == names]
     medians = np.median(np.array([[count for _, count in chain] for chain in same]), axis=0).tolist()
     return tuple(zip(names, medians))
+
+
+def told_trends(grading: Grading) -> list[tuple[str, Trend]]:
+    """Return the trends that have numbers, with the check and the view that each is of, the worst first."""
+    told = [trend for trend in grading.trends.values() if np.isfinite(np.array(trend.values)).any()]
+    ranked = sorted(told, key=lambda trend: -trend.verdict.severity)
+    return [(" ".join(filter(None, [trend.name, grading.name_of(trend.view)])), trend) for trend in ranked]

@@ -20,7 +20,7 @@ _VIRIDIS = np.array(
     ],
     dtype=np.float64,
 )
-_NO_READING = (214, 64, 159)  # not in viridis
+NO_READING = (214, 64, 159)  # not in viridis
 _STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Kinect-like sensors up to some metres
 
 
@@ -30,7 +30,7 @@ def depth_picture(frame: DepthFrame, view: int) -> bytes:
     valid = depth > 0
     near, far = np.quantile(depth[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
     image = viridis((depth - near) / max(far - near, 1e-9))
-    image[~valid] = _NO_READING
+    image[~valid] = NO_READING
     return png(image)
 
 

@@ -1,0 +1,163 @@
+"""The page on captures as pictures, for where no browser is: the same grade, clouds, images and numbers."""
+
+from __future__ import annotations
+
+import io
+import re
+import textwrap
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pcdata import extras
+from pcdata.errors import CaptureError
+from pcdata.files.opening import replacing
+from pcdata.report.figures.figure import Panel, figure_of
+from pcdata.report.figures.panels import cloud_panel, funnel_panel, picture_panel, trend_panel
+from pcdata.report.html.gathering import Gathered, Looked, told_trends
+from pcdata.report.labels import label_text
+from pcdata.validation.grading import LETTERS
+from pcdata.verdicts import Verdict
+
+_COLUMNS = 4
+_WIDTH = 3.9  # inches of a panel
+_MOST_TRENDS = 24
+_MOST_REASONS = 10
+_MOST_PANELS = 16  # of one sample
+_TALLEST = 30_000  # pixels of one picture of all: what programs still open
+_OWN = re.compile(r"sample_\d+\.png")
+_LETTER_COLORS = {"A": "#2b7a3f", "B": "#2b7a3f", "C": "#9a6200", "D": "#c02626", "F": "#c02626"}
+
+
+def write_pictures(gathered: Gathered, path: str | Path) -> list[Path]:
+    """Write what was gathered as PNG: one picture where the path ends in ``.png``, else a folder of them.
+
+    A folder holds ``summary.png`` (grade, reasons, points after each step), ``sample_01.png`` and on (of each sample
+    that is shown, the worst first: its images, its cloud after each step) and ``numbers.png`` (every check's number
+    over the samples). Pictures of those names are replaced, samples of an earlier, longer run removed.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        CaptureError: the folder's name is that of a file.
+        WriteError: a file cannot be written.
+    """
+    extras.require("matplotlib")
+    target = Path(path)
+    if target.suffix.lower() == ".png":
+        _write(target, _all_in_one(gathered))
+        return [target]
+    if target.exists() and not target.is_dir():
+        raise CaptureError(f"report --png: {target} is a file; give a folder, or a name that ends in .png")
+    written: list[Path] = []
+    for name, figure in _figures(gathered):
+        target.mkdir(parents=True, exist_ok=True)
+        _write(target / f"{name}.png", _png(figure))
+        written.append(target / f"{name}.png")
+    for file in target.iterdir():
+        if _OWN.fullmatch(file.name) and file not in written:
+            file.unlink()
+    return written
+
+
+def _figures(gathered: Gathered) -> Iterator[tuple[str, Any]]:
+    """Draw one picture after another: none waits in memory for the next."""
+    yield "summary", _summary(gathered)
+    digits = max(2, len(str(len(gathered.looked))))
+    for place, one in enumerate(gathered.looked, 1):
+        yield f"sample_{place:0{digits}}", _sample(gathered, one)
+    if trends := told_trends(gathered.grading):
+        panels: list[Panel] = [partial(trend_panel, trend=trend, name=name) for name, trend in trends[:_MOST_TRENDS]]
+        more = f", {len(trends) - _MOST_TRENDS} more are in pcdata grade --json" if len(trends) > _MOST_TRENDS else ""
+        yield (
+            "numbers",
+            figure_of(panels, title=f"Numbers over the samples{more}", columns=_COLUMNS, width=_WIDTH, height=2.2),
+        )
+
+
+def _summary(gathered: Gathered) -> Any:
+    panels: list[Panel] = [partial(_verdict_panel, gathered=gathered)]
+    if gathered.funnel:
+        panels.append(partial(funnel_panel, funnel=gathered.funnel))
+    # As wide as a row of samples, the verdict beside the funnel.
+    width = _COLUMNS * _WIDTH / len(panels)
+    height = max(4.0, 0.35 * len(gathered.funnel) + 1)
+    return figure_of(panels, title=_title(gathered.title), columns=2, width=width, height=height)
+
+
+def _verdict_panel(axis: Any, gathered: Gathered) -> None:
+    grading = gathered.grading
+    grade = grading.grade()
+    axis.set_axis_off()
+    counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
+    axis.text(0, 1, grade.letter, fontsize=40, fontweight="bold", color=_LETTER_COLORS[grade.letter], va="top")
+    axis.text(0.12, 0.96, f"{LETTERS[grade.letter]}\n{len(grading.ids):,} captures: {counts or 'none'}", va="top")
+    width = 240 if not gathered.funnel else 120
+    lines: list[str] = []
+    for reason in grade.reasons[:_MOST_REASONS]:
+        lines += textwrap.wrap(label_text(reason), width, subsequent_indent="    ", max_lines=3, placeholder=" ...")
+    if len(grade.reasons) > _MOST_REASONS:
+        lines.append(f"and {len(grade.reasons) - _MOST_REASONS} more")
+    if gathered.left_out:
+        lines.append(f"{len(gathered.left_out):,} captures were left out of the dataset")
+    told = "\n".join(lines) or "Nothing that these checks look for is wrong."
+    axis.text(0, 0.78, told, va="top", fontsize=8, linespacing=1.4)
+
+
+def _sample(gathered: Gathered, one: Looked) -> Any:
+    panels: list[Panel] = [partial(picture_panel, caption=picture.caption, png=picture.png) for picture in one.pictures]
+    stages = one.scene.stages if one.scene is not None else ()
+    clouds: list[Panel] = [partial(cloud_panel, stage=stage) for stage in stages]
+    panels = [*panels[: max(_MOST_PANELS - len(clouds), 3)], *clouds]
+    if len(one.funnel) > 1:
+        panels.append(partial(funnel_panel, funnel=one.funnel))
+    if one.problem or not panels:
+        panels.insert(0, partial(_problem_panel, problem=one.problem or "nothing can be shown"))
+    return figure_of(panels, title=_title(one.sample_id), columns=_COLUMNS, width=_WIDTH, height=3.4)
+
+
+def _problem_panel(axis: Any, problem: str) -> None:
+    axis.set_axis_off()
+    told = "\n".join(textwrap.wrap(label_text(problem), 48, max_lines=12, placeholder=" ..."))
+    axis.text(0, 1, told, va="top", fontsize=9, color=_LETTER_COLORS["F"])
+
+
+def _title(text: str) -> str:
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 3})
+    return buffer.getvalue()
+
+
+def _all_in_one(gathered: Gathered) -> bytes:
+    """Stack the pictures of a folder, as wide as the widest, up to what programs still open."""
+    rows: list[np.ndarray] = []
+    left_out = 0
+    for _, figure in _figures(gathered):
+        figure.canvas.draw()
+        image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+        if rows and sum(map(len, rows)) + len(image) > _TALLEST:
+            left_out += 1
+        else:
+            rows.append(image)
+    if left_out:
+        note: Panel = partial(_problem_panel, problem=f"{left_out} pictures more: give a folder instead of a file")
+        figure = figure_of([note], height=1.0)
+        figure.canvas.draw()
+        rows.append(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+    width = max(row.shape[1] for row in rows)
+    whole = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    buffer = io.BytesIO()
+    Image.fromarray(np.concatenate(whole)).save(buffer, format="png", compress_level=3)
+    return buffer.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    with replacing("report --png", path) as temporary:
+        Path(temporary).write_bytes(content)
