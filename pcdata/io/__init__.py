@@ -16,6 +16,9 @@ from pcdata.io.clouds.ply import read_ply, write_ply
 from pcdata.io.images.confidence import read_confidence, write_confidence
 from pcdata.io.images.reading import read_color, read_depth, read_labels, read_mask
 from pcdata.io.images.writing import write_color, write_depth, write_labels, write_mask
+from pcdata.io.libraries.open3d import from_open3d, to_open3d
+from pcdata.io.libraries.open3d_cameras import Open3DView, PosedCamera
+from pcdata.io.libraries.pyg import from_pyg, to_pyg
 from pcdata.io.sources.averaged import AveragedSource
 from pcdata.io.sources.capture_source import CaptureSource, refused_captures
 from pcdata.io.sources.combine import CombinedSource, SubsetSource
@@ -43,6 +46,8 @@ __all__ = [
     "Captures",
     "CombinedSource",
     "JoinedSource",
+    "Open3DView",
+    "PosedCamera",
     "Source",
     "Store",
     "SubsetSource",
@@ -51,6 +56,8 @@ __all__ = [
     "Writer",
     "WrittenReport",
     "convert",
+    "from_open3d",
+    "from_pyg",
     "open_source",
     "read_calibration",
     "read_capture_camera",
@@ -70,6 +77,8 @@ __all__ = [
     "register_layout",
     "register_store",
     "register_writer",
+    "to_open3d",
+    "to_pyg",
     "with_droid_extrinsics",
     "write_calibration",
     "write_capture",

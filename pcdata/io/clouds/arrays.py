@@ -62,9 +62,9 @@ def to_cloud(
     extra: dict[str, torch.Tensor] = {}
     kinds: dict[str, Kind] = {}
     for given, values in arrays.extra.items():
-        name = _free_name(given, extra)
+        name = free_name(given, extra)
         extra[name] = held_tensor(f"{where}: field {given!r}", values[rows])
-        kinds[name] = arrays.kinds.get(given) or _kind(name, extra[name])
+        kinds[name] = arrays.kinds.get(given) or kind_of_column(name, extra[name])
         if KINDS[kinds[name]].is_length:
             extra[name] = extra[name] * unit
     source = statement.source_from_cloud
@@ -141,12 +141,14 @@ def _array(where: str, value: torch.Tensor) -> NDArray[Any]:
     return array.astype(np.uint8) if array.dtype == bool else array
 
 
-def _kind(name: str, value: torch.Tensor) -> Kind:
+def kind_of_column(name: str, value: torch.Tensor) -> Kind:
+    """Return the kind of a field of which only the name is known."""
     # Scanners write a "confidence" of their own as floats; pcdata's levels are bytes.
     return Kind.MINIMUM if name == "confidence" and value.dtype == torch.uint8 else Kind.INVARIANT
 
 
-def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+def free_name(name: str, taken: Mapping[str, Any]) -> str:
+    """Return a name that an extra field can bear: underscores for what no Python name has, or where it is taken."""
     name = "".join(letter if ("_" + letter).isidentifier() else "_" for letter in name)
     if not name.isidentifier():
         name = f"_{name}"
