@@ -20,11 +20,12 @@ from pcdata.io.clouds.ply_header import TYPE_NAMES, parse_header
 from pcdata.io.clouds.ply_rows import vertices_of_bytes
 from pcdata.io.clouds.ply_text import vertices_of_text
 from pcdata.io.clouds.properties import arrays_of_columns
-from pcdata.io.clouds.statement import read_statement, statement_lines
+from pcdata.io.clouds.statement import SCALAR, read_statement, statement_lines
 from pcdata.structures import PointCloud, SurfaceMesh
 
 _MAX_BYTES = 1 << 32
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
+_QUALITY = "quality"
 _ENCODINGS = {"binary": "binary_little_endian", "binary_big_endian": "binary_big_endian", "ascii": "ascii"}
 
 
@@ -74,7 +75,14 @@ def read_ply(
 
 
 @locates_path
-def write_ply(path: str | os.PathLike[str], cloud: PointCloud | SurfaceMesh, *, encoding: str = "binary") -> None:
+def write_ply(
+    path: str | os.PathLike[str],
+    cloud: PointCloud | SurfaceMesh,
+    *,
+    encoding: str = "binary",
+    scalar_names: bool = False,
+    quality: str | None = None,
+) -> None:
     """Write one cloud, or a mesh, as PLY; colors are rounded to 8 bits.
 
     Written: points, normals, colors, labels, extra fields (many columns become ``name_0``, ``name_1``, ...); as
@@ -85,18 +93,28 @@ def write_ply(path: str | os.PathLike[str], cloud: PointCloud | SurfaceMesh, *, 
         cloud: a single cloud, or a mesh: its triangles become the list ``vertex_indices`` of the element ``face``.
         path: the file; it appears complete or not at all.
         encoding: ``binary`` (little endian), ``binary_big_endian`` or ``ascii``.
+        scalar_names: call labels and extra fields ``scalar_label``, ``scalar_confidence``, ...: CloudCompare loads what
+            is called so as scalar fields, and asks about other names.
+        quality: a field of one value a point, such as "labels", that is written once more as the float ``quality``, the
+            one scalar that MeshLab reads; :func:`read_ply` skips it.
 
     Raises:
         ShapeError, UnitError, DTypeError, NonFiniteError, CaptureError: the cloud cannot be stored, and why.
+
+    Source: CloudCompare, ``PlyFilter.cpp`` (names with "SCAL" are scalar fields); vcglib, ``import_ply.h`` (``quality``
+        float, ``red green blue`` uchar).
     """
     where = f"write_ply: {path}"
     if encoding not in _ENCODINGS:
         raise CaptureError(f"{where}: encoding must be in {tuple(_ENCODINGS)}{near_matches(encoding, _ENCODINGS)}")
     faces = cloud.triangles.cpu().numpy() if isinstance(cloud, SurfaceMesh) else None
     cloud = cloud.vertices if isinstance(cloud, SurfaceMesh) else cloud
-    columns = _columns(where, from_cloud(where, cloud))
+    columns = _columns(where, from_cloud(where, cloud), SCALAR if scalar_names else "")
+    if quality is not None:
+        columns[_QUALITY] = _quality(where, cloud, quality, columns)
     lines = ["ply", f"format {_ENCODINGS[encoding]} 1.0"]
-    lines += [f"comment {line}" for line in statement_lines(where, cloud, "label")]
+    labels = f"{SCALAR}label" if scalar_names else "label"
+    lines += [f"comment {line}" for line in statement_lines(where, cloud, labels, quality)]
     lines += [f"element vertex {cloud.num_points}"]
     lines += [f"property {TYPE_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     if faces is not None:
@@ -128,19 +146,35 @@ def _face_bytes(where: str, faces: NDArray[np.int64], is_text: bool, order: str)
     return rows.tobytes()
 
 
-def _columns(where: str, arrays: CloudArrays) -> dict[str, NDArray[Any]]:
-    """Name the (N,) columns."""
+def _quality(where: str, cloud: PointCloud, name: str, columns: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    """Return the values of one field as the float32 that they are drawn by."""
+    fields = cloud.fields()
+    if name not in fields or fields[name].ndim != 1:
+        single = [one for one, values in fields.items() if values.ndim == 1 and one != "source_index"]
+        raise CaptureError(
+            f"{where}: quality must be a field of one value a point{near_matches(name, single)}, got {name!r}; the "
+            f"cloud has {', '.join(single) or 'none'}"
+        )
+    if _QUALITY in columns:
+        raise CaptureError(f"{where}: the cloud has a field 'quality' already; leave quality= out, or rename it")
+    values: NDArray[np.float32] = fields[name].detach().cpu().numpy().astype(np.float32)
+    return values
+
+
+def _columns(where: str, arrays: CloudArrays, prefix: str) -> dict[str, NDArray[Any]]:
+    """Name the (N,) columns; labels and extra fields begin with the prefix."""
     columns: dict[str, NDArray[Any]] = {name: arrays.xyz[:, i] for i, name in enumerate("xyz")}
     if arrays.normals is not None:
         columns |= {name: arrays.normals[:, i] for i, name in enumerate(_NORMALS)}
     if arrays.rgb is not None:
         columns |= {name: arrays.rgb[:, i] for i, name in enumerate(_COLORS)}
     if arrays.labels is not None:
-        columns["label"] = narrowest_int(f"{where}: labels", arrays.labels, ("i4", "u4"))
+        columns[f"{prefix}label"] = narrowest_int(f"{where}: labels", arrays.labels, ("i4", "u4"))
     for name, values in arrays.extra.items():
         parts = {name: values} if values.ndim == 1 else {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
-        for part, column in parts.items():
-            if part in columns or part in (*_NORMALS, *_COLORS, "label"):
+        for plain, column in parts.items():
+            part = f"{prefix}{plain}"
+            if part in columns or part in (*_NORMALS, *_COLORS, "label", f"{prefix}label"):
                 raise CaptureError(f"{where}: an extra field cannot be called {part!r}, which PLY uses already")
             is_long = column.dtype == np.int64  # PLY has no such type
             columns[part] = narrowest_int(f"{where}: {part}", column, ("i4", "u4")) if is_long else column

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError, near_matches
 from pcdata.io.clouds.arrays import CloudArrays
-from pcdata.io.clouds.statement import CloudStatement
+from pcdata.io.clouds.statement import SCALAR, CloudStatement
 from pcdata.structures import Kind
 
 Columns = dict[str, NDArray[Any]]  # (N,), or (N, C) where a format has columns of several values
@@ -68,6 +68,8 @@ def arrays_of_columns(
     xyz = _triple(columns, ("x", "y", "z"))
     if xyz is None:
         raise CaptureError(f"{where}: fields x, y and z are needed, one value each, but the file has {found}")
+    if statement.quality is not None:
+        columns.pop("quality", None)  # a copy for other programs
     stated = {name: _stated(where, name, columns, statement) for name in statement.fields}
     normals = _one_triple(where, columns, _NORMALS, "normals")
     rgb = _one_triple(where, columns, _COLORS, "colors")
@@ -163,9 +165,11 @@ def _label_name(where: str, columns: Columns, statement: CloudStatement, labels_
             f"{' '.join(columns)[:300] or 'none besides the coordinates'}"
         )
     if statement.frame_id is not None:  # a file of pcdata says which column it is
-        if statement.labels is not None and statement.labels not in columns:
-            raise CaptureError(f"{where}: the column {statement.labels!r} of its labels is missing")
-        return statement.labels
+        if statement.labels is None or statement.labels in columns:
+            return statement.labels
+        if f"{SCALAR}{statement.labels}" in columns:
+            return f"{SCALAR}{statement.labels}"
+        raise CaptureError(f"{where}: the column {statement.labels!r} of its labels is missing")
     fitting = [name for name in columns if plain_name(name) in _LABELS and columns[name].ndim == 1]
     if len(fitting) > 1:
         raise CaptureError(
@@ -215,6 +219,8 @@ def _stated(where: str, name: str, columns: Columns, statement: CloudStatement) 
     """Return an extra field that pcdata wrote, as it was."""
     fact = statement.fields[name]
     names = [name] if name in columns or not fact.columns else [f"{name}_{i}" for i in range(fact.columns)]
+    if names[0] not in columns and f"{SCALAR}{names[0]}" in columns:
+        names = [f"{SCALAR}{one}" for one in names]
     missing = [part for part in names if part not in columns]
     if missing:
         raise CaptureError(f"{where}: the comments name the field {name!r}, but its column {missing[0]!r} is missing")

@@ -22,6 +22,7 @@ from pcdata.files.strict_json import parse_json
 from pcdata.geometry import rigid
 from pcdata.structures import CAMERA_FRAME, METRE, NORMALIZED, Kind, PointCloud
 
+SCALAR = "scalar_"  # what CloudCompare puts before the names of scalar fields
 _MARK = "pcdata "
 _LONGEST = 900  # characters: rply, and Open3D's reader of PCD, cut lines at 1024
 _MOST = 100  # frames, or fields
@@ -54,6 +55,7 @@ class CloudStatement:
     unit: str | None = None
     viewpoint: list[float] | None = None
     labels: str | None = None  # the column that holds them
+    quality: str | None = None  # the field of which the column "quality" is a copy
     source_frame: str | None = None
     source_from_cloud: Tensor | None = None
     frames: dict[str, Tensor] = field(default_factory=dict)
@@ -97,13 +99,14 @@ class CloudStatement:
         return given
 
 
-def statement_lines(where: str, cloud: PointCloud, labels: str) -> list[str]:
+def statement_lines(where: str, cloud: PointCloud, labels: str, quality: str | None = None) -> list[str]:
     """Return what :func:`read_statement` reads, one fact a line, ASCII.
 
     Args:
         where: the door, named in the error.
         cloud: a single cloud.
         labels: what the column of its labels is called.
+        quality: the field that is there once more as the column "quality".
 
     Raises:
         CaptureError: a name is too long for a line, or there are too many.
@@ -112,6 +115,8 @@ def statement_lines(where: str, cloud: PointCloud, labels: str) -> list[str]:
     facts.append(("viewpoint", None if cloud.viewpoint is None else cloud.viewpoint[0].tolist()))
     if cloud.labels is not None:
         facts.append(("labels", labels))
+    if quality is not None:
+        facts.append(("quality", quality))
     identity = torch.eye(4, dtype=torch.float64, device="cpu")
     moved = not torch.equal(cloud.source_from_cloud[0].cpu(), identity)
     if moved or cloud.source_frame != cloud.frame_id:
@@ -166,7 +171,7 @@ def read_statement(where: str, comments: Iterable[str]) -> CloudStatement:
 
 def _take(found: CloudStatement, key: str, value: Any) -> None:
     """Store one fact, checked."""
-    if key in ("frame_id", "source_frame", "labels"):
+    if key in ("frame_id", "source_frame", "labels", "quality"):
         setattr(found, key, _text(value))
     elif key == "unit":
         if value not in (METRE, NORMALIZED):

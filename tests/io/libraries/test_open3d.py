@@ -184,8 +184,8 @@ def test_what_cannot_be_a_cloud_is_refused(o3d):
             pcdata.from_open3d(wrong)
         with pytest.raises(DTypeError, match="to_open3d"):
             pcdata.to_open3d(wrong)
-    with pytest.raises(DTypeError, match="no field 'colours'; did you mean 'colors'"):
-        pcdata.to_open3d(full_cloud(), fields=("colours",))
+    with pytest.raises(DTypeError, match="no field 'color'; did you mean 'colors'"):
+        pcdata.to_open3d(full_cloud(), fields=("color",))
     with pytest.raises(DTypeError, match="not one text"):
         pcdata.to_open3d(full_cloud(), fields="colors")
     half = full_cloud().with_extra("half", torch.zeros(40, dtype=torch.float16), "invariant")
