@@ -42,8 +42,8 @@ EXTRAS = {
         _Extra("s3fs", "remote", "datasets at s3://"),
         _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
-        _Extra("open3d", "open3d", "global alignment, and clouds, meshes and cameras for Open3D and from it"),
-        _Extra("torch_geometric", "pyg", "clouds for PyTorch Geometric and from it"),
+        _Extra("open3d", "open3d", "global alignment, and handing clouds, meshes and cameras to Open3D and back"),
+        _Extra("torch_geometric", "pyg", "handing clouds to PyTorch Geometric and back"),
         _Extra(
             "torch_cluster",
             "cluster",

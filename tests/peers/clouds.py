@@ -21,7 +21,9 @@ def _their_oriented_normals(_: object, ours: object, seen: Names) -> None:
 
 OPEN3D = Section(
     "Open3D",
-    "`pcd` is an `o3d.geometry.PointCloud` of the points, `nns` a `NearestNeighborSearch` with its index made.",
+    "`pcd` is an `o3d.geometry.PointCloud` of the points, `nns` a `NearestNeighborSearch` with its index made. "
+    "`pcdata.to_open3d` and `pcdata.from_open3d` hand clouds, meshes, cameras and captures over, without a copy where "
+    "that can be: [exchange.md](exchange.md).",
     (
         Call(
             "pcd.voxel_down_sample(0.05)",
@@ -423,7 +425,8 @@ TORCH_CLUSTER = Section(
 
 PYG = Section(
     "PyTorch Geometric",
-    "A `Data` with `pos` and `batch` is a `pcdata.PointCloud` with `points` and `ptr`.",
+    "A `Data` with `pos` and `batch` is a `pcdata.PointCloud` with `points` and `ptr`; `pcdata.to_pyg` and "
+    "`pcdata.from_pyg` turn one into the other: [exchange.md](exchange.md).",
     (
         Call("Center()(data)", "pcdata.Center()(cloud)", "each cloud of a batch by itself"),
         Call(
