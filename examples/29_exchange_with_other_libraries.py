@@ -23,7 +23,7 @@ assert back.frame_id == "base"
 
 try:
     geometry = pcdata.to_open3d(cloud)  # open3d.t: every field, in the same memory
-    near = geometry.select_by_mask((geometry.point["positions"][:, 2] < 0.2))
+    near = geometry.select_by_mask(geometry.point["positions"][:, 2] < 0.2)
     print("Open3D:", pcdata.from_open3d(near, like=cloud))  # the frame, and the way back to the source
     views = pcdata.to_open3d(frame, legacy=True, fields=("colors",))  # image, intrinsic, extrinsic of each
     print("Open3D:", views[0].intrinsic)
