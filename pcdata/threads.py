@@ -7,11 +7,16 @@ lasts until the system gives it back, milliseconds later: a hundred operations o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 import torch
+
+One = TypeVar("One")
+Other = TypeVar("Other")
 
 _core_threads: ContextVar[int | None] = ContextVar("core_threads", default=None)
 
@@ -39,3 +44,17 @@ def torch_on_one_thread() -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _core_threads.reset(token)
+
+
+def in_threads(function: Callable[[One], Other], items: Iterable[One]) -> list[Other]:
+    """Return what a function gives for each item, in order; as many at a time as the core may use threads.
+
+    For work of milliseconds in torch, NumPy and the core, which let other threads run meanwhile. The function must not
+    change what the others read. Of errors the first in order is raised.
+    """
+    given = list(items)
+    count = min(core_threads(), len(given))
+    if count < 2:
+        return [function(one) for one in given]
+    with torch_on_one_thread(), ThreadPoolExecutor(count) as pool:
+        return list(pool.map(function, given))

@@ -77,3 +77,25 @@ def test_a_command_lets_threads_wait_asleep():
 
 def test_what_the_user_says_about_waiting_stays():
     assert waits(OMP_WAIT_POLICY="active") == ["active", None]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_runs_in_threads_comes_back_in_order(threads):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        assert in_threads(lambda n: (time.sleep(0.01 * (3 - n)), n)[1], range(4)) == [0, 1, 2, 3]
+        assert torch.get_num_threads() == threads
+        seen = in_threads(lambda _: torch.get_num_threads(), range(4))
+        assert set(seen) == {1}
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_first_error_of_threads_is_raised():
+    def fails(number: int) -> None:
+        if number:
+            raise ValueError(number)
+
+    with pytest.raises(ValueError, match="1"):
+        in_threads(fails, range(4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -60,31 +61,31 @@ def fit_depth_patches(
     first = stride = halves[0]
     size = (depth.shape[0], depth.shape[1])
     rays, steps = _rays_at_centers(intrinsics, size, distortion, first, stride)
-    taken = _fit(depth, halves[0], first, stride)
+    images = _Images.of(depth)
+    taken = _fit(images, _Windows(size, halves[0], first, stride))
     holds = taken.holds
-    floor = _FLOOR_ROUGHNESS * taken.coefficients[..., 0].square()
+    floor = _FLOOR_ROUGHNESS * taken.coefficients[0].square()
     noise = taken.variance[holds].median().sqrt() if bool(holds.any()) else floor.new_zeros(())
     allowed = torch.maximum(noise, floor).square()
     holds = holds & (taken.variance <= _MAX_ROUGHNESS**2 * allowed)
     half = torch.where(holds, halves[0], 0)
     for wider in halves[1:]:
-        fit = _fit(depth, wider, first, stride)
+        fit = _fit(images, _Windows(size, wider, first, stride))
         freedom = (fit.pixels - 6).clamp(min=1)
         good = fit.holds & holds & (fit.variance <= allowed * (1 + _MAX_EXCESS * (2 / freedom).sqrt()))
-        taken = _Fit(
-            *(torch.where(good.reshape(good.shape + (1,) * (old.ndim - 2)), new, old) for old, new in zip(taken, fit))
-        )
+        taken = _Fit(*(torch.where(good, new, old) for old, new in zip(taken, fit)))
         half = torch.where(good, wider, half)
-    inverse_depth = taken.coefficients[..., 0]
+    coefficients = taken.coefficients.permute(1, 2, 0).contiguous()
+    inverse_depth = coefficients[..., 0]
     holds = holds & (inverse_depth > 0)
     safe = torch.where(holds, inverse_depth, 1.0)
-    normals = patch_normals(taken.coefficients[..., :3], rays, steps)
+    normals = patch_normals(coefficients[..., :3], rays, steps)
     cosine = -(normals * rays).sum(-1)  # times the ray's length
     holds = holds & torch.isfinite(cosine) & (cosine >= MIN_COSINE * rays.norm(dim=-1))
     # An error e of 1/z moves the surface by e / (1/z)^2 along the ray, and by the cosine of that along its normal.
     sigma = noise * cosine / safe.square() / stride
     return DepthPatches(
-        coefficients=taken.coefficients,
+        coefficients=coefficients,
         points=rays / safe[..., None],
         normals=normals,
         depth=torch.where(holds, 1 / safe, 0.0),
@@ -110,58 +111,131 @@ def patch_normals(
     return torch.nn.functional.normalize(torch.linalg.cross(tangents[1], tangents[0]), dim=-1)
 
 
+class _Images(NamedTuple):
+    """What is summed over windows; (H, W) float64 each, 0 where there is no reading."""
+
+    read: Tensor  # 1 = a reading
+    inverse: Tensor  # 1/z
+    square: Tensor  # of that
+
+    @classmethod
+    def of(cls, depth: Tensor) -> _Images:
+        inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0).double(), 0.0)
+        return cls((depth > 0).double(), inverse, inverse.square())
+
+
 class _Fit(NamedTuple):
     """Least squares of every window of one width."""
 
-    coefficients: Tensor  # (h, w, 6)
+    coefficients: Tensor  # (6, h, w)
     variance: Tensor  # (h, w) of 1/z about the patch
     slope_spread: Tensor  # (h, w) standard deviation of the steeper of b and c for pixels of unit variance
     pixels: Tensor  # (h, w) that have a reading
     holds: Tensor  # (h, w) bool, enough pixels
 
 
-def _fit(depth: Tensor, half: int, first: int, stride: int) -> _Fit:
-    """Fit the windows that reach ``half`` pixels from their centers; pixels beyond the image have no reading."""
-    valid = (depth > 0).double()
-    inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0).double(), 0.0)
-    weight = _window_moments(valid, half, first, stride, 4)
-    moment = _window_moments(inverse, half, first, stride, 2)
-    square = _window_moments(inverse.square(), half, first, stride, 0)[..., 0, 0]
-    # Moment (v, u) of degree 4 and of degree 2, in the order of the unknowns.
-    pairs = torch.tensor(
-        [[5 * (v + b) + u + a for a, b in _POWERS] for u, v in _POWERS], dtype=torch.int64, device=depth.device
-    )
-    singles = torch.tensor([3 * v + u for u, v in _POWERS], dtype=torch.int64, device=depth.device)
-    normal = weight.flatten(-2)[..., pairs.flatten()].unflatten(-1, (6, 6))
-    right = moment.flatten(-2)[..., singles]
-    count = normal[..., 0, 0]
-    holds = count >= _MIN_VALID * (2 * half + 1) ** 2
-    one = torch.eye(6, dtype=torch.float64, device=depth.device)
-    factor, failed = torch.linalg.cholesky_ex(torch.where(holds[..., None, None], normal, one))
-    holds = holds & (failed == 0)
-    factor = torch.where(holds[..., None, None], factor, one)
-    solution = torch.cholesky_solve(right[..., None], factor)[..., 0]
-    residual = (square - (solution * right).sum(-1)).clamp(min=0)
+def _fit(images: _Images, windows: _Windows) -> _Fit:
+    """Fit the windows; pixels beyond the image have no reading."""
+    moments = [windows.down(one, degree=4 - u) for u, one in enumerate(windows.across(images.read, degree=4))]
+    along_u = windows.across(images.inverse, degree=2)
+    by_power = [windows.down(one, degree=2 - u) for u, one in enumerate(along_u)]
+    (square,) = windows.down(windows.across(images.square, degree=0)[0], degree=0)
+    right = [by_power[u][v] for u, v in _POWERS]
+    normal = [[moments[u + a][v + b] for a, b in _POWERS[: row + 1]] for row, (u, v) in enumerate(_POWERS)]
+    solution, solved = _solve(normal, right)
+    count, half = moments[0][0], windows.half
+    residual = square
+    for one, other in zip(solution, right):
+        residual = torch.addcmul(residual, one, other, value=-1)
     # The moments were taken over offsets in half windows, so that high powers stay near 1.
-    scale = solution.new_tensor([half ** -(u + v) for u, v in _POWERS])
-    slope = torch.minimum(normal[..., 1, 1], normal[..., 2, 2]).clamp(min=1e-12).rsqrt() / half
-    return _Fit(solution * scale, residual / (count - 6).clamp(min=1), slope, count, holds)
+    return _Fit(
+        torch.stack([one * half ** -(u + v) for one, (u, v) in zip(solution, _POWERS)]),
+        residual.clamp(min=0) / (count - 6).clamp(min=1),
+        torch.minimum(normal[1][1], normal[2][2]).clamp(min=1e-12).rsqrt() / half,
+        count,
+        solved & (count >= _MIN_VALID * (2 * half + 1) ** 2),
+    )
 
 
-def _window_moments(image: Tensor, half: int, first: int, stride: int, degree: int) -> Tensor:
-    """Sum image * v^i u^j over each window, i, j = 0 to degree: (h, w, degree + 1, degree + 1), in half windows."""
-    offset = torch.arange(-half, half + 1, dtype=torch.float64, device=image.device) / half
-    powers = offset[:, None] ** torch.arange(degree + 1, dtype=torch.int64, device=image.device)
-    height, width = image.shape
-    if height <= 2 * first or width <= 2 * first:
-        down, across = (len(range(first, length - first, stride)) for length in (height, width))
-        return image.new_zeros(down, across, degree + 1, degree + 1)
-    # Row i of the padded image is row i - half of the image: the window about center c starts at row c.
-    padded = torch.nn.functional.pad(image, (half,) * 4)[
-        first : height - first + 2 * half, first : width - first + 2 * half
-    ]
-    along_u = padded.unfold(1, 2 * half + 1, stride) @ powers
-    return (along_u.unfold(0, 2 * half + 1, stride) @ powers).transpose(-1, -2)
+def _solve(normal: Sequence[Sequence[Tensor]], right: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Solve normal equations, one of each pixel of the images that are their entries: the lower triangle, by rows.
+
+    Returns the unknowns, and where the equations determine them.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., section 4.1.2: L D L^T.
+    """
+    lower: list[list[Tensor]] = []  # L[i][k] for k < i
+    pivots: list[Tensor] = []
+    solved = torch.ones_like(right[0], dtype=torch.bool)
+    for row in normal:
+        left: list[Tensor] = []
+        scaled: list[Tensor] = []  # L[i][k] D[k]
+        for k, entry in enumerate(row[:-1]):
+            for inner, other in zip(scaled, lower[k]):
+                entry = torch.addcmul(entry, inner, other, value=-1)
+            scaled.append(entry)
+            left.append(entry / pivots[k])
+        pivot = row[-1]
+        for one, other in zip(left, scaled):
+            pivot = torch.addcmul(pivot, one, other, value=-1)
+        solved = solved & (pivot > 0)
+        pivots.append(torch.where(solved, pivot, 1.0))
+        lower.append(left)
+    found: list[Tensor] = []
+    for i, one in enumerate(right):
+        for k in range(i):
+            one = torch.addcmul(one, lower[i][k], found[k], value=-1)
+        found.append(one)
+    found = [one / pivot for one, pivot in zip(found, pivots)]
+    for i in reversed(range(len(found))):
+        for k in range(i + 1, len(found)):
+            found[i] = torch.addcmul(found[i], lower[k][i], found[k], value=-1)
+    return found, solved
+
+
+class _Windows:
+    """Sums over square windows on a grid, weighted by powers of the offset from the center, in half windows.
+
+    The two pixels at one distance from the center are added for even powers and subtracted for odd ones, so that each
+    sum is a few additions of whole images.
+    """
+
+    def __init__(self, size: tuple[int, int], half: int, first: int, stride: int) -> None:
+        self.half, self._first, self._stride = half, first, stride
+        self._counts = [len(range(first, length - first, stride)) for length in size]
+
+    def across(self, image: Tensor, *, degree: int) -> list[Tensor]:
+        """Sum along rows: (H, w) for the powers 0 to ``degree``."""
+        padded = torch.nn.functional.pad(image, (self.half, self.half))
+        # Pixels of one phase of the stride lie side by side: what is added is contiguous.
+        phases = [padded[:, phase :: self._stride].contiguous() for phase in range(self._stride)]
+
+        def at(offset: int) -> Tensor:
+            step, phase = divmod(self._first + self.half + offset, self._stride)
+            return phases[phase][:, step : step + self._counts[1]]
+
+        return self._sums(at, degree)
+
+    def down(self, image: Tensor, *, degree: int) -> list[Tensor]:
+        """Sum along columns: (h, w) of an image (H, w) for the powers 0 to ``degree``."""
+        padded = torch.nn.functional.pad(image, (0, 0, self.half, self.half))
+
+        def at(offset: int) -> Tensor:
+            return padded[self._first + self.half + offset :: self._stride][: self._counts[0]]
+
+        return self._sums(at, degree)
+
+    def _sums(self, at: Callable[[int], Tensor], degree: int) -> list[Tensor]:
+        sums = [at(0).clone(), *(torch.zeros_like(at(0)) for _ in range(degree))]
+        for distance in range(1, self.half + 1):
+            before, after = at(-distance), at(distance)
+            both = before + after
+            sums[0] += both
+            if degree:
+                apart = after - before
+                for power in range(1, degree + 1):
+                    sums[power].add_(apart if power % 2 else both, alpha=(distance / self.half) ** power)
+        return sums
 
 
 def _rays_at_centers(
@@ -169,7 +243,9 @@ def _rays_at_centers(
 ) -> tuple[Tensor, Tensor]:
     """Return the rays (h, w, 3) of the windows' centers and how they change from pixel to pixel (h, w, 2, 2)."""
     rays = pixel_rays(intrinsics[None].double(), size, None if distortion is None else distortion[None].double())[0]
-    rows, columns = (slice(first, max(length - first, first), stride) for length in size)
-    by_v, by_u = torch.gradient(rays, dim=(0, 1)) if min(size) > 1 else (torch.zeros_like(rays),) * 2
-    steps = torch.stack([by_u[rows, columns], by_v[rows, columns]], -2)
-    return torch.nn.functional.pad(rays[rows, columns], (0, 1), value=1.0), steps
+    at, before, after = (
+        [slice(first + step, max(length - first, first) + step, stride) for length in size] for step in (0, -1, 1)
+    )
+    by_u = (rays[at[0], after[1]] - rays[at[0], before[1]]) / 2
+    by_v = (rays[after[0], at[1]] - rays[before[0], at[1]]) / 2
+    return torch.nn.functional.pad(rays[at[0], at[1]], (0, 1), value=1.0), torch.stack([by_u, by_v], -2)

@@ -67,14 +67,15 @@ def stage_of(
         most_points: drawn of it.
     """
     packed = pack_cloud(cloud, most_points=most_points)
-    extent = _extent(cloud)
+    low, high = _bounds(cloud)
+    extent = float(np.linalg.norm(high - low)) or 1.0
     lines = [*_axes(extent), *_frusta(cloud, extent), *_planes(cloud), *_objects(cloud)]
     if isinstance(step, CropWorkspace) and step.frame == cloud.frame_id:
         lines.append(_box("workspace", "#8e4ec6", np.array(step.lower), np.array(step.upper)))
     if grasps is not None and len(grasps):
         lines.append(_forks(grasps.detach().cpu().double().numpy()))
     packed.said["up"] = _up(cloud)
-    packed.said["view"] = _view(cloud)
+    packed.said["view"] = _view(cloud, low, high)
     return Stage(caption, packed, tuple(lines))
 
 
@@ -100,21 +101,14 @@ def raw_cloud(frame: DepthFrame) -> PointCloud:
     return cloud
 
 
-def _extent(cloud: PointCloud) -> float:
-    if not cloud.num_points:
-        return 1.0
-    low, high = _bounds(cloud)
-    return float(np.linalg.norm(high - low)) or 1.0
-
-
 def _bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where most points are: far strays do not make the rest small."""
-    points = cloud.points.detach().cpu().double().numpy()
+    points = cloud.points.detach().cpu()
     if not len(points):
         return -np.ones(3), np.ones(3)
-    some = points[:: max(1, len(points) // 20_000)]
+    some = points[:: max(1, len(points) // 20_000)].double().numpy()
     low, high = np.quantile(some, [0.01, 0.99], axis=0)
-    all_low, all_high = points.min(0), points.max(0)
+    all_low, all_high = (end.double().numpy() for end in points.aminmax(dim=0))
     strays = np.linalg.norm(all_high - all_low) > 1.5 * np.linalg.norm(high - low)
     return (low, high) if strays else (all_low, all_high)
 
@@ -127,8 +121,7 @@ def _up(cloud: PointCloud) -> list[float]:
     return [0.0, -1.0, 0.0] if _is_camera(cloud) else [0.0, 0.0, 1.0]
 
 
-def _view(cloud: PointCloud) -> dict[str, list[float]]:
-    low, high = _bounds(cloud)
+def _view(cloud: PointCloud, low: NDArray[np.float64], high: NDArray[np.float64]) -> dict[str, list[float]]:
     # From the lens, a little aside and above, so that depth is seen; else obliquely from above.
     toward = [0.25, -0.35, -1.0] if _is_camera(cloud) else [0.6, -1.0, 0.8]
     return {"lower": low.tolist(), "upper": high.tolist(), "up": _up(cloud), "toward": toward}

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from pcdata.structures import DepthFrame
+from pcdata.threads import in_threads
 from pcdata.validation.capture_check import register_check
 from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.measures.edge_offset import (
@@ -64,9 +65,9 @@ def color_on_depth(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Fi
     """Judge the shift between color and depth at the rims of near surfaces, in every view that has color."""
     if frame.colors is None:
         return []
-    found = [edge_votes(depth, colors) for depth, colors in zip(frame.depth, frame.colors)]
+    found = in_threads(lambda pair: edge_votes(*pair), zip(frame.depth, frame.colors))
     votes.add(found)
-    return [_judged(*one, limits, view) for view, one in enumerate(found)]
+    return in_threads(lambda view: _judged(*found[view], limits, view), range(len(found)))
 
 
 def _judged(votes: Tensor, num_edges: int, limits: CaptureLimits, view: int) -> Finding:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pcdata.functional.depth.stored_depth import MARKS
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.threads import in_threads
 from pcdata.validation.capture_check import register_check
 from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.checks.depth_unit import depth_unit_check
@@ -54,11 +55,13 @@ def readings(capture: DepthFrame | PointCloud, limits: CaptureLimits, before: Se
     """Judge every view; of a cloud z in a camera's frame, elsewhere the distance from the viewpoint."""
     if isinstance(capture, PointCloud):
         return _judged(_depth_of(capture), limits)
-    found = []
-    for view, depth in enumerate(capture.depth):
-        focal = float(capture.camera.intrinsics[view, 0, 0])
-        found += _judged(depth, limits, facts=capture.provenance, focal=focal, view=view)
-    return found
+    frame = capture
+
+    def judged(view: int) -> list[Finding]:
+        focal = float(frame.camera.intrinsics[view, 0, 0])
+        return _judged(frame.depth[view], limits, facts=frame.provenance, focal=focal, view=view)
+
+    return [finding for found in in_threads(judged, range(frame.num_views)) for finding in found]
 
 
 def _depth_of(cloud: PointCloud) -> Tensor:

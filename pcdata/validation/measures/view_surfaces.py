@@ -12,6 +12,7 @@ from pcdata.errors import FrameError, ShapeError, UnitError
 from pcdata.functional.rows import transform_points
 from pcdata.geometry import rigid
 from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, PointCloud
+from pcdata.threads import in_threads
 
 
 def surfaces_of(
@@ -35,16 +36,12 @@ def surfaces_of(
             f"{where}: capture {capture.sample_id!r} has no world_from_camera; its views are not related to each other"
         )
     camera = capture.camera.to(capture.device)
-    surfaces = [
-        depth_surface(
-            capture.depth[view],
-            camera.intrinsics[view],
-            None if camera.distortion is None else camera.distortion[view],
-            max_samples=max_samples,
-        )
-        for view in range(capture.num_views)
-    ]
-    return surfaces, capture.world_from_camera
+
+    def surface(view: int) -> Surface:
+        lens = None if camera.distortion is None else camera.distortion[view]
+        return depth_surface(capture.depth[view], camera.intrinsics[view], lens, max_samples=max_samples)
+
+    return in_threads(surface, range(capture.num_views)), capture.world_from_camera
 
 
 def _of_clouds(where: str, cloud: PointCloud, max_samples: int) -> tuple[list[Surface], Tensor]:
