@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import torch
 
 import pcdata
 from pcdata.synthetic import SyntheticSource, tabletop
-from pcdata.threads import core_threads, torch_on_one_thread
+from pcdata.threads import core_threads, in_threads, torch_on_one_thread
 from pcdata.validation import validate_frame, validate_source
 
 
