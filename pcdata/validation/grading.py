@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.structures import Episode
+from pcdata.validation.by_camera import cameras_of
 from pcdata.validation.summary import SampleReport, Summary
 from pcdata.verdicts import Finding, Verdict, finite_json
 
@@ -94,13 +95,12 @@ class Grading:
     Args:
         ids: the captures, in order.
         episodes: over them, where the source has some.
-        names: of the views, such as ``view 0 (wrist)``; numbers where there are none.
     """
 
-    def __init__(self, ids: Sequence[str], episodes: Sequence[Episode] = (), names: Sequence[str] = ()) -> None:
+    def __init__(self, ids: Sequence[str], episodes: Sequence[Episode] = ()) -> None:
         self.ids = ids
         self.episodes = episodes
-        self.names = names
+        self.names: list[str] = []  # of the views, such as "view 0 (wrist)"; the number alone where captures differ
         self.summary = Summary()
         self.trends: dict[tuple[str, int | None], Trend] = {}
         self.together: list[tuple[str, Finding]] = []  # about all captures of a recording: its name, what was found
@@ -113,6 +113,11 @@ class Grading:
         if report.whole:
             self.together += [(report.sample_id, finding) for finding in report.findings]
             return
+        for view, name in enumerate(report.views):
+            if view == len(self.names):
+                self.names.append(name)
+            elif self.names[view] != name:
+                self.names[view] = f"view {view}"
         place, self._place = self._place, self._place + 1
         self.sample_verdicts[place] = report.verdict.severity
         for finding in report.findings:
@@ -195,6 +200,7 @@ class Grading:
                 "reasons": list(grade.reasons),
                 "captures": {verdict.value: self.count(verdict) for verdict in Verdict},
                 "checks": [self._trend_json(trend) for trend in self.trends.values()],
+                "cameras": [camera.to_json() for camera in cameras_of(self)],
                 "together": [{"recording": name, **finding.to_json()} for name, finding in self.together],
                 "episodes": [self._episode_json(episode) for episode in self.episodes],
             }

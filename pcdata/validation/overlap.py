@@ -119,11 +119,7 @@ def judge_alignment(
         max_angle=math.radians(limits.rotation_degrees[0]),
         reference=reference,
     )
-    pairs = tuple(
-        _pair(one, _opposite(alignment.before, one), names, limits)
-        for one in alignment.before
-        if one.source < one.target
-    )
+    pairs = pairs_of(alignment.before, names, limits)
     suspects = consensus.wrong or consensus.candidates
     cameras = tuple(
         _camera(
@@ -145,6 +141,11 @@ def judge_alignment(
         reference=names[consensus.reference],
         limits=limits,
     )
+
+
+def pairs_of(fits: Sequence[PairFit], names: Sequence[str], limits: OverlapLimits) -> tuple[PairOverlap, ...]:
+    """Judge every two views by how they were measured, in both directions."""
+    return tuple(_pair(one, _opposite(fits, one), names, limits) for one in fits if one.source < one.target)
 
 
 def _pair(fit: PairFit, back: PairFit, names: Sequence[str], limits: OverlapLimits) -> PairOverlap:

@@ -16,6 +16,7 @@ from pcdata.validation import checks as _checks  # noqa: F401  # registers them
 from pcdata.validation.capture_check import CHECKS, Check
 from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.summary import WHOLE, SampleReport
+from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict
 
 # What a reader refuses is the failure of a check too; of errors that fit none, it is of this one.
@@ -77,7 +78,8 @@ def _reports(source: CaptureSource, limits: CaptureLimits) -> Iterator[SampleRep
     for ids, name in zip(recordings, _names_of(recordings)):
         series = _Series(limits)
         for sample_id in ids:
-            yield SampleReport(sample_id, tuple(series.check(source, sample_id)))
+            series.views = ()
+            yield SampleReport(sample_id, tuple(series.check(source, sample_id)), views=series.views)
         if whole := series.whole():
             yield SampleReport(name, tuple(whole), whole=True)
 
@@ -120,6 +122,7 @@ class _Series:
     def __init__(self, limits: CaptureLimits) -> None:
         self._limits = limits
         self._checks = [(check, check.memory()) for check in CHECKS.values()]
+        self.views: tuple[str, ...] = ()  # of the last capture
 
     @torch_on_one_thread()
     def check(self, source: CaptureSource, sample_id: str) -> list[Finding]:
@@ -141,6 +144,8 @@ class _Series:
                 f"validate_source: {source!r} gives a {type(capture).__name__} for {sample_id!r}; load must return a "
                 "DepthFrame or a PointCloud"
             )
+        if isinstance(capture, DepthFrame):
+            self.views = tuple(view_names(capture.provenance, capture.num_views))
         for check, memory in self._checks:
             if isinstance(capture, check.of):
                 found += _asked(check, check.judge, capture, self._limits, found, *memory)

@@ -23,6 +23,7 @@ class SampleReport:
     sample_id: str
     findings: tuple[Finding, ...]
     whole: bool = False  # it is about a recording; its id is WHOLE, or ends so
+    views: tuple[str, ...] = ()  # what its views are called; () = it has none, or was not read
 
     @property
     def verdict(self) -> Verdict:

@@ -15,13 +15,14 @@ IDS = [f"c{place:02}" for place in range(20)]
 
 
 def graded(verdicts: dict[int, Verdict], *, view: int = 1, whole: Verdict | None = None, **options) -> Grading:
+    names = options.pop("names", ())
     grading = Grading(IDS, **options)
     for place, sample_id in enumerate(IDS):
         verdict = verdicts.get(place, Verdict.PASS)
         found = Finding(
             name="noise", verdict=verdict, found=f"{place} mm", value=float(place), view=view, advice="mend"
         )
-        grading.add(SampleReport(sample_id, (found, Finding(name="other"))))
+        grading.add(SampleReport(sample_id, (found, Finding(name="other")), views=tuple(names)))
     if whole is not None:
         grading.add(SampleReport(WHOLE, (Finding(name="poses", verdict=whole, found="mixed"),), whole=True))
     return grading

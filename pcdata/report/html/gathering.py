@@ -5,17 +5,21 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from pcdata.errors import PcdataError
 from pcdata.io.sources.capture_source import CaptureSource, episodes_of
+from pcdata.report.html.episode_lines import EpisodeLine, episode_lines
+from pcdata.report.html.overlaps import overlap_of
 from pcdata.report.html.pictures import color_picture, confidence_picture, depth_picture, edges_picture
-from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
-from pcdata.structures import DepthFrame, PointCloud
-from pcdata.transforms import Compose
+from pcdata.report.html.scene import MOST_POINTS, SampleScene, raw_cloud, stage_of, stages_of
+from pcdata.structures import METRE, DepthFrame, PointCloud
+from pcdata.transforms import Compose, Transform, describe_objects
 from pcdata.validation import CaptureLimits, validate_source
 from pcdata.validation.grading import Grading, Trend
+from pcdata.validation.overlap_result import PairOverlap
 from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict
 
@@ -65,13 +69,18 @@ class Looked:
         pictures: of its depth images.
         funnel: (step, points after it) in order.
         problem: why it cannot be shown.
+        pairs: how the surfaces of every two of its views lie on each other.
+        objects: (length, width, height) in metres of the box of every object that a step told apart, the largest first;
+            None where none did.
     """
 
     sample_id: str
-    scene: SampleScene | None
-    pictures: tuple[Picture, ...]
-    funnel: tuple[tuple[str, int], ...]
+    scene: SampleScene | None = None
+    pictures: tuple[Picture, ...] = ()
+    funnel: tuple[tuple[str, int], ...] = ()
     problem: str = ""
+    pairs: tuple[PairOverlap, ...] = ()
+    objects: tuple[tuple[float, float, float], ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +95,7 @@ class Gathered:
         funnel: (step, median points after it) in order.
         left_out: captures that are not in the dataset, and why.
         pipeline: the steps as YAML, "" = none.
+        lines: some episodes over time, the worst first; a recording without episodes as one.
     """
 
     title: str
@@ -95,6 +105,7 @@ class Gathered:
     funnel: tuple[tuple[str, float], ...]
     left_out: Mapping[str, str]
     pipeline: str
+    lines: tuple[EpisodeLine, ...]
 
 
 def gather_captures(
@@ -137,7 +148,7 @@ def gather_captures(
             if progress is not None:
                 progress(place + 1, total, report.sample_id)
     places = _places_shown(worst, total, num_shown)
-    looked = tuple(look(source, place, pipeline=pipeline, num_shown=num_shown, grading=grading) for place in places)
+    looked = tuple(look(source, place, pipeline=pipeline, num_shown=num_shown) for place in places)
     return Gathered(
         title=title or str(source),
         source=str(source),
@@ -146,6 +157,7 @@ def gather_captures(
         funnel=known.funnel or _funnel(looked),
         left_out=known.left_out,
         pipeline=known.pipeline or (pipeline.to_yaml() if pipeline else ""),
+        lines=episode_lines(source, grading),
     )
 
 
@@ -163,41 +175,55 @@ def look(
     *,
     pipeline: Compose | None = None,
     num_shown: int = 1,
-    grading: Grading | None = None,
 ) -> Looked:
-    """Return what is shown of one capture of ``num_shown``; a grading without names of views is given them."""
+    """Return what is shown of one capture of ``num_shown``."""
     sample_id = source.ids[place]
     most_points = min(2 * MOST_POINTS, _MOST_BYTES // (_BYTES_PER_POINT * max(num_shown, 1)))
     try:
         capture = source.load(sample_id)
-        if isinstance(capture, DepthFrame) and grading is not None and not grading.names:
-            grading.names = view_names(capture.provenance, capture.num_views)
     except PcdataError as error:
-        return Looked(sample_id, None, (), (), f"cannot be read: {error}")
-    pictures = tuple(_pictures(capture)) if isinstance(capture, DepthFrame) else ()
-    stages, funnel, problem = _stages(capture, pipeline, most_points)
-    return Looked(sample_id, SampleScene(sample_id, stages) if stages else None, pictures, funnel, problem)
-
-
-def _stages(
-    capture: DepthFrame | PointCloud, pipeline: Compose | None, most_points: int
-) -> tuple[tuple[Stage, ...], tuple[tuple[str, int], ...], str]:
-    """Return the clouds after the steps, the points of each, and why there are none; then the capture is shown."""
-    problem = ""
-    if pipeline is not None:
+        return Looked(sample_id, problem=f"cannot be read: {error}")
+    overlap = overlap_of(capture) if isinstance(capture, DepthFrame) else None
+    steps, problem = _steps(capture, pipeline)
+    clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
+    stages = stages_of(steps, most_points=most_points)
+    if not stages or overlap is not None:
         try:
-            steps = list(pipeline.split()[0].step_through(capture))
-            funnel = tuple(
-                (type(step).__name__, data.num_points) for step, data in steps if isinstance(data, PointCloud)
-            )
-            return stages_of(steps, most_points=most_points), funnel, ""
+            cloud = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
+            most = min(most_points // (len(clouds) + 1), MOST_POINTS)
+            shown = cloud if overlap is None else overlap.shown_on(cloud, most)
+            stages = (stage_of("capture", shown, most_points=most, total=cloud.num_points), *stages)
         except PcdataError as error:
-            problem = "; ".join([str(error), *getattr(error, "__notes__", ())])
+            problem = problem or str(error)
+    return Looked(
+        sample_id,
+        scene=SampleScene(sample_id, stages) if stages else None,
+        pictures=tuple(_pictures(capture)) if isinstance(capture, DepthFrame) else (),
+        funnel=tuple((type(step).__name__, cloud.num_points) for step, cloud in clouds),
+        problem=problem,
+        pairs=() if overlap is None else overlap.pairs,
+        objects=_boxes(clouds[-1][1] if clouds else capture),
+    )
+
+
+def _steps(capture: DepthFrame | PointCloud, pipeline: Compose | None) -> tuple[list[tuple[Transform, Any]], str]:
+    """Return what every step of a pipeline left, and why it could not be gone through."""
+    if pipeline is None:
+        return [], ""
     try:
-        cloud = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
-        return (stage_of("capture", cloud, most_points=min(most_points, MOST_POINTS)),), (), problem
+        return list(pipeline.split()[0].step_through(capture)), ""
     except PcdataError as error:
-        return (), (), problem or str(error)
+        return [], "; ".join([str(error), *getattr(error, "__notes__", ())])
+
+
+def _boxes(data: DepthFrame | PointCloud) -> tuple[tuple[float, float, float], ...] | None:
+    """Return the sizes of the boxes of a cloud's objects; None where no step told objects apart on a plane."""
+    if not isinstance(data, PointCloud) or data.num_clouds != 1 or "objects" not in data.meta[0]:
+        return None
+    if data.labels is None or not data.meta[0].get("planes") or data.unit != METRE:
+        return None
+    sizes = [one.size.tolist() for one in describe_objects(data)]
+    return tuple((x, y, z) for x, y, z in sorted(sizes, reverse=True))
 
 
 def _pictures(frame: DepthFrame) -> Iterator[Picture]:

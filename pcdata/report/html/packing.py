@@ -160,7 +160,11 @@ def _scalar(columns: _Columns, name: str, value: NDArray[Any]) -> dict[str, Any]
     numbers = value.astype(np.float64)
     finite = np.isfinite(numbers)
     low, step = _range_of(numbers[finite][:, None]) if finite.any() else (np.zeros(1), np.zeros(1))
-    numbers = np.where(finite, numbers, low[0])  # shown as the smallest: a page has no NaN
-    offset = columns.add(np.rint((numbers - low[0]) / (step[0] or 1.0)), "uint16")
-    said = {"name": name, "kind": "scalar", "type": "uint16", "num": 1, "low": float(low[0]), "step": float(step[0])}
-    return {**said, "offset": offset}
+    said = {"name": name, "kind": "scalar", "type": "uint16", "num": 1, "low": float(low[0])}
+    if not finite.all():  # a page has no NaN: its highest level is none
+        step = step * (_LEVELS / (_LEVELS - 1))
+        said["none"] = _LEVELS
+    levels = np.rint((np.where(finite, numbers, low[0]) - low[0]) / (step[0] or 1.0))
+    levels = np.where(finite, levels, _LEVELS)
+    said["step"] = float(step[0])
+    return {**said, "offset": columns.add(levels, "uint16")}

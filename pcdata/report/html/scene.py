@@ -56,6 +56,7 @@ def stage_of(
     step: Transform | None = None,
     grasps: torch.Tensor | None = None,
     most_points: int = MOST_POINTS,
+    total: int | None = None,
 ) -> Stage:
     """Return a cloud with all that is known of where it lies.
 
@@ -65,8 +66,10 @@ def stage_of(
         step: what made it; of a crop the box is drawn.
         grasps: (G, 4, 4) poses in the cloud's frame, x between the fingers and z toward the object; drawn as forks.
         most_points: drawn of it.
+        total: how many points it had before it was thinned; None = as many as it has.
     """
     packed = pack_cloud(cloud, most_points=most_points)
+    packed.said["total"] = cloud.num_points if total is None else total
     low, high = _bounds(cloud)
     extent = float(np.linalg.norm(high - low)) or 1.0
     lines = [*_axes(extent), *_frusta(cloud, extent), *_planes(cloud), *_objects(cloud)]

@@ -5,6 +5,8 @@ from pcdata.validation.checks import stored_files
 from pcdata.validation.checks import coverage
 from pcdata.validation.checks import readings
 from pcdata.validation.checks import depth_axis
+from pcdata.validation.checks import largest_plane
+from pcdata.validation.checks import objects
 from pcdata.validation.checks import cameras
 from pcdata.validation.checks import behind_camera
 from pcdata.validation.checks import sequence
@@ -20,6 +22,8 @@ __all__ = [
     "color_on_depth",
     "coverage",
     "depth_axis",
+    "largest_plane",
+    "objects",
     "pose_direction",
     "pose_direction_over_time",
     "readings",

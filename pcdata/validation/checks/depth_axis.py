@@ -8,7 +8,7 @@ from typing import Any
 from pcdata.structures import DepthFrame
 from pcdata.validation.capture_check import register_check
 from pcdata.validation.capture_limits import CaptureLimits
-from pcdata.validation.measures.plane_bend import PlaneBend, plane_bend
+from pcdata.validation.measures.plane_bend import LEAST_SHARE, MOST_SPREAD, PlaneBend, plane_bends
 from pcdata.validation.measures.pose_conventions import RAYS, advice_of
 from pcdata.verdicts import Finding, Verdict
 
@@ -17,11 +17,9 @@ _PLANE = 0.3  # as a power: planes of real cameras came out at up to 0.1
 _BENT = 0.15  # from one whole power; a ball bends so too where its radius is its distance, to this part
 _ERROR = 0.12  # of the power: four of it between plane and half bent
 _OTHER = 0.25  # as a power: what only surfaces curved by themselves have
-_LEAST_SHARE = 0.1  # of the readings
 _LEAST_GAIN = 1.3  # times the readings of the largest plane of depth as given
 _LEAST_BULGE = 0.008  # of the distance: sensors bend planes by up to 0.002
 _LEAST_CLEAR = 2.0  # times the noise of single readings
-_MOST_SPREAD = 1.35  # cuts through piles and curved surfaces have 1.4 and more
 _NO_PLANE = "show a table, a floor or a wall over much of the image, or give several posed views"
 
 
@@ -33,7 +31,7 @@ _NO_PLANE = "show a table, a floor or a wall over much of the image, or give sev
             "divided by the length of the ray",
             f"within {_PLANE:g} of 0",
             f"within {_BENT:g} of 1 or -1",
-            f"a plane read wrongly is a bowl. Judged where one plane holds {_LEAST_SHARE:.0%} of the readings, is so "
+            f"a plane read wrongly is a bowl. Judged where one plane holds {LEAST_SHARE:.0%} of the readings, is so "
             f"wide that it would bend by {_LEAST_BULGE:.1%} of the distance and {_LEAST_CLEAR:g} times the noise, its "
             f"parts agree to {_ERROR:g}, few readings lie just off it, and it has no bend that depth does not "
             "explain; else unknown",
@@ -42,12 +40,11 @@ _NO_PLANE = "show a table, a floor or a wall over much of the image, or give sev
 )
 def depth_axis(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Finding]) -> list[Finding]:
     """Judge every view by itself, posed or not; those without a reading are left out."""
-    lens, found = frame.camera.distortion, []
-    for view, depth in enumerate(frame.depth):
-        if bool((depth > 0).any()):
-            bend = plane_bend(depth, frame.camera.intrinsics[view], None if lens is None else lens[view])
-            found.append(_judged(bend, view, frame.provenance))
-    return found
+    return [
+        _judged(bend, view, frame.provenance)
+        for view, (depth, bend) in enumerate(zip(frame.depth, plane_bends(frame)))
+        if bool((depth > 0).any())
+    ]
 
 
 def _judged(bend: PlaneBend | None, view: int, facts: Mapping[str, Any]) -> Finding:
@@ -55,9 +52,9 @@ def _judged(bend: PlaneBend | None, view: int, facts: Mapping[str, Any]) -> Find
         return _finding(Verdict.UNKNOWN, "not measurable: no plane", _NO_PLANE, view)
     which = f"the largest plane, {bend.share:.0%} of the readings,"
     power = f"{bend.power:.2f} +- {bend.error:.2f}"
-    if bend.share < _LEAST_SHARE:
+    if bend.share < LEAST_SHARE:
         return _finding(Verdict.UNKNOWN, f"not measurable: {which} is too small", _NO_PLANE, view)
-    if bend.spread > _MOST_SPREAD:
+    if bend.spread > MOST_SPREAD:
         return _finding(Verdict.UNKNOWN, "not measurable: what is most like a plane is none", _NO_PLANE, view)
     if bend.bulge < max(_LEAST_BULGE, _LEAST_CLEAR * bend.noise) or not bend.error <= _ERROR:
         found = f"not measurable: {which} is not wide enough for its noise of {bend.noise:.2%} of the distance"

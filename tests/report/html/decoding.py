@@ -20,7 +20,9 @@ def decoded(packed: PackedCloud) -> dict[str, np.ndarray]:
         if field["kind"] == "category":
             columns = np.array(field["values"])[columns] if len(columns) else columns
         elif field["kind"] == "scalar":
-            columns = field["low"] + field["step"] * columns
+            levels = columns
+            columns = field["low"] + field["step"] * levels
+            columns = np.where(levels == field.get("none", -1), np.nan, columns)
         found[field["name"]] = columns
     return found
 

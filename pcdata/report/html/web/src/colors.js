@@ -48,7 +48,10 @@ export function scalarOf(cloud, said, mode, up) {
   }
   const field = cloud.fields[mode];
   if (!field || field.kind !== "scalar") return null;
-  for (let i = 0; i < said.count; i++) values[i] = field.low + field.step * field.columns[0][i];
+  for (let i = 0; i < said.count; i++) {
+    const level = field.columns[0][i];
+    values[i] = level === field.none ? NaN : field.low + field.step * level;
+  }
   return values;
 }
 
@@ -58,12 +61,15 @@ export function colorsOf(cloud, said, mode, up) {
   const scalar = scalarOf(cloud, said, mode, up);
   if (scalar) {
     // From the 1st to the 99th percentile: one stray point does not take all the colors.
-    const sorted = Float32Array.from(scalar).sort();
+    const sorted = scalar.filter((value) => !Number.isNaN(value)).sort();
     const at = (share) => (sorted.length ? sorted[Math.round(share * (sorted.length - 1))] : 0);
     const [low, high] = [at(0.01), at(0.99)];
     const span = high > low ? high - low : 1;
-    for (let i = 0; i < said.count; i++) viridis((scalar[i] - low) / span, colors, 3 * i);
-    return { colors, legend: { low, high } };
+    for (let i = 0; i < said.count; i++) {
+      if (Number.isNaN(scalar[i])) hue(-1, colors, 3 * i);
+      else viridis((scalar[i] - low) / span, colors, 3 * i);
+    }
+    return { colors, legend: { low, high, none: sorted.length < said.count } };
   }
   const field = cloud.fields[mode];
   if (field.kind === "category") {
@@ -86,7 +92,10 @@ export function toldOf(field, i) {
     const place = field.columns[0][i];
     return field.names ? field.names[place] : String(field.values[place]);
   }
-  if (field.kind === "scalar") return (field.low + field.step * field.columns[0][i]).toPrecision(4);
+  if (field.kind === "scalar") {
+    const level = field.columns[0][i];
+    return level === field.none ? "none" : (field.low + field.step * level).toPrecision(4);
+  }
   if (field.kind === "normal") return field.columns.map((c) => ((c[i] - 127.5) / 127.5).toFixed(2)).join(" ");
   if (field.kind === "pixel") {
     const [height, width] = field.size;

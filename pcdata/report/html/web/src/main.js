@@ -177,6 +177,7 @@ class Viewer {
     }
     const ramp = document.createElement("b");
     box.append(legend.low.toPrecision(3), ramp, legend.high.toPrecision(3));
+    if (legend.none) box.append("gray: none");
   }
 
   listLines(lines) {
