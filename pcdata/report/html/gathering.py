@@ -13,8 +13,8 @@ from pcdata.errors import PcdataError
 from pcdata.io.sources.capture_source import CaptureSource, episodes_of
 from pcdata.report.html.episode_lines import EpisodeLine, episode_lines
 from pcdata.report.html.overlaps import overlap_of
-from pcdata.report.html.pictures import color_picture, confidence_picture, depth_picture, edges_picture
-from pcdata.report.html.scene import MOST_POINTS, SampleScene, raw_cloud, stage_of, stages_of
+from pcdata.report.html.pictures import WIDTH, color_picture, confidence_picture, depth_picture, edges_picture
+from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.transforms import Compose, Transform, describe_objects
 from pcdata.validation import CaptureLimits, validate_source
@@ -24,7 +24,10 @@ from pcdata.validation.view_names import view_names
 from pcdata.verdicts import Finding, Verdict
 
 NUM_SHOWN = 12  # samples with pictures and clouds, unless more are asked for
-_MOST_BYTES = 18 << 20  # of packed clouds in a page; as text, with pictures, that is below 30 MB
+_MOST_BYTES = 15 << 20  # of packed clouds in a page; as text, with pictures and the viewer, that is below 30 MB
+_MOST_PICTURE_BYTES = 5 << 20
+_BYTES_PER_PICTURE = 60_000  # of a color picture of full width
+_MOST_VIEWS = 8  # with pictures
 _BYTES_PER_POINT = 7  # of a packed point with colors, as measured on captures of Kinect-like sensors
 Progress = Callable[[int, int, str], None]
 
@@ -178,7 +181,6 @@ def look(
 ) -> Looked:
     """Return what is shown of one capture of ``num_shown``."""
     sample_id = source.ids[place]
-    most_points = min(2 * MOST_POINTS, _MOST_BYTES // (_BYTES_PER_POINT * max(num_shown, 1)))
     try:
         capture = source.load(sample_id)
     except PcdataError as error:
@@ -186,19 +188,31 @@ def look(
     overlap = overlap_of(capture) if isinstance(capture, DepthFrame) else None
     steps, problem = _steps(capture, pipeline)
     clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
-    stages = stages_of(steps, most_points=most_points)
-    if not stages or overlap is not None:
+    first = None
+    if not clouds or overlap is not None:
         try:
-            cloud = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
-            most = min(most_points // (len(clouds) + 1), MOST_POINTS)
-            shown = cloud if overlap is None else overlap.shown_on(cloud, most)
-            stages = (stage_of("capture", shown, most_points=most, total=cloud.num_points), *stages)
+            first = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
         except PcdataError as error:
             problem = problem or str(error)
+
+    def stages_within(most_points: int) -> tuple[Stage, ...]:
+        each = max(2000, most_points // max(len(clouds) + (first is not None), 1))
+        stages = stages_of(clouds, most_points=each)
+        if first is None:
+            return stages
+        shown = first if overlap is None else overlap.shown_on(first, each)
+        return (stage_of("capture", shown, most_points=each, total=first.num_points), *stages)
+
+    most_bytes = _MOST_BYTES // max(num_shown, 1)
+    most_points = min(2 * MOST_POINTS, most_bytes // _BYTES_PER_POINT)
+    stages = stages_within(most_points)
+    size = sum(len(stage.cloud.content) for stage in stages)
+    if size > most_bytes:  # points of many fields
+        stages = stages_within(int(0.95 * most_points * most_bytes / size))
     return Looked(
         sample_id,
         scene=SampleScene(sample_id, stages) if stages else None,
-        pictures=tuple(_pictures(capture)) if isinstance(capture, DepthFrame) else (),
+        pictures=tuple(_pictures(capture, num_shown)) if isinstance(capture, DepthFrame) else (),
         funnel=tuple((type(step).__name__, cloud.num_points) for step, cloud in clouds),
         problem=problem,
         pairs=() if overlap is None else overlap.pairs,
@@ -226,22 +240,24 @@ def _boxes(data: DepthFrame | PointCloud) -> tuple[tuple[float, float, float], .
     return tuple((x, y, z) for x, y, z in sorted(sizes, reverse=True))
 
 
-def _pictures(frame: DepthFrame) -> Iterator[Picture]:
+def _pictures(frame: DepthFrame, num_shown: int) -> Iterator[Picture]:
     names = view_names(frame.provenance, frame.num_views)
-    for view in range(min(frame.num_views, 8)):
+    count = num_shown * min(frame.num_views, _MOST_VIEWS) * (1 + (frame.colors is not None))
+    width = int(WIDTH * min(1.0, _MOST_PICTURE_BYTES / (_BYTES_PER_PICTURE * count)) ** 0.5)
+    for view in range(min(frame.num_views, _MOST_VIEWS)):
         depth = frame.depth[view]
         valid = depth > 0
         near, far = (float(depth[valid].min()), float(depth[valid].max())) if bool(valid.any()) else (0.0, 0.0)
         share = float(valid.float().mean())
         caption = f"{names[view]}: depth {near:.2f} to {far:.2f} m, {share:.1%} of pixels read (magenta: none)"
-        yield Picture(caption, depth_picture(frame, view))
-        if (edges := edges_picture(frame, view)) is not None:
+        yield Picture(caption, depth_picture(frame, view, width))
+        if (edges := edges_picture(frame, view, width)) is not None:
             yield Picture(f"{names[view]}: rims of depth (red) over color", edges)
-        if (confidence := confidence_picture(frame, view)) is not None:
+        if (confidence := confidence_picture(frame, view, width)) is not None:
             yield Picture(f"{names[view]}: confidence", confidence)
-    if frame.num_views > 8:
-        picture = color_picture(frame, 8) or depth_picture(frame, 8)
-        yield Picture(f"{frame.num_views - 8} views more are not shown", picture)
+    if frame.num_views > _MOST_VIEWS:
+        picture = color_picture(frame, _MOST_VIEWS, width) or depth_picture(frame, _MOST_VIEWS, width)
+        yield Picture(f"{frame.num_views - _MOST_VIEWS} views more are not shown", picture)
 
 
 def _funnel(looked: Sequence[Looked]) -> tuple[tuple[str, float], ...]:

@@ -17,7 +17,7 @@ from pcdata.validation.overlap import pairs_of
 from pcdata.validation.overlap_result import OverlapLimits, PairOverlap
 from pcdata.validation.view_names import view_names
 
-GAP = "gap between cameras [mm]"  # the field of points
+GAP = "gap_between_cameras_mm"  # the field of points
 _MAX_SAMPLES = 8000  # of each view
 _REACH = 0.06  # metres between the surfaces of two views, as in verify_overlap
 _NEAR = 0.012  # metres: a point has the gap of the nearest sample within it

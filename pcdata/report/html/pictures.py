@@ -24,35 +24,35 @@ NO_READING = (214, 64, 159)  # not in viridis
 _STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Kinect-like sensors up to some metres
 
 
-def depth_picture(frame: DepthFrame, view: int) -> bytes:
+def depth_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes:
     """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a PNG."""
-    depth = _reduced(frame.depth[view].cpu().numpy())
+    depth = _reduced(frame.depth[view].cpu().numpy(), width)
     valid = depth > 0
     near, far = np.quantile(depth[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
     return _ramp_png((depth - near) / max(far - near, 1e-9), valid)
 
 
-def confidence_picture(frame: DepthFrame, view: int) -> bytes | None:
+def confidence_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes | None:
     """Confidence from low (dark) to high, None where the capture has none."""
     if frame.confidence is None:
         return None
-    confidence = _reduced(frame.confidence[view].cpu().numpy().astype(np.float64))
+    confidence = _reduced(frame.confidence[view].cpu().numpy().astype(np.float64), width)
     return _ramp_png(confidence / max(float(confidence.max()), 1e-9), np.ones(confidence.shape, dtype=bool))
 
 
-def edges_picture(frame: DepthFrame, view: int) -> bytes | None:
+def edges_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes | None:
     """The color image with the rims of depth in red: they lie on the outlines of things where both are registered."""
     if frame.colors is None:
         return None
-    depth = _reduced(frame.depth[view].cpu().numpy())
-    image = _reduced(frame.colors[view].cpu().numpy()).copy()
+    depth = _reduced(frame.depth[view].cpu().numpy(), width)
+    image = _reduced(frame.colors[view].cpu().numpy(), width).copy()
     image[rims(depth)] = (255, 40, 40)
     return png(image)
 
 
-def color_picture(frame: DepthFrame, view: int) -> bytes | None:
+def color_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes | None:
     """The color image, None where the capture has none."""
-    return None if frame.colors is None else png(_reduced(frame.colors[view].cpu().numpy()))
+    return None if frame.colors is None else png(_reduced(frame.colors[view].cpu().numpy(), width))
 
 
 def rims(depth: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -98,7 +98,7 @@ def png_uri(picture: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
 
 
-def _reduced(image: NDArray) -> NDArray:
+def _reduced(image: NDArray, width: int) -> NDArray:
     """Keep every k-th pixel: depth is never averaged."""
-    stride = max(1, -(-image.shape[1] // WIDTH))
+    stride = max(1, -(-image.shape[1] // max(width, 1)))
     return image[::stride, ::stride]

@@ -83,13 +83,11 @@ def stage_of(
 
 
 def stages_of(
-    steps: Sequence[tuple[Transform, Any]], *, most_points: int = MOST_POINTS
+    clouds: Sequence[tuple[Transform, PointCloud]], *, most_points: int = MOST_POINTS
 ) -> tuple[Stage, ...]:  # of Compose.step_through
-    """Return the clouds that a chain left after its steps; what it left of depth images is in the pictures."""
-    clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
-    shown = max(1, most_points // max(len(clouds), 1))
+    """Return the clouds that a chain left after its steps, of each at most so many points."""
     return tuple(
-        stage_of(f"{place}. {type(step).__name__}", cloud, step=step, most_points=max(shown, 2000))
+        stage_of(f"{place}. {type(step).__name__}", cloud, step=step, most_points=most_points)
         for place, (step, cloud) in enumerate(clouds, 1)
     )
 

@@ -1,4 +1,4 @@
-"""How many objects are there, and how large are they? Numbers for trends, of clouds that ClusterObjects went through."""
+"""How many objects are there, and how large? Numbers for trends, of clouds in which objects were told apart."""
 
 from __future__ import annotations
 
