@@ -18,7 +18,7 @@ class UnpackedCloud:
 
     Args:
         points: (N, 3) float64.
-        fields: name -> (N,) or (N, 3) values: colors and normals 0 to 255, numbers of categories, numbers.
+        fields: name -> (N,) or (N, 3) values: colors and normals 0 to 255, numbers of categories, numbers (NaN = none).
         kinds: name -> color, category, normal, scalar or pixel.
     """
 
@@ -44,6 +44,8 @@ def unpack_cloud(packed: PackedCloud) -> UnpackedCloud:
         if one["kind"] == "category":
             values = np.array(one["values"], dtype=np.int64)[values[:, 0]] if count else values[:, 0]
         elif one["kind"] == "scalar":
-            values = one["low"] + one["step"] * values[:, 0].astype(np.float64)
+            levels = values[:, 0]
+            values = one["low"] + one["step"] * levels.astype(np.float64)
+            values[levels == one.get("none", -1)] = np.nan
         fields[one["name"]] = values
     return UnpackedCloud(points, fields, {one["name"]: one["kind"] for one in said["fields"]})
