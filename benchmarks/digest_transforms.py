@@ -52,6 +52,7 @@ EXAMPLES: dict[str, list[Example]] = {
         "ClusterObjects",
         {"eps": 0.03, "min_points": 4, "min_size": 5},
         {"eps": 0.03, "min_points": 4, "min_size": 5, "max_size": 300, "keep": "all"},
+        {"eps": 0.03, "min_points": 4, "min_area": 1e-5, "max_area": 0.5, "keep": "all"},
     ),
     "CompleteDepth": _of("CompleteDepth", {"completion": "smooth"}, {"completion": "nearest", "reach": 1}),
     "Compose": [

@@ -29,15 +29,34 @@ def seen_room(
     roll: float = 0.0,
     noise: float = 0.0,
     seed: int = 0,
+    scale: float = 1.0,
 ) -> PointCloud:
-    """One organized cloud of what a camera sees that looks at the origin along +y, down by ``pitch`` radians.
+    """One organized cloud of :func:`room_frame`."""
+    frame = room_frame(boxes, pitch=pitch, distance=distance, roll=roll, noise=noise, seed=seed, scale=scale)
+    cloud = Deproject()(frame)
+    assert isinstance(cloud, PointCloud)
+    return cloud
+
+
+def room_frame(
+    boxes: Sequence[Box],
+    *,
+    pitch: float = math.radians(40),
+    distance: float = 1.0,
+    roll: float = 0.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    scale: float = 1.0,
+) -> DepthFrame:
+    """The depth image of what a camera sees that looks at the origin along +y, down by ``pitch`` radians.
 
     Labels are the numbers of the boxes; ``noise`` is the standard deviation of 1/z; ``roll`` tilts the whole room
-    sideways.
+    sideways; ``scale`` is the resolution, as a multiple of ``SIZE``.
     """
-    rows, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
+    size, focal = (round(SIZE[0] * scale), round(SIZE[1] * scale)), FOCAL * scale
+    rows, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
     ray = torch.stack(
-        [(columns - (SIZE[1] - 1) / 2) / FOCAL, (rows - (SIZE[0] - 1) / 2) / FOCAL, torch.ones_like(rows)], -1
+        [(columns - (size[1] - 1) / 2) / focal, (rows - (size[0] - 1) / 2) / focal, torch.ones_like(rows)], -1
     ).reshape(-1, 3)
     down, level = math.sin(pitch), math.cos(pitch)
     axes = torch.tensor([[1, 0, 0], [0, -down, level], [0, -level, -down]], dtype=torch.float64)  # of the camera
@@ -53,8 +72,5 @@ def seen_room(
         depth, label = torch.where(hit, enters, depth), torch.where(hit, number, label)
     noisy = 1 / (1 / depth + noise * torch.randn(len(depth), generator=seeded(seed), dtype=torch.float64))
     depth = torch.where(depth > 0, noisy.clamp(0.05, 20), 0.0)
-    camera = Camera.pinhole(fx=FOCAL, fy=FOCAL, cx=(SIZE[1] - 1) / 2, cy=(SIZE[0] - 1) / 2, size=SIZE)
-    frame = DepthFrame.from_numpy(depth.reshape(SIZE).float().numpy(), camera, labels=label.reshape(SIZE).numpy())
-    cloud = Deproject()(frame)
-    assert isinstance(cloud, PointCloud)
-    return cloud
+    camera = Camera.pinhole(fx=focal, fy=focal, cx=(size[1] - 1) / 2, cy=(size[0] - 1) / 2, size=size)
+    return DepthFrame.from_numpy(depth.reshape(size).float().numpy(), camera, labels=label.reshape(size).numpy())

@@ -2,7 +2,7 @@
 
 from pcdata.transforms.base import REGISTRY, Transform
 from pcdata.transforms.chain_rules import PipelineOrderWarning
-from pcdata.transforms.clusters import ClusterObjects, SplitObjects
+from pcdata.transforms.clusters import ClusterObjects
 from pcdata.transforms.completion import CompleteDepth
 from pcdata.transforms.compose import Compose
 from pcdata.transforms.crop import CropPolygon, CropWorkspace
@@ -47,6 +47,7 @@ from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplica
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.shape import DescribeShape
 from pcdata.transforms.simple_completions import NearestCompletion, SmoothCompletion
+from pcdata.transforms.split_objects import SplitObjects
 from pcdata.transforms.undistort import Undistort
 from pcdata.transforms.unreliable import MarkUnreliableDepth
 from pcdata.transforms.visibility import CropFrustum, RemoveHiddenPoints

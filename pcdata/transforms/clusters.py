@@ -1,22 +1,22 @@
-"""Objects: ClusterObjects labels them, SplitObjects makes a cloud of each."""
+"""ClusterObjects: label what lies together, or looks like one thing, as objects."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError, ReplayError, TooFewPointsError
+from pcdata.errors import ConfigError
+from pcdata.functional.areas import seen_areas
 from pcdata.functional.clusters import dbscan
-from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.rows import ptr_after_mask, ptr_from_counts
+from pcdata.functional.image_clusters import image_clusters
+from pcdata.functional.image_grid import ImageGrid, is_lined
+from pcdata.functional.rows import ptr_after_mask
 from pcdata.functional.touching import (
-    REASONS,
     Separation,
     View,
     in_order_of_rows,
@@ -27,28 +27,38 @@ from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
-from pcdata.transforms.decisions import Decision, Decisions
 from pcdata.transforms.families import DropLimit, LeftOutWarning
-from pcdata.transforms.field_types import Count, Metres
+from pcdata.transforms.field_types import Count, Metres, SquareMetres
 from pcdata.transforms.found_planes import planes_in_cloud
 from pcdata.transforms.merged_views import merged_views
+from pcdata.transforms.touching_evidence import evidence_params, evidence_told
+
+_FEWEST, _MOST = 100, 50_000  # points of an object where no limit is given
 
 
 class ClusterObjects(DropLimit):
-    """Label density clusters (DBSCAN) as objects and keep those of a plausible size.
+    """Label clusters of points as objects and keep those of a plausible size.
 
     Labels become 0..K-1 per cloud in the order of their lowest core point; any labels the cloud had are replaced.
-    ``meta["objects"]`` lists label and point count; ``meta["no_objects"]`` what is no object: the points of ``noise``,
-    and of every cluster that is ``too_small`` or ``too_large``. The history counts them.
+    ``meta["objects"]`` lists label and point count (and the area, where a limit is one); ``meta["no_objects"]`` what is
+    no object: the points of ``noise``, and of every cluster that is ``too_small`` or ``too_large``. The history counts
+    them.
 
     Warns:
-        LeftOutWarning: a cluster is larger than ``max_size``.
+        LeftOutWarning: a cluster is larger than ``max_size`` or ``max_area``.
 
     Args:
         eps: points closer than this are neighbors.
-        min_points: neighbors, the point itself included, that make a core point.
-        min_size: smaller clusters are not objects.
-        max_size: larger clusters are not objects.
+        min_points: neighbors, the point itself included, that make a core point; of no matter by image.
+        by: "density": clusters are those of DBSCAN. "image": connected parts of the depth image that the cloud lies on,
+            faster: points on neighboring pixels that are closer than ``eps`` are linked, all count as core points, and
+            what something in front parts are two; see :func:`pcdata.functional.image_clusters`. Where lines of missing
+            pixels run through the image, as after depth was moved to the color camera, one pixel is bridged.
+        min_size: clusters of fewer points are not objects; None = 100, or no limit where ``min_area`` is given.
+        max_size: clusters of more points are not objects; None = 50,000, or no limit where ``max_area`` is given.
+        min_area: clusters of which less is seen, in square metres, are not objects. Unlike counts areas do not change
+            with the resolution or the distance.
+        max_area: clusters of which more is seen are not objects.
         keep: "all": keep the whole scene, with -1 where no object is.
         split_touching: part clusters where objects touch, by the shape of their surfaces, and join what an object in
             front keeps apart; needs the depth image that the cloud lies on, or those that MergeViews merged: the
@@ -58,74 +68,98 @@ class ClusterObjects(DropLimit):
             cluster it was. A RemovePlane before it tells heights, without which bowls and cups may come apart.
 
     Raises:
-        ConfigError: ``split_touching`` and the cloud no longer lies on its depth images.
+        ConfigError: ``by: image`` or ``split_touching``, and the cloud no longer lies on its depth images.
     """
 
     runs_statistics = True
-    version = 2
+    version = 3
 
     eps: Metres = 0.02
     min_points: Count = 50
-    min_size: Count = 100
-    max_size: Count = 50_000
+    by: Literal["density", "image"] = "density"
+    min_size: Count | None = None
+    max_size: Count | None = None
+    min_area: SquareMetres | None = None
+    max_area: SquareMetres | None = None
     keep: Literal["objects", "all"] = "objects"
     split_touching: bool = False
 
     def check_fields(self) -> None:
-        """Require min_size <= max_size."""
-        if self.min_size > self.max_size:
-            raise ConfigError(f"ClusterObjects: min_size {self.min_size} exceeds max_size {self.max_size}")
+        """Require limits in order."""
+        fewest, most = self._counts()
+        if fewest > most:
+            raise ConfigError(f"ClusterObjects: min_size {fewest} exceeds max_size {most:g}")
+        if self.min_area is not None and self.max_area is not None and self.min_area > self.max_area:
+            raise ConfigError(f"ClusterObjects: min_area {self.min_area:g} exceeds max_area {self.max_area:g}")
+
+    def _counts(self) -> tuple[int, float]:
+        """Return the limits of points that hold."""
+        fewest = self.min_size or (1 if self.min_area is not None else _FEWEST)
+        most = self.max_size or (math.inf if self.max_area is not None else max(_MOST, fewest))
+        return fewest, most
 
     @torch_on_one_thread()
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Cluster, then renumber the clusters of plausible size."""
         grid = data.image_grid()
-        raw = dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=grid)
-        clusters_of = list(torch.tensor_split(raw, data.ptr[1:-1].cpu()))
+        clusters_of = list(torch.tensor_split(self._clusters(data, grid), data.ptr[1:-1].cpu()))
         separations: list[Separation] = []
         before: list[Tensor] = []
         if self.split_touching:
             for b, part in enumerate(clusters_of):
-                images = merged_views(data, b) if grid is None else grid
+                images = merged_views(data, b) if grid is None else _own_grid(data, grid, b)
                 if images is None:
                     raise ConfigError(
                         "ClusterObjects: split_touching needs the depth images that the points lie on, but the cloud "
                         "was downsampled, averaged or moved off its pixels, or merged of images of a lens that bends, "
                         "or was never one; put ClusterObjects before those steps, or split_touching: false"
                     )
-                found, separation = self._separated(data, images, b, part)
+                found, separation = self._separated(data, images, b, part, _own_grid(data, grid, b))
                 before.append(found)
                 separations.append(separation)
             clusters_of = [in_order_of_rows(part)[0] for part in before]
-        parts = [self._numbered(part) for part in clusters_of]
-        sizes = [other.tolist() for _, other in parts]  # per cloud: noise, then every cluster that is no object
-        left_out = {
-            "noise": [noise for noise, *_ in sizes],
-            "too_small": [sum(one for one in clusters if one < self.min_size) for _, *clusters in sizes],
-            "too_large": [sum(one for one in clusters if one > self.max_size) for _, *clusters in sizes],
-        }
-        for b, (_, *clusters) in enumerate(sizes):
-            if clusters and max(clusters) > self.max_size:
-                warnings.warn(
-                    f"ClusterObjects: cloud {b}{sample_name(data, b)}: a cluster of {max(clusters)} points, more than "
-                    f"max_size={self.max_size}, is left out; raise max_size if it is an object or a heap of them, or "
-                    "put RemovePlane or CropWorkspace before it if it is the table or a wall",
-                    LeftOutWarning,
-                    stacklevel=2,
-                )
-        counts = {name: torch.tensor(values, dtype=torch.int64, device="cpu") for name, values in left_out.items()}
-        evidence = _evidence(separations, before, [labels for labels, _ in parts]) if self.split_touching else {}
-        return {"labels": torch.cat([labels for labels, _ in parts]), **counts, **evidence}
+        parts = [self._numbered(data, b, raw, _own_grid(data, grid, b)) for b, raw in enumerate(clusters_of)]
+        names = ("noise", "too_small", "too_large")
+        counts = torch.tensor([counted for _, counted, _ in parts], dtype=torch.int64, device="cpu").reshape(-1, 3)
+        found_params = dict(zip(names, counts.unbind(1)))
+        if self.min_area is not None or self.max_area is not None:
+            listed = [(b, label, area) for b, (*_, areas) in enumerate(parts) for label, area in enumerate(areas)]
+            found_params["areas"] = torch.tensor(listed, dtype=torch.float64, device="cpu").reshape(-1, 3)
+        evidence = evidence_params(separations, before, [labels for labels, *_ in parts]) if self.split_touching else {}
+        return {"labels": torch.cat([labels for labels, *_ in parts]), **found_params, **evidence}
+
+    def _clusters(self, data: PointCloud, grid: ImageGrid | None) -> Tensor:
+        """Return the cluster (N,) of every point, -1 = noise."""
+        if self.by == "density":
+            return dbscan(data.points, data.ptr, eps=self.eps, min_points=self.min_points, grid=grid)
+        if grid is None:
+            raise ConfigError(
+                "ClusterObjects: by='image' links neighboring pixels, but the cloud lies on no depth image: it was "
+                "downsampled, merged or moved off its pixels, or was never one; put ClusterObjects before those steps, "
+                "or say by: density"
+            )
+        pixel, size = grid.pixel_index, grid.size
+        lined = any(is_lined(own, size) for own in torch.tensor_split(pixel, data.ptr[1:-1].cpu()))
+        reach = 2 if lined else 1
+        return image_clusters(data.points, data.ptr, pixel_index=pixel, size=size, eps=self.eps, reach=reach)
+
+    def _sizes(self, data: PointCloud, b: int, raw: Tensor, grid: ImageGrid | None) -> tuple[Tensor, Tensor]:
+        """Return points and area (K,) of every cluster of cloud ``b``; no areas where none is asked for."""
+        size = torch.bincount(raw + 1, minlength=1)[1:]
+        if self.min_area is None and self.max_area is None:
+            return size, torch.zeros_like(size, dtype=torch.float64)
+        points = data.points[int(data.ptr[b]) : int(data.ptr[b + 1])]
+        return size, seen_areas(points, raw, len(size), grid)
 
     def _separated(
-        self, data: PointCloud, images: ImageGrid | list[View], b: int, clusters: Tensor
+        self, data: PointCloud, images: ImageGrid | list[View], b: int, clusters: Tensor, grid: ImageGrid | None
     ) -> tuple[Tensor, Separation]:
         """Part the clusters (n,) of cloud ``b`` that are large enough; return their new numbers, and what was found."""
         start, stop = int(data.ptr[b]), int(data.ptr[b + 1])
-        size = torch.bincount(clusters + 1, minlength=1)
-        size[:1] = 0
-        rows = (size[clusters + 1] >= self.min_size).nonzero().squeeze(1)
-        points = data.points[start:stop][rows]
+        size, area = self._sizes(data, b, clusters, grid)
+        large = torch.cat([size.new_zeros(1, dtype=torch.bool), self._large_enough(size, area)])  # noise first
+        rows = large[clusters + 1].nonzero().squeeze(1)
+        points = data.points[start:stop].detach()[rows]
         planes, height = planes_in_cloud(data, b), None
         if len(planes):
             plane = planes[-1].to(points.device)
@@ -135,29 +169,53 @@ class ClusterObjects(DropLimit):
         noise = data.meta[b].get("planes", [{}])[-1].get("disparity_noise")
         noise = noise if isinstance(noise, float) and math.isfinite(noise) and noise > 0 else None
         if isinstance(images, ImageGrid):
-            motion = None if images.camera_from_points is None else images.camera_from_points[b : b + 1]
-            pixel = images.pixel_index[start:stop][rows]
-            own = ImageGrid(pixel, images.size, images.intrinsics[b : b + 1], motion)
+            own = replace(images, pixel_index=images.pixel_index[rows])
             separation = separate_objects(points, own, height=height, noise=noise)
         else:
             separation = separate_views(points, _picked(images, rows, stop - start), height=height, noise=noise)
         found = torch.full_like(clusters, -1)
         found[rows] = _with_clusters(separation.label, clusters[rows])
         # Clusters that are too small keep numbers of their own, to be counted as such.
-        small = (clusters >= 0) & (size[clusters + 1] < self.min_size)
+        small = (clusters >= 0) & ~large[clusters + 1]
         found[small] = clusters[small] + (int(found.max()) + 1 if len(found) else 0)
         return found, separation
 
-    def _numbered(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+    def _large_enough(self, size: Tensor, area: Tensor) -> Tensor:
+        return (size >= self._counts()[0]) & (area >= (self.min_area or 0.0))
+
+    def _numbered(
+        self, data: PointCloud, b: int, raw: Tensor, grid: ImageGrid | None
+    ) -> tuple[Tensor, list[int], list[float]]:
         """Number the clusters of plausible size in one cloud by 0, 1, ... and call all else -1; return what is else.
 
-        The second result is the number of points of noise, then those of every cluster that is no object.
+        The second result are the points of noise and of clusters that are too small and too large, the third the areas
+        of the objects.
         """
-        size = torch.bincount(raw + 1, minlength=1)  # noise first
-        accepted = (size >= self.min_size) & (size <= self.max_size)
-        accepted[:1] = False
+        size, area = self._sizes(data, b, raw, grid)
+        small = ~self._large_enough(size, area)
+        many, wide = size > self._counts()[1], area > (self.max_area or math.inf)
+        large = (many | wide) & ~small
+        if bool(large.any()):
+            self._warn_of_large(data, b, size[large & many], area[large & wide])
+        accepted = torch.nn.functional.pad(~small & ~large, (1, 0))  # noise first
         number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
-        return number[raw + 1], size[~accepted]
+        counted = [int((raw < 0).sum()), int(size[small].sum()), int(size[large].sum())]
+        return number[raw + 1], counted, area[~small & ~large].tolist()
+
+    def _warn_of_large(self, data: PointCloud, b: int, size: Tensor, area: Tensor) -> None:
+        """Say that what may be wanted is left out."""
+        if len(size):
+            found, limit = f"{int(size.max())} points", f"max_size={self._counts()[1]:g}"
+        else:
+            found, limit = f"{float(area.max()):.3g} m^2", f"max_area={self.max_area:g}"
+        split = "" if self.split_touching else ", or split_touching: true if it is several that touch"
+        warnings.warn(
+            f"ClusterObjects: cloud {b}{sample_name(data, b)}: a cluster of {found}, more than {limit}, is left out; "
+            f"raise {limit.split('=')[0]} if it is an object or a heap of them{split}; or put RemovePlane or "
+            "CropWorkspace before it if it is the table or a wall",
+            LeftOutWarning,
+            stacklevel=2,
+        )
 
     @torch_on_one_thread()
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
@@ -165,9 +223,10 @@ class ClusterObjects(DropLimit):
         labels = params["labels"]
         counted = {name: params[name].tolist() for name in ("noise", "too_small", "too_large")}
         others = [{"no_objects": {name: counted[name][b] for name in counted}} for b in range(data.num_clouds)]
-        labeled = data.with_fields(labels=labels).with_meta(_objects(labels, data)).with_meta(others)
+        listed = _objects(labels, data, params.get("areas"))
+        labeled = data.with_fields(labels=labels).with_meta(listed).with_meta(others)
         if self.split_touching:
-            labeled = labeled.with_meta([{"touching": _touching(params, b)} for b in range(data.num_clouds)])
+            labeled = labeled.with_meta([{"touching": evidence_told(params, b)} for b in range(data.num_clouds)])
         if self.keep == "all":
             return labeled
         member = labels >= 0
@@ -202,106 +261,20 @@ def _with_clusters(label: Tensor, cluster: Tensor) -> Tensor:
     return torch.where(has, label, own[cluster])
 
 
-def _evidence(found: list[Separation], before: list[Tensor], after: list[Tensor]) -> Params:
-    """Lay what was found out as tensors, with the labels that objects have at last; what is no object is left out."""
-    cuts: list[tuple[float, ...]] = []
-    joins: list[tuple[int, ...]] = []
-    for b, separation in enumerate(found):
-        new_of = torch.full((int(before[b].max()) + 2 if len(before[b]) else 1,), -1, dtype=torch.int64, device="cpu")
-        new_of[before[b].cpu() + 1] = after[b].cpu()  # all rows of an object have one new label
-        name = {old: new for old, new in enumerate(new_of[1:].tolist()) if new >= 0}
-        for cut in separation.cuts:
-            if all(one in name for one in cut.objects):
-                cuts.append((b, *sorted(name[one] for one in cut.objects), cut.strength, cut.num_pixels))
-        joins += [(b, name[join.object], REASONS.index(join.why)) for join in separation.joins if join.object in name]
-    return {
-        "depth_noise": torch.tensor([one.noise for one in found], dtype=torch.float64, device="cpu"),
-        "cuts": torch.tensor(sorted(cuts), dtype=torch.float64, device="cpu").reshape(-1, 5),
-        "joins": torch.tensor(sorted(joins), dtype=torch.int64, device="cpu").reshape(-1, 3),
-    }
+def _own_grid(data: PointCloud, grid: ImageGrid | None, b: int) -> ImageGrid | None:
+    """Return the part of a batch's grid that is cloud ``b``'s."""
+    if grid is None:
+        return None
+    motion = None if grid.camera_from_points is None else grid.camera_from_points[b : b + 1]
+    pixel = grid.pixel_index[int(data.ptr[b]) : int(data.ptr[b + 1])]
+    return ImageGrid(pixel, grid.size, grid.intrinsics[b : b + 1], motion)
 
 
-def _touching(params: Params, b: int) -> dict[str, Any]:
-    """Tell what parted and joined the objects of cloud ``b``."""
-    return {
-        "noise": float(params["depth_noise"][b]),
-        "cuts": [
-            {"objects": [int(one), int(other)], "strength": round(strength, 3), "pixels": int(pixels)}
-            for cloud, one, other, strength, pixels in params["cuts"].tolist()
-            if cloud == b
-        ],
-        "joins": [
-            {"object": label, "why": REASONS[why]} for cloud, label, why in params["joins"].tolist() if cloud == b
-        ],
-    }
-
-
-class SplitObjects(DropLimit):
-    """Make one cloud of every label >= 0, in order of cloud and label; points without a label are dropped.
-
-    ``meta["object"]`` keeps the label, ``meta["unlabeled"]`` the number of points dropped from the whole cloud.
-    """
-
-    keeps_clouds = False
-
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Find the labels of every cloud: ``label`` (K,), its ``rank`` in its cloud, and the ``ptr`` (B+1,) of them."""
-        if data.labels is None:
-            raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")
-        found = [torch.unique(own[own >= 0]).cpu() for own in torch.tensor_split(data.labels, data.ptr[1:-1].cpu())]
-        for b, labels in enumerate(found):
-            if not len(labels):
-                raise TooFewPointsError(
-                    f"SplitObjects: cloud {b}{sample_name(data, b)} has no labeled point among its "
-                    f"{int(data.counts[b])}; check the fields of ClusterObjects"
-                )
-        member = torch.nn.functional.pad((data.labels >= 0).cumsum(0), (1, 0))
-        self.check_drop(
-            data.counts.tolist(),
-            member[data.ptr].diff().tolist(),
-            lambda b: f"points of cloud {b}{sample_name(data, b)}",
-        )
-        ranks = [torch.arange(len(labels), dtype=torch.int64, device="cpu") for labels in found]
-        return {
-            "label": torch.cat(found),
-            "rank": torch.cat(ranks),
-            "ptr": ptr_from_counts([len(labels) for labels in found]),
-        }
-
-    def repeat(self, data: PointCloud, decided: Decisions) -> Params:
-        """The objects with the labels that the history tells."""
-        like = torch.empty(0, dtype=torch.int64, device="cpu")
-        starts = [number for number, _ in self.origins(decided.of_clouds)]
-        if data.labels is None or len(starts) != data.num_clouds:
-            raise ReplayError(
-                f"SplitObjects: the histories tell of objects of {len(starts)} clouds, and there are {data.num_clouds}"
-                f"{' without labels' if data.labels is None else ''}; give clouds with the same labels"
-            )
-        ptr = torch.tensor([*starts, len(decided)], dtype=torch.int64, device="cpu")
-        return {"label": decided.values("label", like=like), "rank": decided.values("rank", like=like), "ptr": ptr}
-
-    def origins(self, decisions: Sequence[Decision]) -> list[tuple[int, int | None]]:
-        """A cloud's objects come in the order of their ranks."""
-        ranks = Decisions("SplitObjects", decisions).values("rank").tolist()
-        return [(k, None) for k, rank in enumerate(ranks) if k == 0 or rank <= ranks[k - 1]]
-
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Split each cloud by its labels."""
-        bounds = params["ptr"].tolist()
-        parts = []
-        for b, cloud in enumerate(data.unbatch()):
-            assert cloud.labels is not None  # make_params
-            unlabeled = int((cloud.labels < 0).sum())
-            for label in params["label"][bounds[b] : bounds[b + 1]].tolist():
-                rows = torch.nonzero(cloud.labels == label).squeeze(1)
-                ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
-                parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabeled": unlabeled}]))
-        return PointCloud.cat(parts)
-
-
-def _objects(labels: Tensor, data: PointCloud) -> list[dict[str, Any]]:
-    entries = []
+def _objects(labels: Tensor, data: PointCloud, areas: Tensor | None) -> list[dict[str, Any]]:
+    entries: list[dict[str, Any]] = []
     for own in torch.tensor_split(labels, data.ptr[1:-1].cpu()):
         sizes = torch.bincount(own + 1)[1:].tolist()
         entries.append({"objects": [{"label": label, "points": count} for label, count in enumerate(sizes)]})
+    for b, label, area in [] if areas is None else areas.tolist():
+        entries[int(b)]["objects"][int(label)]["area"] = area
     return entries

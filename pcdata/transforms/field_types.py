@@ -14,6 +14,7 @@ from pcdata.structures import METRE, Confidence
 
 # A length in a unit: its step refuses clouds in another.
 Metres = Annotated[float, Gt(0), annotated_types.Unit(METRE)]
+SquareMetres = Annotated[float, Gt(0), annotated_types.Unit(METRE)]  # likewise
 Unit = Literal["m", "normalized"]
 NonNegative = Annotated[float, Ge(0)]
 Positive = Annotated[float, Gt(0)]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
+from pcdata.functional.areas import seen_areas
 from pcdata.functional.boxes import smallest_box
 from pcdata.functional.hulls import convex_hull_3d
 from pcdata.functional.rectangles import smallest_rectangle
@@ -23,6 +24,7 @@ class ObjectFacts:
     Args:
         label: its label.
         num_points: how many points have it.
+        area: of its surface as far as it was seen, in the square of the unit.
         centroid: (3,) float64 mean of its points.
         height: how far its highest point is above the table.
         box: (4, 4) float64 pose of the smallest box around it that stands upright on the table: origin in the middle,
@@ -38,6 +40,7 @@ class ObjectFacts:
 
     label: int
     num_points: int
+    area: float
     centroid: Tensor
     height: float
     box: Tensor
@@ -74,6 +77,7 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
     plane = _base(own, up, points)
     axes = plane_axes(plane)
     found = []
+    areas = seen_areas(own.points, own.labels, int(labels.max()) + 1 if len(labels) else 0, own.image_grid())
     for label in torch.unique(labels).tolist():
         rows = points[labels == label]
         height = rows @ plane[:3] + plane[3]
@@ -92,6 +96,7 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
             ObjectFacts(
                 label=label,
                 num_points=len(rows),
+                area=float(areas[label]),
                 centroid=rows.mean(0),
                 height=high,
                 box=box,

@@ -13,7 +13,7 @@ import torch
 
 from pcdata import transforms as T
 from pcdata.geometry.lens_models import lens_row
-from pcdata.structures import NORMALIZED, DepthFrame, PointCloud
+from pcdata.structures import NORMALIZED, DepthFrame, ImageLayout, PointCloud
 from tests.factories import cloud_in_base, cloud_in_camera, frame_with_counts, tabletop_frame
 
 QUARTER_TURN = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, -0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
@@ -73,12 +73,29 @@ def _frame_with_a_lens(counts: Sequence[int] = (120, 90), *, seed: int = 0) -> D
     return replace(frame, camera=replace(frame.camera, distortion=lens.repeat(len(counts), 1)))
 
 
+def _organized(counts: Sequence[int]) -> PointCloud:
+    """The batch on images of 16 x 16 pixels, in their order."""
+    cloud = cloud_in_base(counts)
+    intrinsics = torch.tensor([[60.0, 0.0, 7.5], [0.0, 61.0, 7.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    pixels = torch.cat([torch.arange(count) for count in counts])
+    layout = ImageLayout(size=(16, 16), intrinsics=intrinsics.repeat(len(counts), 1, 1))
+    return replace(cloud, source_index=pixels, layout=layout)
+
+
 EXAMPLES: dict[str, list[Example]] = {
     "Center": _of(T.Center()),
-    "ClusterObjects": _of(
-        T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
-        T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
-    ),
+    "ClusterObjects": [
+        *_of(
+            T.ClusterObjects(eps=0.03, min_points=4, min_size=5),
+            T.ClusterObjects(eps=0.03, min_points=4, min_size=5, max_size=300, keep="all"),
+            T.ClusterObjects(eps=0.03, min_points=4, min_area=1e-5, max_area=0.5, keep="all"),
+        ),
+        *_of(
+            T.ClusterObjects(eps=0.1, by="image", min_area=1e-5, max_area=50.0, keep="all"),
+            T.ClusterObjects(eps=0.1, by="image", min_size=1, keep="all", split_touching=True),
+            make=_organized,
+        ),
+    ],
     "CompleteDepth": _of(
         T.CompleteDepth(completion="smooth"), T.CompleteDepth(completion="nearest", reach=1), make=frame_with_counts
     ),

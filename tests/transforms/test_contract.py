@@ -323,6 +323,7 @@ def changed_values(value: Any) -> list[Any]:
             "warn",
             "y",
             "equidistant",
+            "image",
         ]
     if isinstance(value, T.Transform):
         return [T.Center()]
