@@ -1,4 +1,4 @@
-"""Threads: how many the compiled core uses, and how torch's own are kept from waiting for each other.
+"""How work is cut up: the threads of the compiled core, how torch's own are kept from waiting, how much goes at once.
 
 Torch splits every operation on more than about 32,000 elements over its OpenMP threads, which meet at a barrier where
 they wait awake. With a core of their own that costs microseconds. Where another process has the core, every operation
@@ -19,6 +19,17 @@ One = TypeVar("One")
 Other = TypeVar("Other")
 
 _core_threads: ContextVar[int | None] = ContextVar("core_threads", default=None)
+
+
+_WIDER = 64
+
+
+def at_once(device: torch.device, cpu: int) -> int:
+    """Return how much is looked at in one go: ``cpu`` on a CPU, where it should stay in a core's cache.
+
+    Elsewhere it is 64 times that: every step of a loop costs a GPU microseconds, and only large steps fill it.
+    """
+    return cpu if device.type == "cpu" else _WIDER * cpu
 
 
 def core_threads() -> int:

@@ -13,6 +13,7 @@ from pcdata.contracts.dispatch import inner
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.geometry.rigid import check_rigid
+from pcdata.threads import at_once
 
 Axis = Literal["x", "y", "z"]
 _AXES = ("x", "y", "z")
@@ -188,7 +189,9 @@ def points_in_grippers(
     scale = float(wide.abs().max() if len(wide) else 0) + float(shift.abs().max() if len(shift) else 0)
     reach = (half + 1e-5 * (1 + scale)).float()
     columns = points.T.contiguous()
-    for some in torch.arange(len(axes), dtype=torch.int64, device=points.device).split(_TOGETHER):
+    for some in torch.arange(len(axes), dtype=torch.int64, device=points.device).split(
+        at_once(points.device, _TOGETHER)
+    ):
         rough = torch.matmul(axes[some].float(), columns).sub_(shift[some].float()[..., None]).abs_()
         gripper, row = (rough <= reach[some][..., None]).all(1).nonzero(as_tuple=True)
         one = some[gripper]

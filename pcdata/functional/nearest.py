@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.functional.radius import squared_radius
+from pcdata.threads import at_once
 
 _PAIRS = 1 << 20  # looked at together: a few images of 4 MB
 
@@ -72,8 +73,8 @@ def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tenso
     """Yield all pairs of a query and a point of the same cloud; each query is in one chunk."""
     for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):
         row = torch.arange(start, stop, dtype=torch.int64, device=points.device)
-        at_once = max(1, _PAIRS // max(1, stop - start))
-        for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(at_once):
+        some = max(1, at_once(points.device, _PAIRS) // max(1, stop - start))
+        for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(some):
             if len(query):
                 yield _Pairs(query, row, _all_squared(queries[query], points[start:stop]))
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import REFERENCE, inner
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
+from pcdata.threads import at_once
 
 NORMS = ("l2", "l1", "linf")
 
@@ -81,7 +82,7 @@ def nearest_by_norm(
             continue
         row = torch.arange(start, stop, dtype=torch.int64, device=points.device)
         for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(
-            max(1, _PAIRS // (stop - start))
+            max(1, at_once(points.device, _PAIRS) // (stop - start))
         ):
             apart = norm_length(queries[query][:, None] - points[start:stop], norm)
             key = _order(torch.where(apart < limit[query][:, None], apart, torch.inf), row)

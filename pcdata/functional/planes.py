@@ -17,11 +17,12 @@ from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_co
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
 from pcdata.geometry.rigid import angle_between
 from pcdata.rng import seeded
+from pcdata.threads import at_once
 
 # The inlier set of real clouds settles in 3 to 8 rounds; the cap only stops a set that alternates for ever.
 _MAX_REFINEMENTS = 20
-# Hypotheses x points scored at once: 1 MB of distances stays in a CPU core's cache; a GPU wants fewer launches.
-_BLOCK = {"cpu": (64, 4096), "cuda": (64, 262144)}
+# Hypotheses and points looked at together: 1 MB of distances.
+_PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
 _FIRST_TRIES = 32
 # Planes drawn at a time, over all clouds: 32 MB.
@@ -261,7 +262,7 @@ def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: floa
 def _count_near(points: Tensor, planes: Tensor, distance: float) -> Tensor:
     """Count the points nearer than ``distance`` to each plane, in blocks: memory does not grow with the product."""
     counts = torch.zeros(len(planes), dtype=torch.float64, device=points.device)
-    planes_per_block, points_per_block = _BLOCK.get(points.device.type, _BLOCK["cuda"])
+    planes_per_block, points_per_block = _PLANES, at_once(points.device, _POINTS)
     # One contiguous column per coordinate: a strided inner loop is several times slower.
     columns = points.T.contiguous()
     buffers = points.new_empty((2, planes_per_block * points_per_block))
@@ -296,8 +297,8 @@ def refined_planes(
         refitted = fit_planes(own, own_ptr, before, backend=backend)
         fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
         after = near_planes(own, own_ptr, refitted, distance, backend=backend)
-        fits &= count_per_cloud(after, own_ptr) >= 3
-        settled = fits & (count_per_cloud(after != before, own_ptr) == 0)
+        fits &= count_per_cloud(after, own_ptr).cpu() >= 3
+        settled = fits & (count_per_cloud(after != before, own_ptr).cpu() == 0)
         planes[unsettled[fits]] = refitted[fits]
         chosen = after
         if not bool(fits.all()):

@@ -17,12 +17,13 @@ from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_p
 from pcdata.geometry.rigid import angle_between
 from pcdata.geometry.shape_fit import Family, length
 from pcdata.rng import seeded
+from pcdata.threads import at_once
 
 # Points of a cloud that its hypotheses are compared on at first, and how many of those then meet all of its points.
 SCORED, FINALISTS = 4096, 16
 _MAX_REFINEMENTS = 20  # as of planes
 _STEPS = 3  # of Newton between two looks at who the inliers are
-_PAIRS = {"cpu": 1 << 15, "cuda": 1 << 22}  # of points and hypotheses looked at together: 256 KB stay in a core's cache
+_PAIRS = 1 << 15  # of points and hypotheses looked at together: 256 KB
 _MOST_HYPOTHESES = 1 << 18  # drawn at a time, over all clouds
 
 
@@ -140,7 +141,7 @@ def _winners(
 def count_near(family: Family, points: Tensor, ptr: Tensor, shapes: Tensor, distance: float) -> Tensor:  # (B, P) int64
     """Count the points of each cloud that are near its shapes (B, P, K); clouds of about one size go side by side."""
     counts = torch.zeros(shapes.shape[:2], dtype=torch.int64, device=points.device)
-    sizes, pairs = counts_from_ptr(ptr).tolist(), _PAIRS.get(points.device.type, _PAIRS["cuda"])
+    sizes, pairs = counts_from_ptr(ptr).tolist(), at_once(points.device, _PAIRS)
     for bits in sorted({size.bit_length() for size in sizes}):
         clouds = [b for b, size in enumerate(sizes) if size.bit_length() == bits]
         widest = max(sizes[b] for b in clouds)

@@ -14,6 +14,7 @@ from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, group_first
 from pcdata.functional.voxels import numbered_rows
+from pcdata.threads import at_once
 
 _PAIRS = 1 << 20  # points and edges looked at together
 
@@ -92,7 +93,9 @@ def polygon_mask(
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     (ax, ay), (bx, by) = polygon.unbind(1), polygon.roll(-1, 0).unbind(1)
     slope = (bx - ax) / torch.where(by == ay, 1.0, by - ay)
-    for rows in torch.arange(len(points), dtype=torch.int64, device=points.device).split(max(1, _PAIRS // len(ax))):
+    for rows in torch.arange(len(points), dtype=torch.int64, device=points.device).split(
+        max(1, at_once(points.device, _PAIRS) // len(ax))
+    ):
         x, y = points[rows].double().unbind(1)
         spans = (ay <= y[:, None]) != (by <= y[:, None])  # a level edge never does
         inside[rows] = (spans & (x[:, None] < ax + (y[:, None] - ay) * slope)).sum(1) % 2 == 1

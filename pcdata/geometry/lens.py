@@ -24,6 +24,7 @@ from pcdata.contracts.dispatch import inner
 from pcdata.errors import ShapeError
 from pcdata.geometry.lens_models import LENS_MODELS, ROW, WIDEST_PLAIN, check_distortion, lens_facts
 from pcdata.geometry.radial_lenses import bend_radially, radial_fold, unbend_radially
+from pcdata.threads import at_once
 
 # Normalized units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
 CONVERGED = 1e-12
@@ -252,7 +253,7 @@ def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
 def unbent(target: Tensor, twelve: Tensor, after: bool, fold: float) -> Tensor:
     """Undistort (P, 2) coordinates by one reduced polynomial (12,); NaN where it has no inverse within the fold."""
     coefficients = _Polynomial(twelve, None, after).split(1)
-    chunks = [_invert(some, coefficients, fold) for some in target.split(_CHUNK)]
+    chunks = [_invert(some, coefficients, fold) for some in target.split(at_once(target.device, _CHUNK))]
     return torch.cat(chunks) if chunks else target.clone()
 
 

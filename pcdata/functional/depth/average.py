@@ -10,6 +10,7 @@ from torch import Tensor
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.depth.pixel_sort import pick_image, sort_images
+from pcdata.threads import at_once
 
 # The median absolute deviation of a normal distribution is 0.6745 of its standard deviation.
 _SIGMA_PER_MAD = 1.4826
@@ -65,7 +66,8 @@ def average_depth(
             f"{resolution}, {max_jump}, {min_count}"
         )
     flat = depths.flatten(1)
-    parts = [_average(part, mad_factor, resolution, max_jump, min_count) for part in flat.split(_BLOCK, dim=1)]
+    blocks = flat.split(at_once(flat.device, _BLOCK), dim=1)
+    parts = [_average(part, mad_factor, resolution, max_jump, min_count) for part in blocks]
     return DepthAverage(*(torch.cat(values).reshape(depths.shape[1:]) for values in zip(*parts, strict=True)))
 
 

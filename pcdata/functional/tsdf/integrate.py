@@ -16,6 +16,7 @@ from pcdata.functional.tsdf.grid import GRID, VoxelGrid, pack_keys, unpack_keys,
 from pcdata.functional.tsdf.views import VIEW, FusionView
 from pcdata.geometry.lens import distort_normalized
 from pcdata.geometry.lens_models import is_plain
+from pcdata.threads import at_once
 
 _TOGETHER = 2048  # blocks updated in one go: a million voxels
 _FURTHEST = 2.0**40  # blocks; beyond what keys reach
@@ -78,8 +79,9 @@ def integrate_view(
     ``carve`` averages a full truncation into voxels that were seen before.
     """
     for chunk, inside, where in blocks.in_chunks(rows):
-        for start in range(0, len(inside), _TOGETHER):
-            some = slice(start, start + _TOGETHER)
+        together = at_once(inside.device, _TOGETHER)
+        for start in range(0, len(inside), together):
+            some = slice(start, start + together)
             _update(chunk, inside[some], blocks.keys[rows[where[some]]], view, grid, carve)
 
 

@@ -16,6 +16,7 @@ from pcdata.contracts.numbers import checked_count
 from pcdata.functional.tsdf.blocks import BLOCKS, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
 from pcdata.functional.tsdf.margins import SIDE, own_places, plane_with_margin, rows_around
+from pcdata.threads import at_once
 
 _TOGETHER = 512  # blocks
 Edge = tuple[int, int]  # the corners it joins; corner c lies at (c & 1, c >> 1 & 1, c >> 2)
@@ -81,8 +82,9 @@ def find_triangles(
     keys = blocks.sorted_keys
     tables = tensor_tables(blocks.device)
     parts = [
-        _triangles_of(blocks, rows_around(blocks, keys[start : start + _TOGETHER]), min_weight, tables)
-        for start in range(0, len(keys), _TOGETHER)
+        _triangles_of(blocks, rows_around(blocks, some), min_weight, tables)
+        for some in keys.split(at_once(keys.device, _TOGETHER))
+        if len(some)
     ]
     edges = torch.cat(parts) if parts else torch.empty((0, 3), dtype=torch.int64, device=blocks.device)
     if len(edge) == 0:

@@ -14,6 +14,7 @@ from pcdata.functional.rows import pick_rows
 from pcdata.functional.tsdf.blocks import BLOCKS, COLOR_SCALE, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, GRID, VOXELS, VoxelGrid, unpack_keys
 from pcdata.functional.tsdf.margins import SIDE, own_places, plane_with_margin, rows_around
+from pcdata.threads import at_once
 
 _TOGETHER = 512  # blocks read in one go: 0.7 million voxels with their margins
 # Ends of one edge that differ by more lie on two surfaces: the front of one seen past the edge of another. A surface
@@ -62,9 +63,10 @@ def find_crossings(
     belongs to no surface.
     """
     keys = blocks.sorted_keys
+    together = at_once(keys.device, _TOGETHER)
     parts = [
-        _crossings_of(blocks, keys[start : start + _TOGETHER], start, grid, min_weight, edges)
-        for start in range(0, max(len(keys), 1), _TOGETHER)
+        _crossings_of(blocks, keys[start : start + together], start, grid, min_weight, edges)
+        for start in range(0, max(len(keys), 1), together)
     ]
     return Crossings.cat(parts)
 

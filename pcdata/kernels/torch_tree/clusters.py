@@ -19,6 +19,7 @@ from pcdata.functional.rows import cloud_of_rows, ptr_after_mask, ptr_from_count
 from pcdata.kernels.torch_tree.boxtree import box_gap, expand_ranges
 from pcdata.kernels.torch_tree.cells import Cells
 from pcdata.kernels.torch_tree.search import nearest_chunks
+from pcdata.threads import at_once
 
 _SAMPLES = 4  # points per cell in the quick test; 16 distances join nearly all neighboring cells
 _PAIRS_PER_CHUNK = 1 << 15
@@ -85,8 +86,7 @@ def _join(cells: Cells, points: Tensor, eps: float) -> Tensor:
     parent = torch.arange(len(cells), dtype=torch.int64, device=points.device)
     open_pairs = [parent.new_empty((2, 0))]
     for pairs in cells.neighbor_pairs():
-        for begin in range(0, len(pairs[0]), _PAIRS_PER_CHUNK):
-            a, b = (side[begin : begin + _PAIRS_PER_CHUNK] for side in pairs)
+        for a, b in zip(*(side.split(at_once(points.device, _PAIRS_PER_CHUNK)) for side in pairs)):
             apart = parent[a] != parent[b]
             a, b = a[apart], b[apart]
             near = box_gap(low[a], high[a], low[b], high[b]) <= limit
@@ -131,7 +131,7 @@ def _any_within(members: Tensor, start: Tensor, low: Tensor, high: Tensor, a: Te
 
 def _chunks_by_size(pairs: Tensor, count: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield (2, P) pairs of cells in pieces that hold a bounded number of points."""
-    chunk = torch.cumsum(count[pairs[0]] + count[pairs[1]], 0) // _ROWS_PER_CHUNK
+    chunk = torch.cumsum(count[pairs[0]] + count[pairs[1]], 0) // at_once(pairs.device, _ROWS_PER_CHUNK)
     for piece in pairs.split_with_sizes(torch.unique_consecutive(chunk, return_counts=True)[1].tolist(), dim=1):
         yield piece[0], piece[1]
 

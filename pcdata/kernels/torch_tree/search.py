@@ -22,6 +22,7 @@ from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, laid
 from pcdata.functional.radius import largest_squared
 from pcdata.functional.rows import cloud_of_rows
 from pcdata.kernels.torch_tree.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
+from pcdata.threads import at_once
 
 _GROUPS_PER_CHUNK = 512
 _MAX_PAIRS = 1 << 16  # (query, point) or (group, box) pairs alive at once: temporaries that stay in cache
@@ -130,12 +131,13 @@ class _Search:
 
     def run(self) -> Iterator[Neighbors]:
         window = self._window_size()
-        per_chunk = max(1, min(_GROUPS_PER_CHUNK, _MAX_PAIRS // (LEAF_SIZE * LEAF_SIZE * window)))
+        groups, pairs = at_once(self.home.device, _GROUPS_PER_CHUNK), at_once(self.home.device, _MAX_PAIRS)
+        per_chunk = max(1, min(groups, pairs // (LEAF_SIZE * LEAF_SIZE * window)))
         for begin in range(0, len(self.leaves), per_chunk):
-            groups = torch.arange(
+            some = torch.arange(
                 begin, min(begin + per_chunk, len(self.leaves)), dtype=torch.int64, device=self.home.device
             )
-            yield from self._walk(groups, torch.minimum(self._first_bound(groups, window), self.limit))
+            yield from self._walk(some, torch.minimum(self._first_bound(some, window), self.limit))
 
     def _window_size(self) -> int:
         """Leaves that surely hold k points wherever the cloud has them: only a cloud's last leaf may be short."""
@@ -204,7 +206,7 @@ class _Search:
             group, node = group[near], node[near]
             if depth:
                 group, node = expand_ranges(level.groups.first[node], level.groups.count[node], group)
-            if len(group) > _MAX_PAIRS and len(groups) > 1:
+            if len(group) > at_once(group.device, _MAX_PAIRS) and len(groups) > 1:
                 # A bound too loose for so many groups at once: walk again with half of them, never with more memory.
                 half = len(groups) // 2
                 yield from self._walk(groups[:half], bound[:half])
@@ -230,7 +232,7 @@ class _Search:
             chosen = ((counts > narrower) & (counts <= width)).nonzero().squeeze(1)
             narrower = width
             places = torch.arange(width, dtype=torch.int64, device=row.device)
-            per_part = max(1, _MAX_PAIRS // (width * LEAF_SIZE))
+            per_part = max(1, at_once(row.device, _MAX_PAIRS) // (width * LEAF_SIZE))
             for begin in range(0, len(chosen), per_part):
                 part = chosen[begin : begin + per_part]
                 place = torch.where(places < counts[part, None], start[part, None] + places, len(leaf) - 1)

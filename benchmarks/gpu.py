@@ -1,0 +1,258 @@
+"""Every operation, step and fusion on a GPU: the same answers as on the CPU, and how long they take.
+
+    benchmarks/gpu.sh                      # from a bare machine; or, where everything is installed:
+    PYTHONPATH=. python benchmarks/gpu.py  # writes results/gpu.json
+    PYTHONPATH=. python benchmarks/gpu.py --rehearse   # without a GPU, on the device of the tests; keeps nothing
+
+Parity: the examples of the contract suites and a fused volume. Masks, indices and labels are the same; other numbers
+differ by at most 2e-6. Timings: medians of wall time, synchronized before and after, on a warm device, for a synthetic
+1280x720 frame; ``waits`` counts the calls in which torch says that the host waited. One error stops nothing: it is a
+row, and the exit code is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import pcdata
+from pcdata import functional as F
+from pcdata import transforms as T
+from pcdata.rng import seeded
+from pcdata.structures import TSDFVolume
+from pcdata.synthetic import tabletop
+from tests.factories import differences, tree
+from tests.functional import test_op_contract as operations
+from tests.transforms import test_contract as steps
+
+RESULTS = Path(__file__).parent / "results"
+TOLERANCE = 2e-6
+REPEATS = 10
+SLOW = 2.0  # seconds: what takes longer is timed once
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=RESULTS / "gpu.json")
+    parser.add_argument("--rehearse", action="store_true", help="run on the device of the tests; keep nothing")
+    parser.add_argument("--only", default="", help="rows whose name contains this; keep nothing")
+    arguments = parser.parse_args()
+    device = rehearsed() if arguments.rehearse else torch.device("cuda", torch.cuda.current_device())
+    result: dict[str, Any] = {"device": about(device), "parity": [], "timings": []}
+    for name, compare in parity_cases(device):
+        if arguments.only in name:
+            result["parity"].append(compared(name, compare))
+    for name, goal, call in timing_cases(device, (72, 128) if arguments.rehearse else (720, 1280)):
+        if arguments.only in name:
+            result["timings"].append(timed(name, goal, call, device))
+    bad = [row["name"] for row in result["parity"] if not row["same"]]
+    failed = [row["name"] for row in result["timings"] if "error" in row]
+    print(f"{len(result['parity'])} compared, {len(bad)} differ: {bad}; {len(failed)} timings failed: {failed}")
+    if not arguments.rehearse and not arguments.only:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    return bool(bad or failed)
+
+
+def rehearsed() -> torch.device:
+    from tests.pretend_device import device
+
+    return device()
+
+
+def about(device: torch.device) -> dict[str, Any]:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return {"name": name, "torch": torch.__version__, "cuda": torch.version.cuda, "pcdata": pcdata.__version__}
+
+
+# Parity
+
+
+def parity_cases(device: torch.device) -> Iterator[tuple[str, Callable[[], list[str]]]]:
+    """Yield names, and calls that return what differs."""
+    for example in operations.EXAMPLES:
+        yield f"{example.name} ({example.cloud.__name__})", lambda e=example: operation_differences(e, device)
+    for name, examples in steps.EXAMPLES.items():
+        for number, example in enumerate(examples):
+            yield f"{name} ({number})", lambda e=example: step_differences(e, device)
+    yield "TSDFVolume", lambda: volume_differences(device)
+
+
+def operation_differences(example: operations.Example, device: torch.device) -> list[str]:
+    arguments = operations.packed(example, operations.clouds_of(example))
+    expected = operations.call(example, arguments, backend="torch")
+    found = operations.call(example, {key: value.to(device) for key, value in arguments.items()})
+    return [
+        f"output {place}: {told}" for place, pair in enumerate(zip(found, expected)) if (told := apart(*pair, device))
+    ]
+
+
+def apart(found: Tensor, expected: Tensor, device: torch.device) -> str:
+    """Say how two tensors differ; nothing where they are the same."""
+    if found.device.type != device.type:
+        return f"lies on {found.device}"
+    there = found.to("cpu")
+    if there.shape != expected.shape or there.dtype != expected.dtype:
+        return f"{tuple(there.shape)} {there.dtype}, expected {tuple(expected.shape)} {expected.dtype}"
+    if not expected.is_floating_point():
+        return "" if torch.equal(there, expected) else f"{int((there != expected).sum())} of {expected.numel()} differ"
+    most = float((there.double() - expected.double()).nan_to_num(0.0, 0.0, 0.0).abs().max()) if there.numel() else 0.0
+    same = torch.equal(there.isfinite(), expected.isfinite()) and most <= TOLERANCE * (
+        1 + float(expected[expected.isfinite()].abs().max()) if bool(expected.isfinite().any()) else 1
+    )
+    return "" if same else f"up to {most:.2e}"
+
+
+def step_differences(example: Any, device: torch.device) -> list[str]:
+    data = example.make(steps.COUNTS)
+    found = steps.run(example, data.to(device))
+    if found.device.type != device.type:
+        return [f"lies on {found.device}"]
+    return list(differences(tree(steps.run(example, data)), tree(found.to("cpu")), tolerance=TOLERANCE))
+
+
+def volume_differences(device: torch.device) -> list[str]:
+    def fused(where: torch.device) -> TSDFVolume:
+        volume = TSDFVolume(voxel_size=0.01, backend="torch", device=where)
+        for seed in range(2):
+            volume.integrate(tabletop(seed, size=(120, 160)).frame.to(where))
+        return volume
+
+    here, there = fused(torch.device("cpu")), fused(device)
+    keys = apart(there.blocks.keys, here.blocks.keys, device)
+    return (
+        [keys]
+        if keys
+        else list(differences(tree(here.extract_points()), tree(there.extract_points().to("cpu")), tolerance=1e-5))
+    )
+
+
+def compared(name: str, compare: Callable[[], list[str]]) -> dict[str, Any]:
+    try:
+        told = compare()
+    except Exception as error:  # a row, so that one fault does not hide the next
+        told = [f"{type(error).__name__}: {str(error)[:300]}", traceback.format_exc(limit=-2)[-600:]]
+    if told:
+        print(f"DIFFERS {name}: {told[0]}", flush=True)
+    return {"name": name, "same": not told, "told": told[:4]}
+
+
+# Timings
+
+
+def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[str, float | None, Callable[[], Any]]]:
+    """Yield names, milliseconds to reach, and calls."""
+    frame = tabletop(0, noise="stereo", size=size).frame.to(device)
+    chain = T.Compose(
+        [
+            T.MaskDepth(near=0.2, far=2.0),
+            T.Deproject(),
+            T.RemoveStatisticalOutliers(num_neighbors=20, std_ratio=2.0),
+            T.RemoveRadiusOutliers(radius=0.02, min_neighbors=10),
+            T.RemovePlane(distance=0.01),
+            T.FarthestPointSample(num_points=256 if size[0] < 100 else 1024),
+            T.EstimateNormals(radius=0.02, max_neighbors=30),
+        ]
+    )
+    crop = T.Compose([T.Deproject(), T.CropWorkspace(frame="camera", lower=(-1, -1, 0), upper=(1, 1, 2))])
+    yield "deproject and crop", 0.05, lambda: crop(frame)
+    cloud = T.Deproject()(frame)
+    points, grid = cloud.points.contiguous(), cloud.image_grid()
+    yield (
+        "statistical outliers 20",
+        0.4,
+        lambda: F.statistical_outlier_mask(points, num_neighbors=20, std_ratio=2.0, grid=grid),
+    )
+    yield (
+        "radius outliers 2 cm, 10",
+        0.1,
+        lambda: F.radius_outlier_mask(points, radius=0.02, min_neighbors=10, grid=grid),
+    )
+    yield "RANSAC 1000", 0.5, lambda: F.ransac_plane(points, distance=0.01)
+    _, on_plane = F.ransac_plane(points, distance=0.01)
+    above = points[~on_plane].contiguous()
+    yield "DBSCAN 2 cm, 10", 1.0, lambda: F.dbscan(above, eps=0.02, min_points=10)
+    yield "voxels 5 mm", 0.25, lambda: F.voxel_downsample(points, voxel_size=0.005)
+    few = points[torch.randperm(len(points), generator=seeded(0)).to(device)[: 3 * len(points) // 10]].contiguous()
+    for wanted, goal in ((1024, 2.0), (4096, 8.0), (20_000, 40.0)):
+        if wanted < len(few):
+            yield (
+                f"farthest points {len(few)} to {wanted}",
+                goal,
+                lambda w=wanted: F.farthest_point_sample(few, num_samples=w),
+            )
+    many = points[:1].new_empty((128 * 3000, 3))
+    many.copy_(torch.rand(128 * 3000, 3, generator=seeded(0)))
+    ptr = (torch.arange(129, device="cpu") * 3000).to(device)
+    yield "farthest points 128 x 3000 to 128", 0.15, lambda: F.farthest_point_sample(many, ptr, num_samples=128)
+    yield "normals 2 cm, 30", 0.6, lambda: F.estimate_normals(points, radius=0.02, max_neighbors=30, grid=grid)
+    yield "flying pixels", None, lambda: F.flying_pixel_mask(frame.depth)
+    yield "16 nearest", None, lambda: F.knn(points, k=16)
+    yield "chain to 1024 points", 3.0, lambda: chain(frame)
+    yield "chain to 1024 points, four clouds", 4.0, lambda: [chain(frame) for _ in range(4)]
+    volume = TSDFVolume(voxel_size=0.004, backend="auto", device=device)
+    yield "TSDF 4 mm, integrate", 0.3, lambda: volume.integrate(frame)
+    yield "TSDF 4 mm, extract", 0.5, lambda: volume.extract_points()
+
+
+def timed(name: str, goal: float | None, call: Callable[[], Any], device: torch.device) -> dict[str, Any]:
+    try:
+        seconds = [run_once(call, device)]  # warms up
+        waits = waits_of(call, device)
+        seconds = [run_once(call, device) for _ in range(1 if seconds[0] > SLOW else REPEATS)]
+    except Exception as error:  # a row, as above
+        print(f"FAILED {name}: {error}", flush=True)
+        return {"name": name, "error": f"{type(error).__name__}: {str(error)[:300]}"}
+    low, _, high = statistics.quantiles(seconds, n=4) if len(seconds) > 1 else (seconds[0],) * 3
+    row = {
+        "name": name,
+        "ms": 1e3 * statistics.median(seconds),
+        "iqr_ms": 1e3 * (high - low),
+        "goal_ms": goal,
+        "waits": waits,
+    }
+    print(f"{name}: {row['ms']:.3f} ms ({row['iqr_ms']:.3f}), goal {goal}, {waits} waits", flush=True)
+    return row
+
+
+def run_once(call: Callable[[], Any], device: torch.device) -> float:
+    synchronize(device)
+    start = time.perf_counter()
+    call()
+    synchronize(device)
+    return time.perf_counter() - start
+
+
+def synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def waits_of(call: Callable[[], Any], device: torch.device) -> int | None:
+    """Count the calls of one run in which the host waited for the device."""
+    if device.type != "cuda":
+        return None
+    before = torch.cuda.get_sync_debug_mode()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            call()
+    finally:
+        torch.cuda.set_sync_debug_mode(before)
+    return sum("synchroniz" in str(one.message) for one in told)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

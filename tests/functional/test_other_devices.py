@@ -1,0 +1,171 @@
+"""Operations on a device that is not the processor, without a GPU: see ``pretend_device``."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pcdata.contracts.dispatch import OPERATIONS
+from tests import pretend_device
+from tests.functional.test_op_contract import COUNTS, EXAMPLES, Example, call, clouds_of, each_example, packed
+from tests.pretend_device import Watched, host, pretend, watching
+
+pytestmark = pytest.mark.skipif(not pretend_device.AVAILABLE, reason="this PyTorch has no devices written in Python")
+
+# How often the host may wait for the device in one call on three clouds, and how often it does so today or less.
+MOST_WAITS = {
+    "ball_query": 89,
+    "bilateral_filter": 2,
+    "boundary_mask": 31,
+    "box_mask": 7,
+    "chamfer_distance": 107,
+    "core_point_mask": 45,
+    "dbscan": 300,
+    "decimate_depth": 2,
+    "deproject_depth": 96,
+    "deproject_ranges": 5,
+    "depth_normals": 91,
+    "duplicate_mask": 10,
+    "estimate_normals": 35,
+    "f_score": 72,
+    "farthest_point_groups": 16,
+    "farthest_point_sample": 23,
+    "fill_holes": 16,
+    "find_voxel_size": 125,
+    "fit_paired_points": 8,
+    "flying_pixel_mask": 2,
+    "frustum_mask": 12,
+    "hard_voxels": 21,
+    "hausdorff_distance": 74,
+    "hidden_point_mask": 15,
+    "image_clusters": 65,
+    "interpolate_features": 40,
+    "iterate_closest_points": 179,
+    "knn": 126,
+    "median_filter": 2,
+    "neighborhood_covariance": 38,
+    "pack_colors": 0,
+    "polygon_mask": 2,
+    "project_points": 12,
+    "radius_neighbors": 47,
+    "radius_outlier_mask": 46,
+    "ransac_circle": 18,
+    "ransac_cylinder": 65,
+    "ransac_line": 19,
+    "ransac_plane": 27,
+    "ransac_sphere": 24,
+    "register_depth": 135,
+    "render_points": 14,
+    "render_ranges": 6,
+    "render_triangles": 102,
+    "resize_depth": 2,
+    "segment_planes": 199,
+    "spatial_filter": 2,
+    "statistical_outlier_mask": 33,
+    "supporting_plane": 1057,
+    "table_surface": 425,
+    "undistort_depth": 14,
+    "undistort_image": 13,
+    "voxel_downsample": 14,
+}
+
+# Each loops over clouds, or over cameras; the others launch as much for many clouds as for few.
+LOOPS = {
+    "deproject_depth": "every camera has its own lens",
+    "depth_normals": "every camera has its own lens",
+    "frustum_mask": "every camera has its own lens",
+    "project_points": "every camera has its own lens",
+    "register_depth": "every camera has its own lens",
+    "render_points": "every camera has its own lens",
+    "render_triangles": "every camera has its own lens",
+    "undistort_depth": "every camera has its own lens",
+    "undistort_image": "every camera has its own lens",
+    "ransac_circle": "blocks of hypotheses are those of one cloud",
+    "ransac_cylinder": "blocks of hypotheses are those of one cloud",
+    "ransac_line": "blocks of hypotheses are those of one cloud",
+    "ransac_plane": "blocks of hypotheses are those of one cloud",
+    "ransac_sphere": "blocks of hypotheses are those of one cloud",
+    "segment_planes": "a cloud has as many planes as it has",
+    "supporting_plane": "a cloud has as many planes as it has",
+    "table_surface": "every table has its own height map",
+    "find_voxel_size": "the search ends when the last cloud's does",
+    "iterate_closest_points": "the rounds end when the last cloud's do",
+    "farthest_point_sample": "groups of rows are those of one cloud",
+    "farthest_point_groups": "groups of rows are those of one cloud",
+    "knn": "in six dimensions distances are those of one cloud",
+}
+
+
+def named(example: Example) -> str:
+    return f"{example.name}-{example.cloud.__name__}"
+
+
+def watched_call(example: Example, counts: tuple[int, ...]) -> tuple[tuple[torch.Tensor, ...], Watched]:
+    arguments = {key: pretend(value) for key, value in packed(example, clouds_of(example, counts)).items()}
+    with watching() as watched:
+        found = call(example, arguments)
+    return found, watched
+
+
+@each_example
+def test_the_answer_is_that_of_the_reference_and_stays_on_the_device(example):
+    expected = call(example, packed(example, clouds_of(example)), backend="torch")
+    found, watched = watched_call(example, COUNTS)
+    for one, other in zip(found, expected, strict=True):
+        assert one.device.type == pretend_device.NAME
+        assert torch.equal(host(one), other)
+    waits = sum(watched.waits.values())
+    assert waits <= MOST_WAITS[example.name], watched.waits
+
+
+@pytest.mark.parametrize("example", [example for example in EXAMPLES if example.name not in LOOPS], ids=named)
+def test_many_clouds_take_no_more_launches_than_few(example):
+    few, many = (watched_call(example, (30, 21, 40) * times)[1] for times in (1, 5))
+    assert many.launches <= 1.5 * few.launches + 60, many.launches - few.launches
+    assert many.waits.total() <= 1.5 * few.waits.total() + 20, many.waits - few.waits
+
+
+def test_what_loops_is_known_and_nothing_else():
+    assert set(LOOPS) < set(OPERATIONS)
+
+
+def test_the_device_refuses_what_a_gpu_refuses():
+    there, here = pretend(torch.ones(3)), torch.ones(3)
+    with pytest.raises(RuntimeError, match="same device"):
+        there + here
+    with pytest.raises(RuntimeError, match="same device"):
+        torch.where(here > 0, there, there)
+    with pytest.raises(TypeError, match="numpy"):
+        there.numpy()
+    with pytest.raises(RuntimeError, match="address"):
+        there.data_ptr()
+    with pytest.raises(RuntimeError, match="indices"):
+        here[pretend(torch.tensor([0, 1]))]
+    assert torch.equal(host(there + torch.tensor(1.0)), torch.full((3,), 2.0))  # a number of the host may be mixed in
+
+
+def test_the_device_counts_what_a_gpu_waits_for():
+    there = pretend(torch.tensor([0.0, 1.0, 2.0]))
+    with watching() as watched:
+        there.sum() + 1
+        there.to(torch.float64)
+    assert not watched.waits
+    assert not watched.uploads
+    assert watched.launches == 3
+    for waits in (
+        lambda: there.sum().item(),
+        lambda: bool((there > 0).any()),
+        lambda: there.tolist(),
+        lambda: there.cpu(),
+        lambda: there[there > 0],
+        lambda: there.nonzero(),
+        lambda: torch.empty(3).copy_(there),
+    ):
+        with watching() as watched:
+            waits()
+        assert watched.waits.total() == 1, watched.waits
+    with watching() as watched:
+        torch.ones(3).to(there.device)
+        there[torch.tensor([0, 1])]
+    assert watched.uploads.total() == 2
+    assert not watched.waits
