@@ -86,7 +86,8 @@ def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
 
 
 def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
-    monkeypatch.setitem(planes_module._BLOCK, "cpu", (3, 7))
+    monkeypatch.setattr(planes_module, "_PLANES", 3)
+    monkeypatch.setattr(planes_module, "_POINTS", 7)
     points = scene()
     hypotheses = planes_through(points[draw_rows(len(points), 3, 50, seeded(0))])
     counts = planes_module._count_near(points, hypotheses, 0.01)
