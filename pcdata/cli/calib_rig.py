@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +60,7 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
 
 def _overlap(arguments: argparse.Namespace) -> int | None:
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
     from pcdata.verdicts import Verdict
@@ -71,7 +71,7 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     print(result.text())
     if arguments.json:
         with replacing("overlap --json", arguments.json) as temporary:
-            temporary.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+            temporary.write_text(json_text(result.to_json(), indent=2) + "\n", encoding="utf-8")
     if arguments.figure:
         save_overlap_figure(arguments.figure, captures[0], result)
     return FAILED if result.verdict is Verdict.FAIL else None

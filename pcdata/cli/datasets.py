@@ -74,11 +74,11 @@ def _inspect(arguments: argparse.Namespace) -> None:
 
 
 def _tell(file: str | None, facts: dict[str, Any], text: str) -> None:
-    import json
 
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
 
-    document = json.dumps(facts, indent=1, allow_nan=False)
+    document = json_text(facts, indent=1)
     if file == "-":
         print(document)
         return

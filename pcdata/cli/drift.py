@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ def add_to(commands: Any) -> None:
 
 def _drift(arguments: argparse.Namespace) -> int:
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.io.sources.capture_source import check_apart
     from pcdata.report.html.drift_page import drift_page
     from pcdata.validation.drift import measure_drift
@@ -40,7 +40,7 @@ def _drift(arguments: argparse.Namespace) -> int:
         result = measure_drift(source, reference=reference, window=arguments.window, progress=progress)
     if arguments.json:
         with replacing("drift --json", arguments.json) as temporary:
-            Path(temporary).write_text(json.dumps(result.to_json(), indent=1, allow_nan=False), encoding="utf-8")
+            Path(temporary).write_text(json_text(result.to_json(), indent=1), encoding="utf-8")
     if arguments.out:
         with replacing("drift --out", arguments.out) as temporary:
             Path(temporary).write_text(drift_page(result, f"Drift of {source}"), encoding="utf-8")

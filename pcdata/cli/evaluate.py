@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import Any
 
@@ -59,6 +58,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.report.segmentation_text import segmentation_text
     from pcdata.validation.label_files import matched_labels, paired_files, read_label_file
     from pcdata.validation.segmentation import mean_scores, score_segmentation
@@ -74,5 +74,5 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         told = {"mean": mean_scores([*scores.values()]), "scenes": {name: asdict(one) for name, one in scores.items()}}
         with replacing("evaluate --json", arguments.json) as temporary:
-            temporary.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            temporary.write_text(json_text(told, indent=1) + "\n", encoding="utf-8")
         print(f"json  {arguments.json}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from pcdata.cli.argument_types import positive
@@ -34,6 +33,7 @@ def add_to(commands: Any) -> None:
 def _check(arguments: argparse.Namespace) -> int:
     from pcdata.exports import is_export
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.validation_text import validation_text
     from pcdata.verdicts import Verdict
@@ -46,7 +46,8 @@ def _check(arguments: argparse.Namespace) -> int:
         summary = _check_export(arguments) if is_export(arguments.path) else _check_foreign(arguments)
     if arguments.json:
         with replacing("check --json", arguments.json) as temporary, open(temporary, "w", encoding="utf-8") as file:
-            json.dump({"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}, file, indent=1)
+            told = {"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}
+            file.write(json_text(told, indent=1))
     print(validation_text(summary))
     return int(summary.verdict is Verdict.FAIL)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -111,6 +110,7 @@ def _report(arguments: argparse.Namespace) -> int:
 
 def _grade(arguments: argparse.Namespace) -> int:
     from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.io.sources.capture_source import episodes_of
     from pcdata.report.html.dataset_report import dataset_page
     from pcdata.validation import validate_source
@@ -128,7 +128,7 @@ def _grade(arguments: argparse.Namespace) -> int:
                     progress(done, len(source.ids), report.sample_id)
     if arguments.json:
         with replacing("grade --json", arguments.json) as temporary:
-            Path(temporary).write_text(json.dumps(grading.to_json(), indent=1, allow_nan=False), encoding="utf-8")
+            Path(temporary).write_text(json_text(grading.to_json(), indent=1), encoding="utf-8")
     grade = grading.grade()
     print(f"{grade.letter}: {LETTERS[grade.letter]}")
     for reason in grade.reasons:

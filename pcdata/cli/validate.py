@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -86,18 +85,21 @@ class _Writer:
     """Writes the JSON document report by report, so that a long recording need not fit into memory."""
 
     def __init__(self, path: Path, source: str, limits: dict[str, Any]) -> None:
+        from pcdata.files.strict_json import json_text
+
+        self._text = json_text
         self._file: IO[str] = open(path, "w", encoding="utf-8")  # noqa: SIM115  # closed by close
         head = {"schema": "pcdata.validation/1", "source": str(source), "limits": limits}
-        self._file.write(json.dumps(head, indent=1)[:-2] + ',\n "samples": [')
+        self._file.write(self._text(head, indent=1)[:-2] + ',\n "samples": [')
         self._first = True
 
     def add(self, report: dict[str, Any]) -> None:
         """Write one report."""
-        self._file.write(("\n  " if self._first else ",\n  ") + json.dumps(report, allow_nan=False))
+        self._file.write(("\n  " if self._first else ",\n  ") + self._text(report))
         self._first = False
 
     def close(self, summary: dict[str, Any], unread: list[str]) -> None:
         """Write the end."""
-        end = f'"not_read": {json.dumps(unread)},\n "summary": {json.dumps(summary, allow_nan=False)}'
+        end = f'"not_read": {self._text(unread)},\n "summary": {self._text(summary)}'
         self._file.write(f"\n ],\n {end}\n}}\n")
         self._file.close()

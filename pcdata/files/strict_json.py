@@ -18,6 +18,8 @@ _CONTAINERS = (dict, list)
 # What could be more than a float or an int can hold: only then is every number looked at.
 _LARGE_NUMBER = re.compile(r"(?<![\w\"])\d[\d.]*[eE]\+?\d{3}|(?<!\d)\d{200}")
 _MAYBE_LARGE = re.compile(r"[eE]\+?\d{3}|(?<!\d)\d{200}")  # found wherever the other is, and five times as fast
+# A backslash as it is written, two surrogates that are one character, and one that is alone.
+_ESCAPE = re.compile(r"\\\\|\\ud[89ab]..\\ud[c-f]..|(\\u(d[89a-f]..))")
 _MAX_DEPTH = 100  # a pipeline may have 50 levels as YAML, and each is two here
 
 
@@ -53,6 +55,17 @@ def parse_json(text: str | bytes) -> Any:
     raise ValueError(f"nested too deeply, more than {_MAX_DEPTH} levels")
 
 
+def json_text(data: Any, *, indent: int | None = None) -> str:
+    r"""Return JSON that every parser takes: ASCII, numbers alone that are finite, no lone surrogates.
+
+    Those are what Python makes of the bytes of a file name that is no UTF-8: such a byte stands as the text ``\xff``.
+
+    Raises:
+        ValueError: a number that is not finite.
+    """
+    return _ESCAPE.sub(_without_surrogate, json.dumps(data, indent=indent, allow_nan=False))
+
+
 def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> dict[str, Any]:
     """Parse a JSON object.
 
@@ -66,6 +79,13 @@ def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> d
     if not isinstance(data, dict):
         raise error(f"{where}: must be a JSON object, got a {type(data).__name__}")
     return data
+
+
+def _without_surrogate(match: re.Match[str]) -> str:
+    if match[1] is None:
+        return match[0]
+    code = int(match[2], 16)
+    return f"\\\\x{code - 0xDC00:02x}" if 0xDC80 <= code <= 0xDCFF else f"\\\\u{code:04x}"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import importlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class RowsWriter:
             metadata={"huggingface": json.dumps({"info": {"features": _for_hub(self._features)}})},
         )
         self._writer: Any = None
+        self._stream: IO[bytes] | None = None  # the library opens no name that is not UTF-8 by itself
         self._path: Path | None = None
         self._file = -1
         self._waiting: dict[str, list[Any]] = {key: [] for key in self._features}
@@ -52,7 +53,8 @@ class RowsWriter:
             self._file += 1
             self._path = self._root / DATA_PATH.format(**self._place())
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = self._parquet.ParquetWriter(self._path, self._schema, compression="zstd")
+            self._stream = open(self._path, "wb")  # noqa: SIM115  # closed by close
+            self._writer = self._parquet.ParquetWriter(self._stream, self._schema, compression="zstd")
         return self._place()
 
     def add(self, row: Mapping[str, Any]) -> None:
@@ -72,14 +74,21 @@ class RowsWriter:
         ]
         if len(columns[0]):
             self._writer.write_table(self._arrow.Table.from_arrays(columns, schema=self._schema))
+            if self._stream is not None:
+                self._stream.flush()  # begin_episode asks for the size
         self._waiting = {key: [] for key in self._features}
         self._bytes = 0
 
     def close(self) -> None:
         """End the file."""
         writer, self._writer = self._writer, None
-        if writer is not None:
-            writer.close()
+        stream, self._stream = self._stream, None
+        try:
+            if writer is not None:
+                writer.close()
+        finally:
+            if stream is not None:
+                stream.close()
 
     def _place(self) -> dict[str, int]:
         return {"chunk_index": self._file // FILES_IN_CHUNK, "file_index": self._file % FILES_IN_CHUNK}
@@ -90,7 +99,8 @@ def write_episodes_table(root: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     arrow, parquet = importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     path = root / EPISODES_PATH.format(chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True)
-    parquet.write_table(arrow.Table.from_pylist([dict(row) for row in rows]), path, compression="zstd")
+    with open(path, "wb") as stream:
+        parquet.write_table(arrow.Table.from_pylist([dict(row) for row in rows]), stream, compression="zstd")
 
 
 def write_tasks_table(root: Path, tasks: Sequence[str]) -> None:
@@ -109,7 +119,8 @@ def write_tasks_table(root: Path, tasks: Sequence[str]) -> None:
     }  # fmt: skip
     schema = arrow.schema([("task_index", arrow.int64()), ("task", arrow.string())], {"pandas": json.dumps(about)})
     columns = [arrow.array(range(len(tasks)), arrow.int64()), arrow.array(list(tasks), arrow.string())]
-    parquet.write_table(arrow.Table.from_arrays(columns, schema=schema), root / TASKS_PATH)
+    with open(root / TASKS_PATH, "wb") as stream:
+        parquet.write_table(arrow.Table.from_arrays(columns, schema=schema), stream)
 
 
 def _type(arrow: Any, said: Feature) -> Any:
