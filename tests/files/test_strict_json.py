@@ -15,7 +15,7 @@ from pcdata import Camera, DepthFrame, PointCloud, TSDFVolume, read_ply, read_vo
 from pcdata.errors import CacheError, CaptureError, PcdataError
 from pcdata.exports.export_record import FILE_NAME, ExportRecord
 from pcdata.files.npz import write_npz
-from pcdata.files.strict_json import json_object, parse_json
+from pcdata.files.strict_json import json_object, json_text, parse_json
 from pcdata.io.arrays.stored_arrays import stored_arrays
 from pcdata.io.store.cloud_record import Record, cloud_from_record, parse_info, record_from_cloud
 from pcdata.io.store.manifest import Manifest
@@ -145,3 +145,27 @@ def test_what_could_not_be_read_back_is_not_written():
         deep = [deep]
     with pytest.raises(CacheError, match="nested too deeply"):
         record_from_cloud(PointCloud(points=torch.rand(4, 3), frame_id="base", meta=({"deep": deep},)))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a\udcff\udc80", r"a\xff\x80"),  # bytes that are no UTF-8
+        ("\ud83d", r"\ud83d"),
+        ("\ud83dx\ude00", r"\ud83dx\ude00"),
+        ("\\\udc80", r"\\x80"),
+        ("\\udcff", "\\udcff"),  # a backslash and letters, no surrogate
+        ("\\\\udcff", "\\\\udcff"),
+        ("\U0001f600\u00e9\u202e\x1b", "\U0001f600\u00e9\u202e\x1b"),
+    ],
+)
+def test_json_that_is_written_has_no_half_characters(text, told):
+    written = json_text({text: [text]}, indent=1)
+    assert written.isascii()
+    assert json.loads(written) == {told: [told]}
+    told.encode()
+
+
+def test_json_that_is_written_has_finite_numbers_alone():
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        json_text([float("nan")])
