@@ -11,7 +11,7 @@ import math
 import re
 from typing import Any
 
-from pcdata.errors import PcdataError
+from pcdata.errors import CacheError, PcdataError
 
 _MAX_DIGITS = 1000  # no float has more than 309 before its point; Python refuses to convert 4,300
 _CONTAINERS = (dict, list)
@@ -19,7 +19,7 @@ _CONTAINERS = (dict, list)
 _LARGE_NUMBER = re.compile(r"(?<![\w\"])\d[\d.]*[eE]\+?\d{3}|(?<!\d)\d{200}")
 _MAYBE_LARGE = re.compile(r"[eE]\+?\d{3}|(?<!\d)\d{200}")  # found wherever the other is, and five times as fast
 # A backslash as it is written, two surrogates that are one character, and one that is alone.
-_ESCAPE = re.compile(r"\\\\|\\ud[89ab]..\\ud[c-f]..|(\\u(d[89a-f]..))")
+_ESCAPE = re.compile(r"\\\\|\\ud[89ab]..\\ud[c-f]..|(\\u(d[89a-f]..))", re.IGNORECASE)
 _MAX_DEPTH = 100  # a pipeline may have 50 levels as YAML, and each is two here
 
 
@@ -70,15 +70,24 @@ def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> d
     """Parse a JSON object.
 
     Raises:
-        PcdataError: of the type ``error``: not what :func:`parse_json` takes, or no object.
+        PcdataError: of the type ``error``: not what :func:`parse_json` takes, no object, or, of a file that pcdata did
+            not write, a text with half a character, which no other file could hold.
     """
     try:
+        if not issubclass(error, CacheError):  # a dataset keeps folders whose names are no UTF-8
+            _check_whole_characters(text)
         data = parse_json(text)
     except ValueError as cause:
         raise error(f"{where}: not valid JSON: {str(cause)[:300]}") from cause
     if not isinstance(data, dict):
         raise error(f"{where}: must be a JSON object, got a {type(data).__name__}")
     return data
+
+
+def _check_whole_characters(text: str | bytes) -> None:
+    plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else text
+    if half := next((found[1] for found in _ESCAPE.finditer(plain) if found[1]), None):
+        raise ValueError(f"half a character, {half}, is no text")
 
 
 def _without_surrogate(match: re.Match[str]) -> str:

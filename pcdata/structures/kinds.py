@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.errors import DTypeError
+from pcdata.errors import ConfigError, DTypeError, near_matches
 from pcdata.functional.rows import group_first, transform_directions, transform_points
 from pcdata.functional.voxels import (
     voxel_majority,
@@ -90,6 +90,12 @@ class Kind(str, Enum):
     DIRECTION = "direction"
     INVARIANT = "invariant"
     MINIMUM = "minimum"  # as a chain is as strong as its weakest link
+
+    @classmethod
+    def _missing_(cls, value: object) -> Kind:
+        known = [kind.value for kind in cls]
+        hint = near_matches(value, known) if isinstance(value, str) else ""
+        raise ConfigError(f"kind: a field is one of {', '.join(known)}, not {value!r:.100}{hint}")
 
 
 @dataclass(frozen=True, kw_only=True)

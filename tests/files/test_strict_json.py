@@ -169,3 +169,11 @@ def test_json_that_is_written_has_no_half_characters(text, told):
 def test_json_that_is_written_has_finite_numbers_alone():
     with pytest.raises(ValueError, match="not JSON compliant"):
         json_text([float("nan")])
+
+
+@pytest.mark.parametrize("text", [r'{"frame_id": "a\ud800"}', r'{"a\uDCFF": 1}', rb'{"a": "\udc80\ud83d"}'])
+def test_half_a_character_is_refused_in_what_others_wrote(text):
+    with pytest.raises(CaptureError, match="half a character"):
+        json_object("it", text, error=CaptureError)
+    assert json_object("it", text, error=CacheError)  # a dataset says so where its captures lie
+    json_object("it", r'{"\ud83d\ude00": "\\ud800"}', error=CaptureError)

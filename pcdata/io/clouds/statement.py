@@ -199,6 +199,7 @@ def _take(found: CloudStatement, key: str, value: Any) -> None:
 def _text(value: Any) -> str:
     if not isinstance(value, str) or not value:
         raise ValueError("a name is needed")
+    value.encode()  # raises a ValueError of half a character
     return value
 
 

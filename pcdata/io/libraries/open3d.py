@@ -19,7 +19,7 @@ from pcdata.io.libraries.open3d_clouds import (
     open3d,
     tensors_of_cloud,
 )
-from pcdata.io.libraries.rows import cloud_of_tensors
+from pcdata.io.libraries.rows import cloud_of_tensors, vertices_of
 from pcdata.structures import Camera, DepthFrame, Kind, PointCloud, SurfaceMesh
 
 
@@ -127,7 +127,7 @@ def from_open3d(
     clouds = (library.geometry.PointCloud, library.t.geometry.PointCloud)
     meshes = (library.geometry.TriangleMesh, library.t.geometry.TriangleMesh)
     if several and all(isinstance(one, clouds) for one in several):
-        known = like.vertices if isinstance(like, SurfaceMesh) else like
+        known = vertices_of(where, like)
         if known is not None and known.num_clouds != len(several):
             raise DTypeError(f"{where}: like= has {known.num_clouds} clouds, but {len(several)} are given")
         origins = [None] * len(several) if known is None else known.unbatch()
@@ -138,19 +138,27 @@ def from_open3d(
         return made[0] if len(made) == 1 else PointCloud.cat(made)
     if isinstance(what, meshes):
         rows, triangles = mesh_of_open3d(where, what, copy)
-        known = like.vertices if isinstance(like, SurfaceMesh) else like
+        known = vertices_of(where, like)
         return SurfaceMesh(vertices=cloud_of_tensors(where, rows, **facts, like=known), triangles=triangles)
-    if strange := [name for name, value in {**facts, "like": like}.items() if value is not None]:
-        told = f"{type(what).__name__} has no {strange[0]}" if several else "the list is empty"
-        raise DTypeError(f"{where}: {told}; of clouds and meshes alone such things are said")
     cameras = library.camera
+    kinds_of_cameras = (
+        cameras.PinholeCameraIntrinsic,
+        cameras.PinholeCameraParameters,
+        cameras.PinholeCameraTrajectory,
+    )
+    stated = [name for name, value in {**facts, "like": like}.items() if value is not None]
+    if stated and several and all(isinstance(one, kinds_of_cameras) for one in several):
+        raise DTypeError(
+            f"{where}: a camera has no {stated[0]}, which is said of clouds and meshes alone; leave it out"
+        )
     if several and all(isinstance(one, cameras.PinholeCameraIntrinsic) for one in several):
         return camera_of_open3d(several)
     if isinstance(what, cameras.PinholeCameraTrajectory):
         return posed_of_open3d(what.parameters)
     if several and all(isinstance(one, cameras.PinholeCameraParameters) for one in several):
         return posed_of_open3d(several)
+    found = type(what).__name__ if several else f"{type(what).__name__} without items"
     raise DTypeError(
         f"{where}: takes a PointCloud or TriangleMesh of open3d.geometry or open3d.t.geometry, a list of point clouds, "
-        f"or cameras of open3d.camera, got {type(what).__name__}; of images see pcdata.DepthFrame.from_numpy"
+        f"or cameras of open3d.camera, got {found}; of images see pcdata.DepthFrame.from_numpy"
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 from pcdata.errors import DTypeError, IntrinsicsError, ShapeError
 from pcdata.geometry import rigid
 from pcdata.io.libraries.open3d_clouds import open3d, to_library
+from pcdata.io.libraries.rows import check_texts
 from pcdata.structures import Camera, DepthFrame
 
 
@@ -56,7 +57,8 @@ def frame_to_open3d(
     """Return every view of a capture."""
     library = open3d()
     there = [name for name in ("colors", "labels", "confidence", "mask") if getattr(frame, name) is not None]
-    if isinstance(fields, str) or not {*(fields or ())} <= {*there}:
+    check_texts(where, "fields", fields)
+    if not {*(fields or ())} <= {*there}:
         raise DTypeError(f"{where}: fields must be names of what the capture has, {there}, got {fields!r}")
     chosen = there if fields is None else [name for name in there if name in fields]
     if strange := [name for name in chosen if name != "colors"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from pcdata import extras
 from pcdata.errors import CaptureError, DTypeError, FrameError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
-from pcdata.io.libraries.rows import chosen_fields, cloud_of_tensors
+from pcdata.io.libraries.rows import check_texts, chosen_fields, cloud_of_tensors, vertices_of
 from pcdata.structures import Kind, PointCloud, SurfaceMesh
 
 # What their transforms and models look for. To what has "index" in its name a Batch adds the points before the graph.
@@ -91,8 +91,7 @@ def to_pyg(
 
 
 def _features(where: str, present: Mapping[str, Tensor], names: Sequence[str]) -> Tensor | None:
-    if isinstance(names, str):
-        raise DTypeError(f"{where}: features must be names, such as ({names!r},), not one text")
+    check_texts(where, "features", names)
     if tuple(names) == ("colors",) and "colors" not in present:
         return None
     if missing := [name for name in names if name not in present]:
@@ -136,10 +135,11 @@ def from_pyg(
     library = extras.require("torch_geometric").data
     if not isinstance(data, library.Data):
         raise DTypeError(f"{where}: takes torch_geometric.data.Data or Batch, got {type(data).__name__}")
+    check_texts(where, "features", features)
     held = dict(data.to_dict())
     if edges := [name for name in _EDGES if held.get(name) is not None]:
         raise CaptureError(f"{where}: a cloud has no edges; take {', '.join(edges)} off: data.{edges[0]} = None")
-    known = like.vertices if isinstance(like, SurfaceMesh) else like
+    known = vertices_of(where, like)
     said = {name: _told(where, name, held.pop(name, None)) for name in ("frame_id", "unit")}
     if frame_id is not None and said["frame_id"] not in (None, frame_id):
         raise FrameError(f"{where}: frame_id={frame_id!r}, but the data says {said['frame_id']!r}; give one of them")

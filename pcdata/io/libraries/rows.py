@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 from pcdata.contracts.lengths import check_metres
 from pcdata.errors import DTypeError, FrameError, NonFiniteError, ShapeError, UnitError, near_matches
 from pcdata.io.clouds.arrays import free_name, kind_of_column
-from pcdata.structures import METRE, Kind, PointCloud
+from pcdata.structures import METRE, Kind, PointCloud, SurfaceMesh
 from pcdata.structures.kinds import FIELDS, KINDS, attributes
 from pcdata.structures.point_arrays import held_tensor, metres, unit_colors, unit_normals, whole_labels
 from pcdata.structures.structure import derived
@@ -30,8 +30,7 @@ def chosen_fields(where: str, cloud: PointCloud, fields: Sequence[str] | None) -
         DTypeError: a name that the cloud does not have, or values of a type that arrays do not have.
     """
     present = cloud.fields()
-    if isinstance(fields, str):
-        raise DTypeError(f"{where}: fields must be names, such as ({fields!r},), not one text")
+    check_texts(where, "fields", fields)
     for name in fields or ():
         if name not in present:
             raise DTypeError(f"{where}: no field {name!r}{near_matches(name, present)}; the cloud has {[*present]}")
@@ -40,6 +39,31 @@ def chosen_fields(where: str, cloud: PointCloud, fields: Sequence[str] | None) -
         if value.dtype not in _HELD:
             raise DTypeError(f"{where}: {name} is {value.dtype}, which is not handed over; convert it, or say fields=")
     return kept
+
+
+def check_texts(where: str, argument: str, names: Any) -> None:
+    """Require names, or None.
+
+    Raises:
+        DTypeError: one text, which is a sequence of letters, or no texts.
+    """
+    if isinstance(names, str):
+        raise DTypeError(f"{where}: {argument} must be names, such as ({names!r},), not one text")
+    if names is not None and not (isinstance(names, Collection) and all(isinstance(name, str) for name in names)):
+        raise DTypeError(f"{where}: {argument} must be names of fields, got {names!r:.100}")
+
+
+def vertices_of(where: str, like: Any) -> PointCloud | None:
+    """Return the clouds that ``like=`` names, of a mesh its vertices.
+
+    Raises:
+        DTypeError: it is neither.
+    """
+    if like is None or isinstance(like, PointCloud):
+        return like
+    if isinstance(like, SurfaceMesh):
+        return like.vertices
+    raise DTypeError(f"{where}: like= must be the cloud or mesh that was handed over, got {type(like).__name__}")
 
 
 def cloud_of_tensors(

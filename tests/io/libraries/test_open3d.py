@@ -12,6 +12,7 @@ import pcdata
 from pcdata import extras
 from pcdata.errors import (
     CaptureError,
+    ConfigError,
     DTypeError,
     FrameError,
     IntrinsicsError,
@@ -115,7 +116,7 @@ def test_a_batch_is_a_list_and_a_list_is_a_batch(o3d):
     assert [type(one) for one in pcdata.to_open3d([batch[0]])] == [o3d.t.geometry.PointCloud]
     with pytest.raises(DTypeError, match="like= has 3 clouds, but 2"):
         pcdata.from_open3d(several[:2], like=batch)
-    with pytest.raises(DTypeError, match="empty"):
+    with pytest.raises(DTypeError, match="list without items"):
         pcdata.from_open3d([], frame_id="base")
 
 
@@ -188,6 +189,15 @@ def test_what_cannot_be_a_cloud_is_refused(o3d):
         pcdata.to_open3d(full_cloud(), fields=("color",))
     with pytest.raises(DTypeError, match="not one text"):
         pcdata.to_open3d(full_cloud(), fields="colors")
+    for wrong in (3, [["colors"]], [3]):
+        with pytest.raises(DTypeError, match="must be names of fields"):
+            pcdata.to_open3d(full_cloud(), fields=wrong)
+    geometry = pcdata.to_open3d(full_cloud())
+    for wrong in (3, np.zeros(3), "base"):
+        with pytest.raises(DTypeError, match="like= must be the cloud or mesh"):
+            pcdata.from_open3d(geometry, like=wrong)
+    with pytest.raises(ConfigError, match=r"one of position, direction, invariant, minimum, not 'banana'"):
+        pcdata.from_open3d(geometry, frame_id="base", kinds={"score": "banana"})
     half = full_cloud().with_extra("half", torch.zeros(40, dtype=torch.float16), "invariant")
     with pytest.raises(DTypeError, match=r"half is torch\.float16"):
         pcdata.to_open3d(half)
@@ -242,7 +252,7 @@ def test_cameras_and_poses_come_back(o3d):
     parameters[0].extrinsic = np.diag([1.0, 1, -1, 1])
     with pytest.raises(PoseError):
         pcdata.from_open3d(parameters[0])
-    with pytest.raises(DTypeError, match="has no frame_id"):
+    with pytest.raises(DTypeError, match="a camera has no frame_id"):
         pcdata.from_open3d(intrinsics[0], frame_id="base")
 
 
