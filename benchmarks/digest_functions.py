@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from digest_inputs import pose, rendered, scratch, seeded, with_confidence
+from digest_inputs import pose, poses, rendered, scratch, seeded, with_confidence
 from digest_names import (
     Confidence,
     TSDFVolume,
@@ -84,6 +84,10 @@ def _function_calls() -> Iterator[Case]:
         "convex_hull": lambda g: f.convex_hull(g.source[:, :2]),
         "convex_hull_3d": lambda g: f.convex_hull_3d(g.source),
         "smallest_box": lambda g: f.smallest_box(g.source),
+        "convert_grasps": lambda g: f.convert_grasps(
+            poses(5, 3), source="graspnet", target="contact_graspnet", source_tips=0.02
+        ),
+        "read_grasp_group": lambda g: f.read_grasp_group(_grasp_rows(poses(5, 3))),
         "shape_features": lambda g: f.shape_features(f.neighborhood_covariance(g.source, max_neighbors=12)[1]),
         "smallest_rectangle": lambda g: f.smallest_rectangle(g.source[:, :2]),
         "voxel_cells": lambda g: f.voxel_cells(g.source, 0.04),
@@ -92,6 +96,11 @@ def _function_calls() -> Iterator[Case]:
     }
     for name, make in calls.items():
         yield f"function/{name}", lambda make=make: make(_given())
+
+
+def _grasp_rows(grasps: Tensor) -> Tensor:
+    numbers = torch.arange(20, dtype=torch.float64).reshape(5, 4)
+    return torch.cat([numbers, grasps[:, :3, :3].reshape(5, 9), grasps[:, :3, 3], numbers[:, :1]], 1)
 
 
 def _searched_often(index: Any, queries: Tensor) -> list[Any]:

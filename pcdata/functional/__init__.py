@@ -21,6 +21,13 @@ from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.temporal import TemporalState, temporal_filter
 from pcdata.functional.depth.undistortion import undistort_depth, undistort_image
 from pcdata.functional.depth.window_filters import bilateral_filter, median_filter
+from pcdata.functional.grasp_conventions import (
+    GRASP_CONVENTIONS,
+    GraspConvention,
+    GraspGroup,
+    convert_grasps,
+    read_grasp_group,
+)
 from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
 from pcdata.functional.hard_voxels import HardVoxels, hard_voxels
 from pcdata.functional.hulls import ConvexHull, convex_hull_3d
@@ -74,6 +81,7 @@ from pcdata.functional.voxels import (
 from pcdata.geometry.lens import distort_normalized, undistort_normalized
 
 __all__ = [
+    "GRASP_CONVENTIONS",
     "SHAPE_FEATURES",
     "ClosestPoints",
     "ConvexHull",
@@ -83,6 +91,8 @@ __all__ = [
     "FoundLine",
     "FoundSphere",
     "GraspChecks",
+    "GraspConvention",
+    "GraspGroup",
     "HardVoxels",
     "ImageGrid",
     "NeighborIndex",
@@ -101,6 +111,7 @@ __all__ = [
     "chamfer_distance",
     "check_grasps",
     "cloud_of_rows",
+    "convert_grasps",
     "convex_hull",
     "convex_hull_3d",
     "core_point_mask",
@@ -146,6 +157,7 @@ __all__ = [
     "ransac_line",
     "ransac_plane",
     "ransac_sphere",
+    "read_grasp_group",
     "register_depth",
     "render_points",
     "render_ranges",

@@ -67,18 +67,19 @@ class ParallelJaw:
         if self.approach == self.closing:
             raise ConfigError(f"ParallelJaw: approach and closing must be two axes, both are {self.approach!r}")
 
-    def boxes(self, openings: Tensor) -> tuple[Tensor, Tensor]:
+    def boxes(self, openings: Tensor, tips: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the lower and upper corners (4, G, 3) float64 of palm, two fingers and the room between them.
 
         The coordinates are along approach, closing direction and across both, from the origin of a grasp.
 
         Args:
             openings: (G,) metres.
+            tips: (G,) metres from the origins to the tips; None = the gripper's own.
         """
         half = openings.double() / 2
         outer = half + self.finger_thickness
-        start, width = torch.full_like(half, self.tip - self.finger_length), self.finger_width / 2
-        tip, across = torch.full_like(half, self.tip), torch.full_like(half, width)
+        tip = torch.full_like(half, self.tip) if tips is None else tips.double()
+        start, across = tip - self.finger_length, torch.full_like(half, self.finger_width / 2)
         palm = outer if self.palm_span is None else torch.full_like(half, self.palm_span / 2)
         palm_across = across if self.palm_width is None else torch.full_like(half, self.palm_width / 2)
         lower = [
@@ -121,6 +122,7 @@ def check_grasps(
     grasps: Tensor,  # (G, 4, 4) float, frame_from_gripper in the coordinates of the points
     gripper: ParallelJaw,
     openings: Tensor | None = None,  # (G,) float, metres
+    tips: Tensor | None = None,  # (G,) float, metres
     plane: Tensor | None = None,  # (4,) float64
 ) -> GraspChecks:
     """Check grasps against a table and against points, all in one frame and in metres.
@@ -133,6 +135,7 @@ def check_grasps(
         grasps: rigid poses of the gripper, approaching along its own axis.
         gripper: its dimensions and axes.
         openings: between the fingers; None = the gripper's own. What exceeds that is refused.
+        tips: from the origins of the grasps to the tips of the fingers, as GraspNet's depths; None = the gripper's own.
         plane: unit normal, away from the table, and offset; None = no table.
 
     Raises:
@@ -141,8 +144,9 @@ def check_grasps(
         ShapeError, DTypeError, NonFiniteError: an argument breaks the contract above.
     """
     where = "check_grasps"
-    given = {"points": points, "grasps": grasps, "openings": openings, "plane": plane}
-    specs = {"points": "N 3", "grasps": "G 4 4 : float", "openings": "G : float", "plane": "P : float64"}
+    given = {"points": points, "grasps": grasps, "openings": openings, "tips": tips, "plane": plane}
+    specs = {"points": "N 3", "grasps": "G 4 4 : float", "plane": "P : float64"}
+    specs |= {"openings": "G : float", "tips": "G : float"}
     check_tensors(where, given, specs)
     if plane is not None and plane.shape != (4,):
         raise ShapeError(f"{where}: plane must be (4,), got {tuple(plane.shape)}")
@@ -152,7 +156,7 @@ def check_grasps(
         wide = openings.double()
         if bool(((wide <= 0) | (wide > gripper.opening * (1 + 1e-6))).any()):
             raise ConfigError(f"{where}: openings must be above 0 and at most the gripper's {gripper.opening:g}")
-    lower, upper = gripper.boxes(wide)
+    lower, upper = gripper.boxes(wide, tips)
     axes, origin = gripper.axes(grasps), grasps[:, :3, 3].double()
     angle = clearance = None
     if plane is not None:

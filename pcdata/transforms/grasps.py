@@ -18,6 +18,7 @@ def judge_grasps(
     *,
     frame: str | None = None,
     openings: Tensor | None = None,  # (G,) float, metres
+    tips: Tensor | None = None,  # (G,) float, metres
     b: int = 0,
 ) -> GraspChecks:
     """Check grasps of one cloud, wherever it was moved since: angle to its table, clearance, points hit and held.
@@ -32,6 +33,7 @@ def judge_grasps(
         frame: one that the cloud knows, such as "camera" though the cloud is in "base" or normalized; None = the
             coordinates that it has now.
         openings: between the fingers; None = the gripper's own.
+        tips: from the origins of the grasps to the tips of the fingers; None = the gripper's own.
         b: which cloud of a batch.
 
     Raises:
@@ -52,5 +54,8 @@ def judge_grasps(
     if plane is not None and own.meta[0]["planes"][-1].get("faces") == "neither side" and own.num_points:
         height = own.points.double() @ plane[:3] + plane[3]
         plane = torch.where(height.median() < 0, -plane, plane)  # what is left stands on it
-    grasps = grasps.to(own.device)
-    return check_grasps(own.points, grasps=grasps, gripper=gripper, openings=openings, plane=plane)
+    each = {
+        name: None if given is None else given.to(own.device)
+        for name, given in (("grasps", grasps), ("openings", openings), ("tips", tips))
+    }
+    return check_grasps(own.points, **each, gripper=gripper, plane=plane)  # type: ignore[arg-type]
