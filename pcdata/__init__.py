@@ -143,7 +143,7 @@ _HOMES = {
     ],
     "pcdata.models": ["ModelBatch", "ModelContract", "check", "preset", "to_frame", "to_source"],
     "pcdata.build": ["build_dataset", "load_config"],
-    "pcdata.exports": ["export_dataset"],
+    "pcdata.exports": ["export_dataset", "write_clouds"],
     "pcdata.validation": ["validate_frame", "validate_source"],
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}

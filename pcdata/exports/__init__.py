@@ -1,5 +1,6 @@
 """Exports: built clouds and captures in the layouts that the models' own loaders open, unmodified."""
 
+from pcdata.exports.cloud_files import write_clouds
 from pcdata.exports.export_check import check_export, is_export
 from pcdata.exports.exporter import export_dataset
 from pcdata.exports.registry import register_target, targets_of
@@ -15,4 +16,5 @@ __all__ = [
     "is_export",
     "register_target",
     "targets_of",
+    "write_clouds",
 ]
