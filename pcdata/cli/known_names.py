@@ -32,6 +32,8 @@ CHECKS = (
     "coverage",
     "readings",
     "depth_axis",
+    "largest_plane",
+    "objects",
     "intrinsics",
     "stated",
     "poses",
