@@ -53,3 +53,10 @@ def numbers(text: str) -> list[float]:
         return [float(number) for number in text.replace(",", " ").split()]
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be numbers with spaces between them, got {text!r}") from None
+
+
+def port(text: str) -> int:
+    """Parse the number of a port, 0 = any that is free."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, got {text!r}")
+    return int(text)

@@ -156,6 +156,7 @@ def _parser() -> argparse.ArgumentParser:
         split,
         validate,
         verify,
+        view,
     )
 
     parser = argparse.ArgumentParser(prog="pcdata", description="From raw depth frames to training-ready point clouds.")
@@ -174,6 +175,7 @@ def _parser() -> argparse.ArgumentParser:
         export,
         validate,
         report,
+        view,
         drift,
         evaluate,
         models,

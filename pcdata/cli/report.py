@@ -47,7 +47,7 @@ def _limits(arguments: argparse.Namespace) -> Any:
     return CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
 
 
-def _is_dataset(arguments: argparse.Namespace) -> bool:
+def is_dataset(arguments: argparse.Namespace) -> bool:
     """Whether a build wrote what is at the path; refuse then what says how captures are read and gone through."""
     from pcdata.errors import ConfigError
     from pcdata.io.store.manifest import Manifest
@@ -81,7 +81,7 @@ def _report(arguments: argparse.Namespace) -> int:
     with ExitStack() as opened:
         temporary = opened.enter_context(replacing("report --out", out)) if out else None
         with ProgressBar("report") as progress:
-            if _is_dataset(arguments):
+            if is_dataset(arguments):
                 gathered = gather_dataset(arguments.path, num_shown=arguments.samples, progress=progress)
             else:
                 gathered = gather_captures(
@@ -117,7 +117,7 @@ def _grade(arguments: argparse.Namespace) -> int:
     from pcdata.validation.grading import LETTERS, Grading
 
     with ProgressBar("grade") as progress:
-        if _is_dataset(arguments):
+        if is_dataset(arguments):
             _, grading = dataset_page(arguments.path, num_shown=1, progress=progress)
         else:
             source = open_captures(arguments.path, arguments, limit=arguments.limit)

@@ -37,27 +37,63 @@ def page_of(title: str, sections: Sequence[Section], scenes: Sequence[SampleScen
         scenes: what the viewer shows; without any there is none.
         viewer_after: how many sections stand before the viewer.
     """
-    script, style = (_web_file(name) for name in ("viewer.js", "page.css"))
     parts = [f"<section><h2>{shown(one.title)}</h2>{one.html}</section>" for one in sections]
-    scripts = ""
+    data = ""
     if scenes:
         index, blobs = _index(scenes)
-        parts.insert(viewer_after, _VIEWER)
-        data = "".join(f'<script type="text/plain" id="{name}">{text}</script>' for name, text in blobs.items())
-        scripts = f'<script type="application/json" id="pcdata-index">{index}</script>{data}<script>{script}</script>'
-    # A browser runs this script and no other, whatever text got into the page, and fetches nothing.
-    policy = (
-        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src '{_digest(script)}'; "
-        "base-uri 'none'; form-action 'none'"
+        parts.insert(viewer_after, _viewer())
+        data = f'<script type="application/json" id="pcdata-index">{index}</script>' + "".join(
+            f'<script type="text/plain" id="{name}">{text}</script>' for name, text in blobs.items()
+        )
+    return _document(title, "".join(parts), data, has_viewer=bool(scenes))
+
+
+def served_page(title: str, total: int) -> str:
+    """Return the page of ``pcdata view``: the viewer alone, which asks its server for each sample that is chosen."""
+    return _document(
+        title,
+        _viewer(_CHOICE) + '<section id="pictures"></section>',
+        f'<script type="application/json" id="pcdata-served">{total}</script>',
+        has_viewer=True,
+        connects=True,
     )
+
+
+def content_policy(*, script: str = "", connects: bool = False) -> str:
+    """Return what a page may do, whatever text got into it: run this script, and fetch from its server or nothing."""
+    sources = f"script-src '{_digest(script)}'; " if script else ""
+    return (
+        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; {sources}"
+        f"{'connect-src ' + repr('self') + '; ' if connects else ''}base-uri 'none'; form-action 'none'"
+    )
+
+
+def _document(title: str, body: str, data: str, *, has_viewer: bool, connects: bool = False) -> str:
+    script, style = (_web_file(name) for name in ("viewer.js", "page.css"))
+    policy = content_policy(script=script, connects=connects)
     return (
         "<!doctype html>\n"
         '<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{shown(title, 200)}</title><style>{style}</style></head>\n"
-        f"<body><main><h1>{shown(title, 200)}</h1>{''.join(parts)}</main>{scripts}</body></html>\n"
+        f"<body><main><h1>{shown(title, 200)}</h1>{body}</main>"
+        f"{data}{f'<script>{script}</script>' if has_viewer else ''}</body></html>\n"
     )
+
+
+def scene_json(scene: SampleScene, blobs: Sequence[str]) -> dict[str, Any]:
+    """Return the description of a scene for the viewer; the clouds of its stages go by the names ``blobs``."""
+    stages = []
+    for stage, name in zip(scene.stages, blobs, strict=True):
+        said = {**stage.cloud.said, "blob": name, "frame": plain(stage.cloud.said["frame"])}
+        said["fields"] = [{**field, "name": plain(field["name"], 40)} for field in said["fields"]]
+        lines = [
+            {"name": plain(one.name, 60), "color": one.color, "segments": one.segments.reshape(-1).round(5).tolist()}
+            for one in stage.lines
+        ]
+        stages.append({"caption": plain(stage.caption, 80), "cloud": said, "lines": lines})
+    return {"name": plain(scene.name, 120), "stages": stages}
 
 
 def _index(scenes: Sequence[SampleScene]) -> tuple[str, dict[str, str]]:
@@ -65,22 +101,9 @@ def _index(scenes: Sequence[SampleScene]) -> tuple[str, dict[str, str]]:
     samples: list[dict[str, Any]] = []
     blobs: dict[str, str] = {}
     for scene in scenes:
-        stages = []
-        for stage in scene.stages:
-            name = f"cloud-{len(blobs)}"
-            blobs[name] = stage.cloud.text
-            said = {**stage.cloud.said, "blob": name, "frame": plain(stage.cloud.said["frame"])}
-            said["fields"] = [{**field, "name": plain(field["name"], 40)} for field in said["fields"]]
-            lines = [
-                {
-                    "name": plain(one.name, 60),
-                    "color": one.color,
-                    "segments": one.segments.reshape(-1).round(5).tolist(),
-                }
-                for one in stage.lines
-            ]
-            stages.append({"caption": plain(stage.caption, 80), "cloud": said, "lines": lines})
-        samples.append({"name": plain(scene.name, 120), "stages": stages})
+        names = [f"cloud-{len(blobs) + place}" for place in range(len(scene.stages))]
+        blobs |= {name: stage.cloud.text for name, stage in zip(names, scene.stages)}
+        samples.append(scene_json(scene, names))
     text = json.dumps(finite_json(samples), allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"), blobs
 
@@ -94,8 +117,17 @@ def _digest(script: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
 
 
+_CHOICE = """<span><button id="earlier" title="samples before these">&#8592;</button>
+<label>find <input id="find" type="search" placeholder="part of a name" size="14"></label>
+<button id="later" title="samples after these">&#8594;</button></span>"""
+
+
+def _viewer(choice: str = "") -> str:
+    return _VIEWER.replace("<!--choice-->", choice)
+
+
 _VIEWER = """<section><h2>In three dimensions</h2><div id="viewer">
-<div class="bar"><label>sample <select id="sample"></select></label>
+<div class="bar"><!--choice--><label>sample <select id="sample"></select></label>
 <span><button id="before" title="the step before ([)">&#8592;</button>
 <label>step <select id="step"></select></label>
 <button id="after" title="the step after (])">&#8594;</button></span>
@@ -104,6 +136,6 @@ _VIEWER = """<section><h2>In three dimensions</h2><div id="viewer">
 <button id="measure" aria-pressed="false" title="pick two points (m)">measure</button>
 <button id="reset" title="see all (r)">reset</button></div>
 <canvas tabindex="0" aria-label="The cloud. Arrows turn, plus and minus zoom, Enter picks the point in the
-middle, brackets change the step, c the color, m measures, r shows all."></canvas>
+middle, brackets change the step, comma and period the sample, c the color, m measures, r shows all."></canvas>
 <div class="bar"><span id="legend"></span></div><div class="bar" id="lines"></div>
 <output id="picked" aria-live="polite"></output><div class="bar dim"><span id="counted"></span></div></div></section>"""

@@ -1,15 +1,17 @@
 // The page's viewer: which sample, which step of its pipeline, colored by what; picking and measuring.
 
 import { colorsOf, modesOf, toldOf } from "./colors.js";
-import { bytesOf, cloudOf } from "./decode.js";
+import { cloudOf } from "./decode.js";
+import { Carried, Served } from "./library.js";
 import { Stage } from "./stage.js";
 
 const find = (id) => document.getElementById(id);
 
 class Viewer {
-  constructor(root, samples) {
-    this.samples = samples;
-    this.sample = 0;
+  constructor(root, library) {
+    this.library = library;
+    this.sample = -1; // none yet
+    this.shown = null; // its stages
     this.step = 0;
     this.mode = null;
     this.hidden = new Set();
@@ -17,20 +19,24 @@ class Viewer {
     this.decoded = new Map();
     this.stage = new Stage(root.querySelector("canvas"));
     this.connect();
-    this.ready = this.open(0);
+    this.ready = this.begin();
   }
 
   get stages() {
-    return this.samples[this.sample].stages;
+    return this.shown ? this.shown.stages : [];
   }
 
   get said() {
-    return this.stages[this.step].cloud;
+    return this.stages[this.step]?.cloud; // none where a sample could not be read
   }
 
   connect() {
-    this.fill(find("sample"), this.samples.map((one) => one.name));
-    find("sample").addEventListener("change", (event) => this.open(event.target.selectedIndex));
+    find("sample").addEventListener("change", (event) => this.open(this.library.listed[event.target.selectedIndex].place));
+    if (find("find")) {
+      find("find").addEventListener("input", () => this.list(0));
+      find("earlier").addEventListener("click", () => this.list(this.library.before - this.library.step));
+      find("later").addEventListener("click", () => this.list(this.library.before + this.library.step));
+    }
     find("step").addEventListener("change", (event) => this.go(event.target.selectedIndex));
     find("before").addEventListener("click", () => this.go(this.step - 1));
     find("after").addEventListener("click", () => this.go(this.step + 1));
@@ -71,6 +77,8 @@ class Viewer {
       "-": () => this.stage.zoom(1 / 0.9),
       "[": () => this.go(this.step - 1),
       "]": () => this.go(this.step + 1),
+      ",": () => this.open(this.sample - 1),
+      ".": () => this.open(this.sample + 1),
       c: () => this.nextColor(),
       m: () => this.setMeasuring(!this.measuring),
       r: () => this.look(),
@@ -91,18 +99,77 @@ class Viewer {
     );
   }
 
+  async begin() {
+    if (this.library.list) await this.list(0);
+    else this.fill(find("sample"), this.library.listed.map((one) => one.name));
+    await this.open(0);
+  }
+
+  /** Lists other names; the sample that is shown stays. */
+  async list(from) {
+    const text = find("find").value;
+    try {
+      await this.library.list(Math.max(from, 0), text);
+    } catch (error) {
+      find("picked").textContent = error.message;
+      return;
+    }
+    if (text !== find("find").value) return; // more was typed meanwhile
+    const { listed, before, matching, step } = this.library;
+    this.fill(find("sample"), listed.map((one) => one.name));
+    this.selectSample();
+    find("earlier").disabled = before === 0;
+    find("later").disabled = before + step >= matching;
+  }
+
+  selectSample() {
+    find("sample").selectedIndex = this.library.listed.findIndex((one) => one.place === this.sample);
+  }
+
   async open(sample) {
+    if (sample < 0 || sample >= this.library.total) return;
     this.sample = sample;
-    find("sample").selectedIndex = sample;
-    this.fill(find("step"), this.stages.map((one) => one.caption));
-    this.shownFrame = null;
-    await this.go(this.stages.length - 1);
+    this.selectSample();
+    try {
+      const shown = await this.library.sample(sample);
+      if (sample !== this.sample) return; // another one was chosen meanwhile
+      this.shown = shown;
+      this.tellSample(shown);
+      this.fill(find("step"), this.stages.map((one) => one.caption));
+      this.shownFrame = null;
+      if (this.stages.length) await this.go(this.stages.length - 1);
+      else this.stage.clear();
+    } catch (error) {
+      if (error.name !== "AbortError") find("picked").textContent = error.message;
+    }
+  }
+
+  /** Shows the pictures of a sample that a server sent. */
+  tellSample(shown) {
+    const box = find("pictures");
+    if (!box) return;
+    document.querySelector("#viewer").previousElementSibling.textContent = shown.name;
+    const figures = shown.pictures.map(({ caption, uri }) => {
+      const figure = document.createElement("figure");
+      const image = document.createElement("img");
+      const told = document.createElement("figcaption");
+      image.src = uri;
+      image.width = 320;
+      image.alt = told.textContent = caption; // as text
+      figure.append(image, told);
+      return figure;
+    });
+    const problem = document.createElement("p");
+    problem.className = "fail";
+    problem.textContent = shown.problem;
+    box.replaceChildren(...(shown.problem ? [problem] : []), ...figures);
+    find("picked").textContent = "";
+    if (!shown.stages.length) find("counted").textContent = "";
   }
 
   async decode(cloud) {
     if (!this.decoded.has(cloud.blob)) {
-      const bytes = await bytesOf(find(cloud.blob).textContent);
-      this.decoded.set(cloud.blob, cloudOf(bytes, cloud));
+      this.decoded.set(cloud.blob, cloudOf(await this.library.bytes(cloud), cloud));
       // Samples that were looked at long ago are decoded anew.
       if (this.decoded.size > 12) this.decoded.delete(this.decoded.keys().next().value);
     }
@@ -116,8 +183,9 @@ class Viewer {
     find("before").disabled = step === 0;
     find("after").disabled = step === this.stages.length - 1;
     const said = this.said;
-    this.cloud = await this.decode(said);
+    const cloud = await this.decode(said);
     if (said !== this.said) return; // another one was asked for meanwhile
+    this.cloud = cloud;
     const modes = modesOf(said);
     this.fill(find("color"), modes);
     const mode = modes.includes(this.mode) ? this.mode : modes[0];
@@ -142,11 +210,13 @@ class Viewer {
   }
 
   look() {
+    if (!this.said) return;
     const { lower, upper, up, toward } = this.said.view;
     this.stage.look(lower, upper, up, toward);
   }
 
   paint(mode) {
+    if (!this.said) return;
     this.mode = mode;
     find("color").value = mode;
     const { colors, legend } = colorsOf(this.cloud, this.said, mode, this.said.up);
@@ -155,6 +225,7 @@ class Viewer {
   }
 
   nextColor() {
+    if (!this.said) return;
     const select = find("color");
     this.paint(select.options[(select.selectedIndex + 1) % select.options.length].value);
   }
@@ -233,10 +304,11 @@ class Viewer {
 }
 
 const index = find("pcdata-index");
-const samples = index ? JSON.parse(index.textContent) : [];
-if (samples.length) {
+const served = find("pcdata-served");
+const library = served ? new Served(Number(served.textContent)) : new Carried(index ? JSON.parse(index.textContent) : []);
+if (library.total) {
   try {
-    window.pcdata = new Viewer(find("viewer"), samples);
+    window.pcdata = new Viewer(find("viewer"), library);
   } catch (error) {
     find("picked").textContent = `This browser cannot draw in three dimensions (${error.message}); all else is on this page.`;
   }

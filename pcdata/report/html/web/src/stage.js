@@ -58,6 +58,18 @@ export class Stage {
     this.drawn++;
   }
 
+  /** Draws nothing. */
+  clear() {
+    if (this.points) {
+      this.scene.remove(this.points);
+      this.points.geometry.dispose();
+      this.points.material.dispose();
+      this.points = null;
+    }
+    this.setLines([], () => false);
+    this.setMark([], 0);
+  }
+
   show(positions, colors, size) {
     if (this.points) {
       this.scene.remove(this.points);
@@ -169,6 +181,7 @@ export class Stage {
 
   /** The row of the nearest point that is drawn within reach of a place in CSS pixels; -1 where there is none. */
   pick(x, y) {
+    if (!this.points) return -1;
     const { clientWidth: width, clientHeight: height } = this.canvas;
     this.camera.updateMatrixWorld();
     const m = new Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse).elements;
