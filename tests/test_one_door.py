@@ -23,6 +23,7 @@ ALLOWED = {
     "datasets/batch_transport.py": {"os.open": "memory of a worker, which says its own name in it"},
     "cli/demo.py": {"(files('pcdata') / 'demo.yaml').read_text": "a file of the package"},
     "report/html/page.py": {"(files('pcdata.report.html') / 'web' / name).read_text": "a file of the package"},
+    "cli/view.py": {"webbrowser.open": "an address, which a browser opens"},
     "report/figures/panels.py": {"Image.open": "of bytes that it has made"},
     "sensors/known_sensors.py": {
         "files('pcdata.sensors').joinpath('profiles.yaml').read_text": "a file of the package"
