@@ -157,6 +157,7 @@ _SUBMODULES = [
     "functional",
     "geometry",
     "io",
+    "live",
     "models",
     "report",
     "sensors",

@@ -34,6 +34,7 @@ LAYERS = [
     {"calibration", "models"},
     {"build"},  # datasets for a model are built by its preset
     {"exports"},  # holds samples to the contracts of models
+    {"live"},
     {"report"},
     {"cli", "__main__"},
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from os import PathLike
 from typing import Any
@@ -106,6 +106,15 @@ class Compose(Transform):
         """
         return self._run(data, generator, is_own=not data.points.requires_grad, sources=sources)
 
+    def run_in_passes(
+        self, data: Data, *, generator: GeneratorLike | None = None, after: Callable[[range, Any], None]
+    ) -> Any:
+        """Run every step as :meth:`forward` does; call ``after(positions of the steps, data)`` behind each pass.
+
+        Several steps may be one pass, so what lies between them is never made: :meth:`step_through` makes it.
+        """
+        return self._run(data, generator, after=after)
+
     def _run(
         self,
         data: Data,
@@ -113,17 +122,22 @@ class Compose(Transform):
         *,
         is_own: bool = False,
         sources: Mapping[str, Tensor] | None = None,
+        after: Callable[[range, Any], None] | None = None,
     ) -> Any:
         position, generator = self._enter(data, generator)
         steps = list(self.steps)
         beginning = self._beginning
         if beginning is not None and position <= beginning.start:
-            for step in steps[position : beginning.start]:
-                data, generator = _step(step, data, generator)
+            for number in range(position, beginning.start):
+                data, generator = _step(steps[number], data, generator)
+                if after is not None:
+                    after(range(number, number + 1), data)
             cloud = run_beginning(steps[beginning], data)
             position = beginning.start
             if cloud is not None:
                 data, position = cloud, beginning.stop
+                if after is not None:
+                    after(range(beginning.start, position), data)
         while position < len(steps):
             together = motions_from(steps, position)
             if together > 1 - is_own and isinstance(data, PointCloud):
@@ -133,6 +147,8 @@ class Compose(Transform):
                 cloud = run_motions(own, data, generator, in_place=is_own, sources=sources)
                 if cloud is not None:
                     data, position, sources = cloud, position + together, None
+                    if after is not None:
+                        after(range(position - together, position), data)
                     continue
             if sources and isinstance(data, PointCloud):
                 gather_kept({name: getattr(data, name) for name in sources}, sources, data.ptr)
@@ -141,6 +157,8 @@ class Compose(Transform):
             is_own = False
             data, generator = _step(steps[position], data, generator)
             position += 1
+            if after is not None:
+                after(range(position - 1, position), data)
         return data
 
     @property

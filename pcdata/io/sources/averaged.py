@@ -134,32 +134,58 @@ class AveragedSource(CombinedSource):
             raise
 
     def _average(self, frames: Sequence[DepthFrame], names: Sequence[str]) -> DepthFrame:
-        confidences = torch.stack([confidence_of(frame) for frame in frames])
-        depths = torch.stack([frame.depth for frame in frames])
-        depths = torch.where(confidences > int(Confidence.NO_READING), depths, 0.0)
-        average = average_depth(
-            depths,
+        return averaged_frame(
+            "AveragedSource",
+            frames,
+            names,
             mad_factor=self.mad_factor,
             resolution=self.resolution,
             max_jump=self.max_jump,
             min_count=self.min_count,
+            max_moving=self.max_moving,
         )
-        readings = int((depths > 0).sum())
-        jumps = int(average.num_jumps.sum())
-        if jumps > self.max_moving * readings:
-            raise CaptureError(
-                f"AveragedSource: {100 * jumps / max(readings, 1):.1f} % of the readings lie on another surface than "
-                f"the others of their pixel (at most {100 * self.max_moving:g} %): the camera or the scene moved. "
-                "Average fewer captures, or only still ones; if it is the sensor's noise, raise max_jump"
-            )
-        confidence = None
-        if any(frame.confidence is not None for frame in frames):
-            worst = torch.where(depths > 0, confidences, int(Confidence.RELIABLE)).amin(0)
-            confidence = torch.where(average.depth > 0, worst, int(Confidence.NO_READING)).to(torch.uint8)
-        facts = {"frames": list(names), "readings": readings, **_facts(average)}
-        facts |= {"changing_signals": changing} if (changing := _changing_signals(frames)) else {}
-        provenance = {**frames[0].provenance, "averaged": facts}
-        return replace(frames[0], depth=average.depth, confidence=confidence, provenance=provenance)
+
+
+def averaged_frame(
+    where: str,
+    frames: Sequence[DepthFrame],
+    names: Sequence[str],
+    *,
+    max_moving: float,
+    **limits: Any,
+) -> DepthFrame:
+    """Return the first of the frames of a still camera with the average of the depth of all.
+
+    Args:
+        where: the door, named in errors.
+        frames: of one camera that stood still.
+        names: what the provenance calls them.
+        max_moving: as AveragedSource has it.
+        limits: those of average_depth.
+
+    Raises:
+        CaptureError: the scene moved.
+    """
+    confidences = torch.stack([confidence_of(frame) for frame in frames])
+    depths = torch.stack([frame.depth for frame in frames])
+    depths = torch.where(confidences > int(Confidence.NO_READING), depths, 0.0)
+    average = average_depth(depths, **limits)
+    readings = int((depths > 0).sum())
+    jumps = int(average.num_jumps.sum())
+    if jumps > max_moving * readings:
+        raise CaptureError(
+            f"{where}: {100 * jumps / max(readings, 1):.1f} % of the readings lie on another surface than "
+            f"the others of their pixel (at most {100 * max_moving:g} %): the camera or the scene moved. "
+            "Average fewer captures, or only still ones; if it is the sensor's noise, raise max_jump"
+        )
+    confidence = None
+    if any(frame.confidence is not None for frame in frames):
+        worst = torch.where(depths > 0, confidences, int(Confidence.RELIABLE)).amin(0)
+        confidence = torch.where(average.depth > 0, worst, int(Confidence.NO_READING)).to(torch.uint8)
+    facts = {"frames": list(names), "readings": readings, **_facts(average)}
+    facts |= {"changing_signals": changing} if (changing := _changing_signals(frames)) else {}
+    provenance = {**frames[0].provenance, "averaged": facts}
+    return replace(frames[0], depth=average.depth, confidence=confidence, provenance=provenance)
 
 
 def _facts(average: DepthAverage) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def check_still_camera(where: str, frames: Sequence[DepthFrame]) -> None:
                 f"{names} have {frame.num_views} views of {frame.size} and {first.num_views} of {first.size}; they "
                 "must come from the same cameras"
             )
-        if not _same_camera(frame.camera, first.camera):
+        if not same_camera(frame.camera, first.camera):
             raise CaptureError(f"{names} have other intrinsics or distortion; they must come from the same cameras")
         if frame.frame_id != first.frame_id:
             raise CaptureError(f"{names} have poses in {frame.frame_id!r} and {first.frame_id!r}; they must agree")
@@ -42,7 +42,8 @@ def check_still_camera(where: str, frames: Sequence[DepthFrame]) -> None:
             )
 
 
-def _same_camera(one: Camera, other: Camera) -> bool:
+def same_camera(one: Camera, other: Camera) -> bool:
+    """Say whether two cameras have the same intrinsics and lens."""
     if (one.distortion is None) != (other.distortion is None) or not torch.equal(one.intrinsics, other.intrinsics):
         return False
     return one.distortion is None or other.distortion is None or torch.equal(one.distortion, other.distortion)

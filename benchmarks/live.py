@@ -1,0 +1,326 @@
+"""Latency of a chain on a camera's stream, 848x480: percentiles of each step and of the whole.
+
+    PCDATA_TEST_DATA=... python benchmarks/live.py            # 2,000 frames; table, JSON and a histogram as a picture
+    python benchmarks/live.py --quick                         # 60 frames, nothing is kept
+
+The chain: mask, crop, flying pixels, both outlier filters, plane, 1,024 farthest points with normals. The frames: a
+room (``seven_scenes``) and a tabletop (``tabletop_stream``) resized to 848x480, and synthetic scenes; each through a
+workspace as a robot there would have. Every frame of them goes through the offline pipeline too, and the clouds must be
+identical. Wall time is that of ``LivePipeline``, one frame after another without pause. Processor time is of all
+threads of the process and says what a busy machine does not blur.
+
+``--camera 60`` replays the frames by a thread at so many frames a second for ``--seconds`` beside a busy second
+process, and counts what is dropped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from timing import RESULTS, facts
+
+import pcdata
+from pcdata.live import LatestFrame, LivePipeline, LiveResult
+from pcdata.report import text_table
+from pcdata.synthetic import tabletop
+from pcdata.threads import torch_on_one_thread
+
+SIZE = (480, 848)
+BAR, STRETCH = 1 / 60, 1 / 90  # seconds
+PERCENTILES = (50, 90, 99, 99.9)
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+SETS: dict[str, Box] = {  # the workspace in the camera's frame, metres
+    "room": ((-0.5, -0.5, 0.3), (0.5, 0.5, 2.0)),
+    "tabletop": ((-0.25, -0.2, 0.2), (0.25, 0.2, 1.0)),
+    "synthetic": ((-0.4, -0.4, 0.2), (0.4, 0.4, 1.5)),
+}
+
+
+def chain(box: Box) -> pcdata.Compose:
+    """The steps of the measurement; the search for the plane stops when a better one is unlikely to be missed."""
+    return pcdata.Compose(
+        [
+            pcdata.MaskDepth(near=0.2, far=3.0),
+            pcdata.RemoveFlyingPixels(),
+            pcdata.Deproject(),
+            pcdata.CropWorkspace(frame="camera", lower=box[0], upper=box[1]),
+            pcdata.RemoveStatisticalOutliers(),
+            pcdata.RemoveRadiusOutliers(),
+            pcdata.RemovePlane(probability=0.9999),
+            pcdata.FarthestPointSample(num_points=1024),
+            pcdata.EstimateNormals(),
+        ]
+    )
+
+
+def frames(quick: bool) -> dict[str, list[pcdata.DepthFrame]]:
+    """The frames of each set, alike in size, camera and images."""
+    found: dict[str, list[pcdata.DepthFrame]] = {}
+    folder = os.environ.get("PCDATA_TEST_DATA")
+    resize = pcdata.ResizeDepth(size=SIZE)
+    if folder:
+        room = pcdata.open_source(Path(folder) / "seven_scenes")
+        table = pcdata.open_source(
+            Path(folder) / "tabletop_stream", intrinsics=(927.17, 927.37, 651.32, 349.62), metres_per_unit=0.001
+        )
+        for name, source in (("room", room), ("tabletop", table)):
+            found[name] = [resize(source.load(own)) for own in source.ids[:: 10 if quick else 1]]
+    found["synthetic"] = [
+        replace(tabletop(seed, noise="stereo", size=SIZE, num_views=1).frame, labels=None, sample_id=f"seed{seed}")
+        for seed in range(2 if quick else 10)
+    ]
+    return found
+
+
+def with_one_camera(frames: list[pcdata.DepthFrame]) -> list[list[pcdata.DepthFrame]]:
+    """Part frames by their intrinsics: a pipeline is for one camera."""
+    parts: dict[tuple[float, ...], list[pcdata.DepthFrame]] = {}
+    for frame in frames:
+        parts.setdefault(tuple(frame.camera.intrinsics.flatten().tolist()), []).append(frame)
+    return list(parts.values())
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+class Measured:
+    """What the frames of one set took."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self.processor: list[float] = []
+        self.points: list[int] = []
+        self.steps: dict[str, tuple[list[float], list[float]]] = {}  # wall and processor seconds
+
+    def add(self, other: Measured) -> None:
+        self.seconds += other.seconds
+        self.processor += other.processor
+        self.points += other.points
+        for name, (wall, processor) in other.steps.items():
+            mine = self.steps.setdefault(name, ([], []))
+            mine[0].extend(wall)
+            mine[1].extend(processor)
+
+
+def check_identical(live: LivePipeline, frame: pcdata.DepthFrame, offline: pcdata.Compose) -> None:
+    """Hold a live cloud to the offline one, bit for bit."""
+    answer = cloud_of(live(frame))
+    expected = offline(frame)
+    assert answer.history == expected.history
+    assert answer.meta == expected.meta
+    assert answer.fields().keys() == expected.fields().keys()
+    for name, values in expected.fields().items():
+        assert torch.equal(answer.fields()[name], values), f"{name} of {frame.sample_id} differs"
+
+
+def cloud_of(answer: LiveResult) -> pcdata.PointCloud:
+    assert answer.cloud is not None, f"{answer.fault}: {answer.reason}"
+    return answer.cloud
+
+
+def by_steps(steps: pcdata.Compose, frame: pcdata.DepthFrame, measured: Measured) -> None:
+    """Run the chain once more and note what each pass took."""
+    names = [type(step).__name__ for step in steps.steps]
+    since = time.perf_counter(), time.process_time()
+
+    def after(positions: range, data: Any) -> None:
+        nonlocal since
+        now = time.perf_counter(), time.process_time()
+        name = " + ".join(names[k] for k in positions)
+        wall, processor = measured.steps.setdefault(name, ([], []))
+        wall.append(now[0] - since[0])
+        processor.append(now[1] - since[1])
+        if name.endswith("CropWorkspace"):
+            measured.points.append(data.num_points)
+        since = time.perf_counter(), time.process_time()
+
+    with torch_on_one_thread():
+        steps.run_in_passes(frame, after=after)
+
+
+def measure(frames: list[pcdata.DepthFrame], box: Box, count: int) -> Measured:
+    """Answer ``count`` frames live; every eighth goes through the steps one by one too."""
+    measured, offline = Measured(), chain(box)
+    for part in with_one_camera(frames):
+        live = LivePipeline(chain(box), like=part[0], same_pixels=len(part) > 1)
+        for frame in part:
+            check_identical(live, frame, offline)
+        for number, frame in zip(range(-(-count * len(part) // len(frames))), itertools.cycle(part)):
+            processor = time.process_time()
+            answer = live(frame)
+            measured.processor.append(time.process_time() - processor)
+            cloud_of(answer)
+            measured.seconds.append(answer.seconds)
+            if number % 8 == 0:
+                by_steps(offline, frame, measured)
+    return measured
+
+
+def figures(seconds: list[float]) -> dict[str, float]:
+    found = {f"p{share:g}_ms": 1000 * float(np.percentile(seconds, share)) for share in PERCENTILES}
+    return found | {"worst_ms": 1000 * max(seconds)}
+
+
+def summary(measured: Measured) -> dict[str, Any]:
+    return {
+        "frames": len(measured.seconds),
+        "points_after_crop": {"median": int(np.median(measured.points)), "most": max(measured.points)},
+        "wall": figures(measured.seconds),
+        "processor": figures(measured.processor),
+        "steps": {
+            name: {"wall": figures(wall), "processor": figures(processor)}
+            for name, (wall, processor) in measured.steps.items()
+        },
+    }
+
+
+# -- a camera thread ---------------------------------------------------------------------------------------------------
+
+
+def keep_busy() -> None:
+    while True:
+        pass
+
+
+def replay(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: float) -> dict[str, Any]:
+    """Replay frames at a rate beside a busy process; count what came, what was dropped, and that none came twice."""
+    busy = multiprocessing.get_context("spawn").Process(target=keep_busy, daemon=True)
+    busy.start()
+    try:
+        return replay_beside(frames, box, rate, seconds)
+    finally:
+        busy.kill()
+        busy.join()
+
+
+def replay_beside(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: float) -> dict[str, Any]:
+    live = LivePipeline(chain(box), like=frames[0], max_age=1.0, same_pixels=len(frames) > 1)
+    with LatestFrame.reading(camera_at(frames, rate, seconds), timeout=1.0) as camera:
+        stamps, ages = [], []
+        for answer in live.follow(camera):
+            assert answer.fault is None, f"{answer.fault}: {answer.reason}"
+            stamps.append(answer.stamp)
+            ages.append(answer.age)
+        given = camera.given
+    assert stamps == sorted(set(stamps)), "a frame was served twice, or after a newer one"
+    stats = live.stats()
+    return {
+        "rate": rate,
+        "given": given,
+        "answered": stats.clouds,
+        "dropped": stats.dropped,
+        "faults": dict(stats.faults),
+        "age": figures(ages),
+    }
+
+
+def camera_at(frames: list[pcdata.DepthFrame], rate: float, seconds: float) -> Callable[[], pcdata.DepthFrame]:
+    """Return what gives the next frame when it is due."""
+    started = time.monotonic()
+
+    def due() -> Iterator[pcdata.DepthFrame]:
+        for number, frame in zip(range(int(rate * seconds)), itertools.cycle(frames)):
+            time.sleep(max(0.0, started + number / rate - time.monotonic()))
+            yield frame
+
+    return due().__next__
+
+
+# -- telling -----------------------------------------------------------------------------------------------------------
+
+
+def tell(name: str, told: dict[str, Any]) -> None:
+    keys = [f"p{share:g}" for share in PERCENTILES] + ["worst"]
+    rows = [
+        [label, *(f"{values[f'{key}_ms']:.2f}" for key in keys)]
+        for label, values in [("whole", told["wall"]), ("whole, processor", told["processor"])]
+    ]
+    for step, values in told["steps"].items():
+        rows.append([step, *(f"{values['wall'][f'{key}_ms']:.2f}" for key in keys)])
+        rows.append(["  processor", *(f"{values['processor'][f'{key}_ms']:.2f}" for key in keys)])
+    points = told["points_after_crop"]
+    print(f"{name}: {told['frames']} frames, {points['median']} points after the crop ({points['most']} at most)")
+    print(text_table(["ms", *keys], rows), "\n")
+
+
+def picture(sets: dict[str, Measured]) -> str:
+    """Return an SVG: how many frames took how long, a band for each set, with the limits of 60 and 90 Hz."""
+    width, height, left, top = 720, 110, 70, 26
+    longest = max(1.25 * BAR, *(float(np.percentile(one.seconds, 99.9)) for one in sets.values()))
+    bins = np.linspace(0, longest, 121)
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{left + width + 20}" '
+        f'height="{top + height * len(sets) + 34}" font-family="sans-serif" font-size="12">',
+        '<rect width="100%" height="100%" fill="white"/>',
+    ]
+    for row, (name, measured) in enumerate(sets.items()):
+        counts, _ = np.histogram(np.minimum(measured.seconds, longest * 0.9999), bins)
+        base = top + height * (row + 1)
+        parts.append(f'<text x="6" y="{base - 4}">{name}</text>')
+        parts.append(f'<line x1="{left}" x2="{left + width}" y1="{base}" y2="{base}" stroke="#999"/>')
+        for at, count in zip(bins, counts):
+            if count:
+                tall = (height - 14) * count / counts.max()
+                x = left + width * at / longest
+                parts.append(
+                    f'<rect x="{x:.1f}" y="{base - tall:.1f}" width="{width / 120:.1f}" height="{tall:.1f}" '
+                    'fill="#4477aa"/>'
+                )
+    bottom = top + height * len(sets)
+    for label, seconds in (("60 Hz", BAR), ("90 Hz", STRETCH)):
+        x = left + width * seconds / longest
+        parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top - 6}" y2="{bottom}" stroke="#cc3311"/>')
+        parts.append(f'<text x="{x:.1f}" y="{top - 10}" text-anchor="middle" fill="#cc3311">{label}</text>')
+    for ms in np.arange(0, 1000 * longest, 5 if longest < 0.06 else 50):
+        x = left + width * ms / 1000 / longest
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{ms:g}</text>')
+    parts.append(f'<text x="{left + width}" y="{bottom + 30}" text-anchor="end">milliseconds per frame</text></svg>')
+    return "\n".join(parts)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=2000, help="of all sets together")
+    parser.add_argument("--quick", action="store_true", help="60 frames; nothing is kept")
+    parser.add_argument("--camera", type=float, nargs="*", default=None, metavar="HZ", help="replay at these rates")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each replay")
+    parser.add_argument("--out", type=Path, default=RESULTS / "live.json", help="where JSON and picture go")
+    arguments = parser.parse_args()
+    found = frames(arguments.quick)
+    count = 60 if arguments.quick else arguments.frames
+    result: dict[str, Any] = facts([]) | {"size": SIZE, "boxes": {name: SETS[name] for name in found}, "sets": {}}
+    sets: dict[str, Measured] = {}
+    for name, own in found.items():
+        sets[name] = measure(own, SETS[name], -(-count // len(found)))
+        result["sets"][name] = summary(sets[name])
+        tell(name, result["sets"][name])
+    everything = Measured()
+    for one in sets.values():
+        everything.add(one)
+    result["all"] = summary(everything)
+    tell("all", result["all"])
+    p99 = result["all"]["wall"]["p99_ms"]
+    print(f"p99 {p99:.2f} ms; 60 Hz wants {1000 * BAR:.1f}, 90 Hz {1000 * STRETCH:.1f}; identical to offline: yes")
+    for rate in arguments.camera or ():
+        told = replay(found["synthetic"][:1] * 2, SETS["synthetic"], rate, arguments.seconds)
+        result.setdefault("camera", []).append(told)
+        print(told)
+    if not arguments.quick:
+        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        arguments.out.with_suffix(".svg").write_text(picture(sets) + "\n")
+
+
+if __name__ == "__main__":
+    main()

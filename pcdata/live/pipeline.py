@@ -1,0 +1,302 @@
+"""LivePipeline: a chain on a camera's stream."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pcdata.build import load_config
+from pcdata.errors import (
+    CaptureError,
+    ConfigError,
+    DTypeError,
+    FrameError,
+    IntrinsicsError,
+    NonFiniteError,
+    PoseError,
+    ShapeError,
+)
+from pcdata.live.arrays import ArrayReader
+from pcdata.live.faults import Fault, LiveResult, StalledError
+from pcdata.live.first_frame import check_like, has_readings, same_pixels
+from pcdata.live.latency import Histogram
+from pcdata.live.latest_frame import LatestFrame
+from pcdata.live.over_time import OverTime
+from pcdata.live.stamps import Stamps
+from pcdata.live.stats import LiveStats
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.structure import with_tensors
+from pcdata.threads import torch_on_one_thread
+from pcdata.transforms import Compose
+
+_KINDS: tuple[tuple[type[Exception], Fault], ...] = (  # of what making a frame raises; the first that fits
+    (IntrinsicsError, Fault.OTHER_CAMERA),
+    (FrameError, Fault.OTHER_CAMERA),
+    (PoseError, Fault.BAD_VALUES),
+    (NonFiniteError, Fault.BAD_VALUES),
+    (CaptureError, Fault.BAD_VALUES),
+    (ShapeError, Fault.OTHER_FORM),
+    (DTypeError, Fault.OTHER_FORM),
+)
+
+
+class LivePipeline:
+    """Runs a chain on the frames of one camera, one after another; what is wrong with a frame is told, never raised.
+
+    The chain is the one that built the dataset, as an object or as the file that it is written in, and each cloud is
+    bit for bit the one that it gives offline. A cloud belongs to the caller: memory that is used again is the
+    pipeline's own (the frames' depth and colors where they come as arrays, scratch in the core). Every frame must be
+    like the first in size, dtype, camera and images; what the first has shown is not looked at again. Torch runs on the
+    calling thread alone, the compiled core on all of torch's threads: give torch the cores that are free.
+
+    Args:
+        chain: from captures to clouds; or the path of its YAML, alone or within a configuration of a build.
+        like: the first frame, or one like it. The chain runs on it once, so what is wrong with the chain is raised
+            here, and the frames find memory and caches warm.
+        max_age: seconds from a frame's stamp beyond which it is too late to look at; None = never.
+        clock: the clock of the stamps, in seconds: ``time.monotonic`` for frames stamped where they arrive,
+            ``time.time`` or a node's clock for stamps of a driver.
+        before: a :class:`LiveTemporalFilter` or :class:`LiveAverage` that frames go through before the chain.
+        invalid_values: stored numbers of arrays besides 0 that mean "no reading".
+        same_pixels: whether a frame equal to the one before in every depth pixel is frozen. No sensor gives one; a
+            simulator without noise does.
+        seed: needed where steps are random: each frame is drawn for anew with it.
+
+    Raises:
+        ConfigError: the chain gives no clouds, or is random and there is no seed.
+        PcdataError: the chain refuses the first frame.
+    """
+
+    def __init__(
+        self,
+        chain: Compose | str | PathLike[str],
+        *,
+        like: DepthFrame,
+        max_age: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        before: OverTime | None = None,
+        invalid_values: Collection[int] = (),
+        same_pixels: bool = True,
+        seed: int | None = None,
+    ) -> None:
+        self.chain = chain if isinstance(chain, Compose) else load_config(Path(chain)).pipeline
+        self._check_chain(seed)
+        if not isinstance(like, DepthFrame):
+            raise DTypeError(
+                f"LivePipeline: like must be a DepthFrame, got {type(like).__name__}; of arrays make one by "
+                "DepthFrame.from_numpy(depth, intrinsics, metres_per_unit=0.001)"
+            )
+        self.before, self.max_age = before, max_age
+        self._like, self._seed, self._same_pixels = like, seed, same_pixels
+        self._arrays = ArrayReader(like, like.provenance.get("metres_per_unit"), invalid_values)
+        self._stamps = Stamps(max_age, clock)
+        self._camera: LatestFrame | None = None
+        self._last: Tensor | None = None
+        self._copy: Tensor | None = None
+        self._turn = Lock()  # held while a frame is worked on
+        self._names = [type(step).__name__ for step in self.chain.steps]
+        self._number = 0
+        self.reset_stats()
+        if self._run(like) is None:
+            raise ConfigError("LivePipeline: the chain gives no clouds; put Deproject into it")
+        self.reset_stats()
+
+    def _check_chain(self, seed: int | None) -> None:
+        if not issubclass(self.chain.takes, DepthFrame) or not issubclass(self.chain.gives, PointCloud):
+            raise ConfigError(
+                f"LivePipeline: the chain must lead from captures to clouds, but takes a {self.chain.takes.__name__} "
+                f"and gives a {self.chain.gives.__name__}; Deproject makes one of the other"
+            )
+        if self.chain.is_random and seed is None:
+            raise ConfigError(
+                "LivePipeline: the chain has random steps, which are for training; give chain.split()[0], the steps "
+                "before the first of them, or a seed to draw with for every frame"
+            )
+
+    def __call__(
+        self,
+        frame: DepthFrame | ArrayLike,
+        *,
+        stamp: float | None = None,
+        colors: ArrayLike | None = None,
+        confidence: ArrayLike | None = None,
+        pose: ArrayLike | None = None,
+    ) -> LiveResult:
+        """Answer one frame by a cloud or by a named fault; nothing about the frame is raised.
+
+        Args:
+            frame: a capture; or its depth, (H, W) or (V, H, W), as ``DepthFrame.from_numpy`` made the first of it.
+            stamp: seconds when it was taken; without stamps nothing is late or out of order.
+            colors: beside an array: (H, W, 3) or (V, H, W, 3) uint8 RGB, if the first frame has colors.
+            confidence: beside an array: uint8, values of Confidence.
+            pose: beside an array: world_from_camera, if the first frame has it.
+        """
+        with self._turn:
+            started = time.perf_counter()
+            number, self._number = self._number, self._number + 1
+            cloud, fault, reason = None, *self._stamps.check(stamp)
+            if fault is None:
+                cloud, fault, reason = self._answer(frame, stamp, colors, confidence, pose)
+            seconds = time.perf_counter() - started
+            if fault is None:
+                self._whole.add(seconds)
+            else:
+                self._faults[str(fault)] += 1
+            return LiveResult(
+                cloud=cloud,
+                fault=fault,
+                reason=reason,
+                stamp=stamp,
+                age=self._stamps.age(stamp),
+                seconds=seconds,
+                number=number,
+            )
+
+    def _answer(
+        self, given: Any, stamp: float | None, colors: Any, confidence: Any, pose: Any
+    ) -> tuple[PointCloud | None, Fault | None, str]:
+        try:
+            if isinstance(given, DepthFrame):
+                if colors is not None or confidence is not None or pose is not None:
+                    raise ShapeError("LivePipeline: a DepthFrame has its own colors, confidence and poses")
+                check_like(given, self._like)
+                frame = given
+            else:
+                frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
+        except Exception as error:
+            fault = next((fault for kind, fault in _KINDS if isinstance(error, kind)), Fault.OTHER_FORM)
+            return None, fault, str(error)
+        if not has_readings(frame.depth):
+            return None, Fault.EMPTY, "LivePipeline: not one pixel has a reading; is the lens covered?"
+        if self._same_pixels and self._last is not None and same_pixels(frame.depth, self._last):
+            return None, Fault.FROZEN, "LivePipeline: every pixel is that of the frame before; does the camera stream?"
+        if self._same_pixels:
+            self._remember(frame.depth, is_own=frame is not given)
+        try:
+            if self.before is not None:
+                since = time.perf_counter()
+                with torch_on_one_thread():
+                    frame = self.before(frame, stamp)
+                self._count(type(self.before).__name__, time.perf_counter() - since)
+            cloud = self._run(frame)
+        except NonFiniteError as error:
+            return None, Fault.BAD_VALUES, str(error)
+        except Exception as error:
+            notes = getattr(error, "__notes__", [])
+            return None, Fault.FAILED_STEP, "; ".join([str(error) or repr(error), *notes])
+        if frame is not given:
+            self._arrays.give_away(_tensors_of(cloud))
+        return cloud, None, ""
+
+    def _remember(self, depth: Tensor, *, is_own: bool) -> None:
+        """Keep the pixels for the next frame: as they are where nobody else writes to them, else copied."""
+        if is_own:
+            self._last = depth
+            return
+        if self._copy is None or self._copy.shape != depth.shape or self._copy.device != depth.device:
+            self._copy = torch.empty_like(depth, memory_format=torch.contiguous_format)
+        self._copy.copy_(depth)
+        self._last = self._copy
+
+    def _run(self, frame: DepthFrame) -> PointCloud:
+        """Run the chain and count how long each pass took."""
+        seed = self._seed
+        generator = None if seed is None else torch.Generator("cpu").manual_seed(seed)
+        since = time.perf_counter()
+
+        def after(steps: range, _: Any) -> None:
+            nonlocal since
+            now = time.perf_counter()
+            self._count(" + ".join(self._names[position] for position in steps), now - since)
+            since = now
+
+        with torch_on_one_thread(), torch.no_grad():
+            cloud: PointCloud = self.chain.run_in_passes(frame, generator=generator, after=after)
+        return cloud
+
+    def _count(self, name: str, seconds: float) -> None:
+        self._passes.setdefault(name, Histogram()).add(seconds)
+
+    def follow(self, camera: LatestFrame) -> Iterator[LiveResult]:
+        """Answer the newest frame of a camera, again and again, until it ends the stream.
+
+        A camera puts captures, depth arrays, or mappings of what a call takes: ``{"frame": depth, "colors": rgb}``. A
+        frame without a stamp of its own has that of its arrival. Where no frame comes within the camera's timeout, a
+        result with the fault ``stalled`` is given, and it goes on waiting.
+
+        Raises:
+            Exception: what the camera's thread raised.
+        """
+        self._camera = camera
+        while True:
+            try:
+                arrived = camera.take()
+            except StopIteration:
+                return
+            except StalledError as error:
+                with self._turn:
+                    self._faults[str(Fault.STALLED)] += 1
+                yield LiveResult(fault=Fault.STALLED, reason=str(error), number=self._number)
+                continue
+            item = arrived.item
+            given = dict(item) if isinstance(item, Mapping) else {"frame": item}
+            del item
+            yield self(**{"stamp": arrived.stamp, **given})
+
+    def reset(self) -> None:
+        """Forget the frames before: their stamps, their pixels, what filters gathered. The counts stay."""
+        with self._turn:
+            self._stamps.reset()
+            self._last = None
+            if self.before is not None:
+                self.before.reset()
+
+    def reset_stats(self) -> None:
+        """Begin to count anew."""
+        self._whole = Histogram()
+        self._passes: dict[str, Histogram] = {}
+        self._faults: Counter[str] = Counter()
+        self._counted_from = self._number
+        self._dropped_before = 0 if self._camera is None else self._camera.dropped
+
+    def stats(self) -> LiveStats:
+        """Return what was counted since the start, or since :meth:`reset_stats`."""
+        passes = {name: histogram.summary() for name, histogram in self._passes.items()}
+        whole = self._whole.summary()
+        return LiveStats(
+            frames=self._number - self._counted_from,
+            clouds=whole.count,
+            faults=dict(self._faults),
+            dropped=0 if self._camera is None else self._camera.dropped - self._dropped_before,
+            restarts=self._stamps.restarts,
+            resets=0 if self.before is None else self.before.resets,
+            latency={"whole": whole, **passes},
+        )
+
+    def histogram(self) -> dict[str, list[float]]:
+        """Return the latencies of whole frames: ``seconds``, the upper ends of the bins, and ``count`` of each."""
+        return self._whole.bins()
+
+    def __repr__(self) -> str:
+        height, width = self._like.size
+        return f"LivePipeline({len(self._names)} steps, {self._like.num_views} views of {width}x{height})"
+
+
+def _tensors_of(cloud: PointCloud) -> list[Tensor]:
+    found: list[Tensor] = []
+
+    def note(tensor: Tensor) -> Tensor:
+        found.append(tensor)
+        return tensor
+
+    with_tensors(cloud, note)
+    return found

@@ -1,0 +1,43 @@
+"""What a live pipeline has counted so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pcdata.live.latency import Latency
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveStats:
+    """Counts since the pipeline was made, or since ``reset_stats``.
+
+    Args:
+        frames: that were given.
+        clouds: that were answered.
+        faults: how often each occurred; those that never did are left out.
+        dropped: frames that the camera gave while the pipeline was busy, so nobody looked at them.
+        restarts: how often the stamps began anew.
+        resets: how often the filter over time began anew after its first frame.
+        latency: of frames that gave a cloud: ``whole``, and each pass by the names of its steps.
+    """
+
+    frames: int
+    clouds: int
+    faults: Mapping[str, int]
+    dropped: int
+    restarts: int
+    resets: int
+    latency: Mapping[str, Latency]
+
+    def __str__(self) -> str:
+        told = ", ".join(f"{count} {name}" for name, count in self.faults.items()) or "none"
+        lines = [
+            f"{self.frames} frames, {self.clouds} clouds; faults: {told}; {self.dropped} dropped, "
+            f"{self.restarts} restarts, {self.resets} resets",
+            f"{'milliseconds':40}{'median':>9}{'p90':>9}{'p99':>9}{'p99.9':>9}{'worst':>9}",
+        ]
+        for name, one in self.latency.items():
+            figures = (one.median, one.p90, one.p99, one.p999, one.worst)
+            lines.append(f"{name:40.40}{''.join(f'{1000 * value:9.2f}' for value in figures)}")
+        return "\n".join(lines)
