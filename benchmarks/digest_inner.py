@@ -28,6 +28,9 @@ from torch import Tensor
 Arguments = tuple[tuple[Any, ...], dict[str, Any]]
 
 
+NO_RUNS = torch.zeros(3, dtype=torch.int64), torch.empty(8, 0), torch.empty(3, 0)  # of two small clouds
+
+
 def _fields() -> dict[str, Tensor]:
     return {"points": points(90, 1), "labels": torch.arange(90), "byte": torch.arange(90).to(torch.uint8)}
 
@@ -116,7 +119,9 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     planes = torch.nn.functional.normalize(torch.randn(2, 30, 4, generator=seeded(4), dtype=torch.float64), dim=2)
     planes[:, :, 3] *= 0.1
     yield "draw_planes", "two", lambda: ((cloud, ptr, triples, torch.tensor([0, 1])), {})
-    yield "count_near_planes", "two", lambda: ((cloud, ptr, planes, distance), {})
+    competes, floors = planes[:, :, 0] < 0.9, torch.zeros(2, dtype=torch.int64)
+    yield "bound_runs", "small", lambda: ((cloud, ptr), {})
+    yield "record_planes", "two", lambda: ((cloud, ptr, NO_RUNS, planes, competes, distance, floors), {})
     yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
     yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
     yield from _calls_of_motions()

@@ -39,6 +39,11 @@ def negated(mask: Tensor) -> Tensor:
     return torch.from_numpy(~mask.numpy()) if mask.device.type == "cpu" else ~mask
 
 
+def differing(a: Tensor, b: Tensor) -> Tensor:
+    """Return the mask that is true where two masks differ."""
+    return torch.from_numpy(a.numpy() != b.numpy()) if a.device.type == "cpu" else a != b
+
+
 def equal_values(a: Tensor, b: Tensor) -> bool:
     """Say whether two tensors of one shape hold the same values."""
     return bool(np.array_equal(a.numpy(), b.numpy())) if a.device.type == "cpu" else torch.equal(a, b)

@@ -15,15 +15,16 @@ from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import dbscan, density_clusters
 from pcdata.functional.neighbors import nearest_rows
 from pcdata.functional.planes import (
+    bound_runs,
     checked_probability,
     checked_seeds,
     checked_tilt,
     checked_up,
-    count_near_planes,
     draw_planes,
     fit_planes,
     near_planes,
     ransac_plane,
+    record_planes,
     refined_planes,
 )
 from pcdata.functional.rows import ptr_from_counts
@@ -49,7 +50,7 @@ _LEAST_LEAN = 0.1
     probability=checked_probability,
     max_planes=checked_count,
     min_share=checked_fraction,
-    steps=(draw_planes, count_near_planes, near_planes, fit_planes),
+    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes),
     gradient=False,
 )
 def segment_planes(
@@ -133,7 +134,7 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(draw_planes, count_near_planes, near_planes, fit_planes, nearest_rows, density_clusters),
+    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes, nearest_rows, density_clusters),
     gradient=False,
 )
 def supporting_plane(

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
+from pcdata.contracts.host import differing
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
@@ -24,7 +25,7 @@ _MAX_REFINEMENTS = 20
 # Hypotheses and points looked at together: 1 MB of distances.
 _PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
-_FIRST_TRIES = 32
+_FIRST_TRIES = 64
 # Planes drawn at a time, over all clouds: 32 MB.
 _MOST_HYPOTHESES = 1 << 20
 
@@ -86,19 +87,42 @@ def draw_planes(
 
 
 @inner
-def count_near_planes(
-    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, *, backend: str = "auto"
+def bound_runs(points: Tensor, ptr: Tensor, *, backend: str = "auto") -> tuple[Tensor, ...]:
+    """Return what a backend likes to know of the points before it counts those near planes again and again."""
+    return ()
+
+
+@inner
+def record_planes(
+    points: Tensor,
+    ptr: Tensor,
+    runs: tuple[Tensor, ...],  # of bound_runs
+    planes: Tensor,  # (B, P, 4)
+    competes: Tensor,  # (B, P) bool: the others are not looked at
+    distance: float,
+    floors: Tensor,  # (B,) int64
+    *,
+    backend: str = "auto",
 ) -> Tensor:  # (B, P) int64 on the CPU
-    """Count the points of each cloud that are near its planes (B, P, 4); planes of NaN are near nothing."""
-    bounds = pairwise(ptr.tolist())
-    return torch.stack([_count_near(points[start:stop], own, distance) for (start, stop), own in zip(bounds, planes)])
+    """Count the points near each plane that competes and has more than its cloud's floor and all before it; else 0."""
+    counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
+    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
+        counts[b, competes[b]] = _count_near(points[start:stop], planes[b, competes[b]], distance)
+    before = torch.cat([floors[:, None], counts[:, :-1]], 1).cummax(1).values
+    return counts.masked_fill_((counts <= before) | (counts <= floors[:, None]), 0)
 
 
 @inner
 def near_planes(
-    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, *, backend: str = "auto"
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,
+    distance: float,
+    runs: tuple[Tensor, ...] = (),
+    *,
+    backend: str = "auto",
 ) -> Tensor:  # (N,) bool
-    """Mark the points that are near their cloud's plane, planes (B, 4)."""
+    """Mark the points that are near their cloud's plane, planes (B, 4); ``runs`` as bound_runs gives them."""
     bounds = pairwise(ptr.tolist())
     near = [
         plane_distance(points[start:stop], plane[None])[0].abs_() < distance
@@ -124,7 +148,7 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "a
     up=checked_up,
     max_tilt=checked_tilt,
     probability=checked_probability,
-    steps=(draw_planes, count_near_planes, near_planes, fit_planes),
+    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes),
     gradient=False,
 )
 def ransac_plane(
@@ -176,46 +200,53 @@ def ransac_plane(
     num_clouds, counts = len(ptr) - 1, counts_from_ptr(ptr).tolist()
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
-    winners = []
+    winners, runs = [], ()
     for first in range(0, num_clouds, at_once):
         some = slice(first, min(first + at_once, num_clouds))
         own, own_ptr = _clouds_between(points, ptr, some.start, some.stop)
         triples, which = _draw_triples(counts[some], num_hypotheses, seed[some])
         hypotheses = draw_planes(own, own_ptr, triples, which, backend=backend)
-        allowed = _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
-        if probability is None:
-            near = count_near_planes(own, own_ptr, hypotheses, distance, backend=backend)
-        else:
-            near, allowed = _count_until_probable(own, own_ptr, hypotheses, allowed, distance, probability, backend)
-        winners.append(_best_planes(hypotheses, allowed, near, distance, first))
-    planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend)
+        is_plane = ~hypotheses[..., 0].isnan()
+        competes = is_plane & _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
+        runs = bound_runs(own, own_ptr, backend=backend)
+        counts = _count_until_probable(own, own_ptr, runs, hypotheses, competes, distance, probability, backend)
+        winners.append(_best_planes(hypotheses, is_plane, competes, counts, distance, first))
+    runs = runs if at_once >= num_clouds else ()  # of all clouds
+    planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend, runs)
     return _face(planes, up, distance).to(points.device), inliers
 
 
 def _count_until_probable(
     points: Tensor,
     ptr: Tensor,
+    runs: tuple[Tensor, ...],
     hypotheses: Tensor,  # (B, P, 4)
-    allowed: Tensor,  # (B, P)
+    competes: Tensor,  # (B, P)
     distance: float,
-    probability: float,
+    probability: float | None,
     backend: str,
-) -> tuple[Tensor, Tensor]:  # counts (B, P) and allowed (B, P), nothing behind each cloud's last try
-    """Score hypotheses in blocks until the last cloud has been tried often enough."""
+) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
+    """Score hypotheses, in blocks where few may do, until the last cloud has been tried often enough."""
+    floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
+    if probability is None:
+        return record_planes(points, ptr, runs, hypotheses, competes, distance, floors, backend=backend)
     sizes = counts_from_ptr(ptr).cpu()[:, None].double()
-    counts = torch.zeros(allowed.shape, dtype=torch.int64, device="cpu")
-    competes, tries = allowed & ~hypotheses[..., 0].isnan(), hypotheses.shape[1]
-    last, first, block = torch.full_like(sizes, tries), 0, _FIRST_TRIES
+    counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
+    tries, first, block = hypotheses.shape[1], 0, _FIRST_TRIES
+    last = torch.full_like(sizes, tries)
     while first < tries and bool((last > first).any()):
         some = slice(first, min(first + block, tries))
-        counts[:, some] = count_near_planes(points, ptr, hypotheses[:, some].contiguous(), distance, backend=backend)
-        share = counts[:, : some.stop].masked_fill(~competes[:, : some.stop], 0).cummax(1).values / sizes
+        part, asked = hypotheses[:, some].contiguous(), competes[:, some] & (last > first)
+        counts[:, some] = record_planes(points, ptr, runs, part, asked, distance, floors, backend=backend)
+        best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
         # log1p(-1) = -inf: one try finds a plane that holds all
-        needed = math.log1p(-probability) / torch.log1p(-share.pow(3))
-        done = torch.arange(1, some.stop + 1, dtype=torch.float64, device="cpu") >= needed
-        last = torch.where(done.any(1, keepdim=True), done.int().argmax(1, keepdim=True) + 1.0, float(tries))
+        needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))
+        done = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") >= needed
+        stop = torch.where(done.any(1, keepdim=True), first + done.int().argmax(1, keepdim=True) + 1.0, last)
+        last = torch.where(last > first, stop, last)
+        floors = best[:, -1].clone()
         first, block = some.stop, 2 * block
-    return counts, allowed & (torch.arange(tries, dtype=torch.int64, device="cpu") < last)
+    return counts.masked_fill_(torch.arange(tries, dtype=torch.int64, device="cpu") >= last, 0)
 
 
 def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
@@ -237,10 +268,10 @@ def draw_rows(num_points: int, size: int, count: int, generator: torch.Generator
     return torch.stack(drawn, dim=1)
 
 
-def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: float, first_cloud: int) -> Tensor:
-    """Return each cloud's allowed plane with the most inliers, the earliest among equals, (B, 4)."""
-    is_plane = ~planes[..., 0].isnan()
-    competes = is_plane & allowed
+def _best_planes(
+    planes: Tensor, is_plane: Tensor, competes: Tensor, counts: Tensor, distance: float, first_cloud: int
+) -> Tensor:
+    """Return each cloud's plane with the most inliers, the earliest among equals, (B, 4)."""
     for cloud in (~competes.any(1)).nonzero().squeeze(1).tolist():
         reason = (
             f"none of the {int(is_plane[cloud].sum())} planes found is within max_tilt of up; is up in the frame of "
@@ -249,9 +280,8 @@ def _best_planes(planes: Tensor, allowed: Tensor, counts: Tensor, distance: floa
             else f"all {planes.shape[1]} triples drawn lie on a line"
         )
         raise NoPlaneError(f"ransac_plane: cloud {first_cloud + cloud}: {reason}")
-    scores = counts.masked_fill(~competes, -1)
-    best = scores.argmax(1)  # the first of equals, as torch documents
-    for cloud in (scores.gather(1, best[:, None]) < 3).squeeze(1).nonzero().squeeze(1).tolist():
+    best = counts.argmax(1)  # the first of equals, as torch documents
+    for cloud in (counts.gather(1, best[:, None]) < 3).squeeze(1).nonzero().squeeze(1).tolist():
         raise NoPlaneError(
             f"ransac_plane: cloud {first_cloud + cloud}: no plane has 3 points nearer than distance={distance:g}; "
             "is it in the right unit?"
@@ -285,20 +315,21 @@ def refined_planes(
     ups: Tensor | None,
     max_tilt: float | None,
     backend: str,
+    runs: tuple[Tensor, ...] = (),
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
     """Refit to the inliers until they no longer change; return the last allowed planes and their inliers.
 
-    The planes given are changed.
+    The planes given are changed. ``runs`` are those of the points, if they are known.
     """
-    inliers = near_planes(points, ptr, planes, distance, backend=backend)
+    inliers = near_planes(points, ptr, planes, distance, runs, backend=backend)
     unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
     rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(_MAX_REFINEMENTS):
         refitted = fit_planes(own, own_ptr, before, backend=backend)
         fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
-        after = near_planes(own, own_ptr, refitted, distance, backend=backend)
+        after = near_planes(own, own_ptr, refitted, distance, runs, backend=backend)
         fits &= count_per_cloud(after, own_ptr).cpu() >= 3
-        settled = fits & (count_per_cloud(after != before, own_ptr).cpu() == 0)
+        settled = fits & (count_per_cloud(differing(after, before), own_ptr).cpu() == 0)
         planes[unsettled[fits]] = refitted[fits]
         chosen = after
         if not bool(fits.all()):
@@ -315,7 +346,7 @@ def refined_planes(
             kept = open_.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
             rows = kept.nonzero().squeeze(1) if rows is None else rows[kept]
             own, own_ptr = own[kept], ptr_from_counts(counts_from_ptr(own_ptr)[open_.to(own_ptr.device)])
-            chosen, unsettled = chosen[kept], unsettled[open_]
+            chosen, unsettled, runs = chosen[kept], unsettled[open_], ()
         before = chosen
     return planes, inliers
 

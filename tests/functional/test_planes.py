@@ -105,8 +105,25 @@ def test_among_equal_hypotheses_the_earliest_wins():
     points = slab(50, [0.0, 0.0, 1.0], 0.5, noise=0.0)
     hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
     allowed = torch.ones(1, 3, dtype=torch.bool)
-    near = planes_module._count_near(points, hypotheses, 0.01)[None]
-    assert torch.equal(planes_module._best_planes(hypotheses[None], allowed, near, 0.01, 0), hypotheses[1:2])
+    ptr, none = torch.tensor([0, 50]), torch.zeros(1, dtype=torch.int64)
+    near = planes_module.record_planes(points, ptr, (), hypotheses[None], allowed, 0.01, none, backend="torch")
+    assert near.tolist() == [[0, 50, 0]]
+    best = planes_module._best_planes(hypotheses[None], allowed, allowed, near, 0.01, 0)
+    assert torch.equal(best, hypotheses[1:2])
+
+
+def test_hypotheses_beyond_the_tilt_are_never_scored(monkeypatch):
+    scored = []
+    monkeypatch.setattr(planes_module, "_count_near", lambda points, planes, distance: _kept(scored, points, planes))
+    up, limit = torch.tensor([0.0, 0, 1]), 0.3
+    ransac_plane(scene(), num_hypotheses=200, up=up, max_tilt=limit, backend="torch")
+    assert 0 < len(scored[0]) < 200
+    assert bool((scored[0][:, 2].abs() >= math.cos(limit)).all())
+
+
+def _kept(scored, points, planes):
+    scored.append(planes)
+    return (plane_distance(points, planes).abs() < 0.01).sum(dim=1)
 
 
 def test_the_same_seed_repeats_and_a_batch_is_each_cloud_alone():

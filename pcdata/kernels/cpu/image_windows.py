@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+import pcdata.functional.depth.flying_pixels
 import pcdata.functional.image_clusters
 import pcdata.functional.table_surface  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
@@ -15,6 +16,14 @@ from pcdata.kernels.cpu.native import call, room
 
 # The core numbers the rows of one cloud with 31 bits.
 _MAX_ROWS = 2**31 - 1
+
+
+@kernel("flying_pixel_mask", "cpu")
+def flying_pixel_mask(depth: Tensor, *, tolerance: float, min_neighbors: int) -> Tensor:
+    """Compare each reading with its eight neighbors while walking over the rows once."""
+    flying = room(depth.shape, torch.bool)
+    call("pc_flying_pixels", depth, *depth.shape, float(tolerance), min_neighbors, flying)
+    return flying
 
 
 @kernel("window_medians", "cpu")

@@ -15,6 +15,8 @@ from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
 from pcdata.kernels.cpu.native import call, numbers, room
 
+# What pc_bound_runs looks at: points of a run, and runs that fit a register; smaller clouds it leaves alone.
+_RUN, _RUNS_AT_ONCE, _SMALL_CLOUD = 64, 16, 8192
 # The core numbers the rows of one cloud, and voxels, with 32 bits.
 _MAX_ROWS = 2**31 - 1
 
@@ -78,19 +80,43 @@ def draw_planes(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> 
     return planes
 
 
-@kernel("count_near_planes", "cpu")
-def count_near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
-    """Score all planes of all clouds in one pass over the points."""
+@kernel("bound_runs", "cpu")
+def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
+    """Look at 64 points that follow each other at a time, where that is worth it: in large clouds."""
+    counts = counts_from_ptr(ptr)
+    runs = torch.where(counts > _SMALL_CLOUD, (counts + (_RUN - 1)) // _RUN, 0)
+    run_ptr = ptr_from_counts((runs + (_RUNS_AT_ONCE - 1)) // _RUNS_AT_ONCE * _RUNS_AT_ONCE)
+    num_runs = int(run_ptr[-1])
+    facts, columns = room((8, num_runs), torch.float32), room((3, _RUN * num_runs), torch.float32)
+    call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts, columns)
+    return run_ptr, facts, columns
+
+
+@kernel("record_planes", "cpu")
+def record_planes(
+    points: Tensor,
+    ptr: Tensor,
+    runs: tuple[Tensor, ...],
+    planes: Tensor,
+    competes: Tensor,
+    distance: float,
+    floors: Tensor,
+) -> Tensor:
+    """Look at runs of points first: they tell of most planes that they are no records, and of most points."""
     counts = room(planes.shape[:2], torch.int64)
-    call("pc_count_near_planes", points, ptr, len(planes), planes.float(), planes.shape[1], float(distance), counts)
+    count, some = len(planes), planes.shape[1]
+    call(
+        "pc_record_planes", points, ptr, count, *runs, planes.float(), competes, some, float(distance), floors, counts
+    )  # fmt: skip
     return counts
 
 
 @kernel("near_planes", "cpu")
-def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
-    """Mark in one pass."""
+def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float, runs: tuple[Tensor, ...] = ()) -> Tensor:
+    """Mark in one pass, runs of points at once where they are known."""
     near = room(len(points), torch.bool)
-    call("pc_near_planes", points, ptr, len(planes), planes.float(), float(distance), near)
+    known = runs or (None, None, None)
+    call("pc_near_planes", points, ptr, len(planes), *known, planes.float(), float(distance), near)
     return near
 
 

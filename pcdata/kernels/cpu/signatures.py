@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xB36838B5ED45661
+INTERFACE_NUMBER = 0x003378B0793F807
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -47,6 +47,7 @@ pc_duplicate_mask: float* points, int64* ptr, int64 num_clouds, uint8* repeats
 pc_convex_hull: double* points, int64 count, int64* corners, int64* num_corners
 pc_points_in_grippers: float* points, int64 count, double* axes, double* origin, double* lower, double* upper, int64
     num_grasps, int64* hits, int64* held
+pc_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, double tolerance, int64 least, uint8* flying
 pc_window_medians: float* values, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, float* medians
 pc_linked_pixels: float* points, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, double limit,
     int64 reach, int64* label
@@ -98,9 +99,11 @@ pc_find_voxel_sizes: float* points, int64* ptr, int64 num_clouds, int64 num_poin
     int64* possible
 pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triples, int64 count, int64* which, double
     flat, double* planes
-pc_count_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, int64 num_planes, double distance,
-    int64* counts
-pc_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, double distance, uint8* near
+pc_bound_runs: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns
+pc_record_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns, float*
+    planes, uint8* competes, int64 num_planes, double distance, int64* floors, int64* counts
+pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns, float* planes,
+    double distance, uint8* near
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
 pc_reach: float* points, int64 rows, double* places, int64 num_places, double least, double* reach
 pc_fit_surface: float* points, int64 count, double* reach, double* plane, double* axes, double* numbers, double* height,

@@ -20,11 +20,13 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.functional.depth.deproject import deproject_depth
-from pcdata.functional.planes import ransac_plane
+from pcdata.functional.planes import draw_rows, ransac_plane
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample
+from pcdata.geometry.plane_fit import planes_through
 from pcdata.kernels.cpu import native
+from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
@@ -268,10 +270,46 @@ def test_inlier_counts_equal_the_reference():
     triples, which = planes._draw_triples([4000, 3, 6097], 77, [0, 1, 2])
     drawn = [planes.draw_planes(points, ptr, triples, which, backend=name) for name in ("cpu", "torch")]
     torch.testing.assert_close(*drawn, rtol=0, atol=1e-12, equal_nan=True)
-    ours, reference = (
-        planes.count_near_planes(points, ptr, drawn[1], 0.004, backend=name) for name in ("cpu", "torch")
-    )
-    assert torch.equal(ours, reference)
+    competes, floors = ~drawn[1][..., 0].isnan(), torch.tensor([0, 0, 40])
+    assert_records_equal(points, ptr, drawn[1], competes, 0.004, floors)
+
+
+def assert_records_equal(
+    points: Tensor, ptr: Tensor, drawn: Tensor, competes: Tensor, distance: float, floors: Tensor
+) -> None:
+    from pcdata.functional import planes
+
+    found = []
+    for name in ("cpu", "torch"):
+        runs = planes.bound_runs(points, ptr, backend=name)
+        found.append(planes.record_planes(points, ptr, runs, drawn, competes, distance, floors, backend=name))
+        near = [planes.near_planes(points, ptr, drawn[:, 0], distance, own, backend=name) for own in ((), runs)]
+        assert torch.equal(*near)
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize(
+    ("order", "scale"),
+    [*((order, 1.0) for order in ("image", "shuffled", "sorted", "equal")), *(("image", s) for s in (1e-6, 1e6, 1e18))],
+)
+def test_runs_of_points_change_no_count(order, scale, machine):
+    """Large clouds are counted by runs: on an image, where those say nothing, of one point, and where floats end."""
+    points, generator = organized(130, 170) * scale, seeded(1)
+    if order == "shuffled":
+        points = points[torch.randperm(len(points), generator=generator)]
+    elif order == "sorted":
+        points = points[points[:, 2].argsort()]
+    elif order == "equal":
+        points = torch.cat([points[:12_000], points[:1].expand(9_000, 3)])
+    largest = len(points)
+    points = torch.cat([points, organized(20, 30) * scale, points[:8193], points[:8192]]).contiguous()
+    ptr = ptr_from_counts([largest, 600, 0, 8193, 8192])
+    drawn = planes_through(points[draw_rows(largest, 3, 61, generator)])[None].repeat(5, 1, 1)
+    drawn[:, 7] = torch.nan
+    competes = ~drawn[..., 0].isnan()
+    competes[:, ::5] = False
+    for distance in (1e-4 * scale, 0.01 * scale, 3 * scale):
+        assert_records_equal(points, ptr, drawn, competes, distance, torch.tensor([0, 3, 0, 500, 10_000]))
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])

@@ -193,6 +193,12 @@ PC_EXPORT int32_t pc_points_in_grippers(const pc_context* context, const float* 
 
 // -- points on depth images -------------------------------------------------------------------------------------------
 
+// depth (num_views, height, width), 0 = no reading -> flying (num_views, height, width), 0 or 1: whether a reading has
+// a neighbor of the eight across an edge and fewer than `least` on its own surface. Two readings share a surface where
+// they differ by at most `tolerance` times the nearer.
+PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth, int64_t num_views, int64_t height,
+                                   int64_t width, double tolerance, int64_t least, uint8_t* flying);
+
 // values (N,) of points on the pixels (N,), rising within each cloud, of images (height, width) -> medians (N,): the
 // lower medians of the values that the 3 x 3 pixels around each have; those that are NaN do not count.
 PC_EXPORT int32_t pc_window_medians(const pc_context* context, const float* values, const int64_t* pixel,
@@ -388,16 +394,25 @@ PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* p
                                        int64_t num_clouds, const int64_t* triples, int64_t count, const int64_t* which,
                                        double flat, double* planes);
 
-// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4) -> counts (num_clouds, H): the points of each cloud
-// with
-// |((nx*x + ny*y) + nz*z) + d| < distance.
-PC_EXPORT int32_t pc_count_near_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                       int64_t num_clouds, const float* planes, int64_t num_planes, double distance,
-                                       int64_t* counts);
+// Runs of 64 points that follow each other in a cloud, for pc_record_planes. run_ptr (num_clouds+1,) has room for whole
+// groups of 16 runs per cloud -> runs (8, R): first point, last point, how far the others lie from the segment between
+// them, how many there are; columns (3, 64 R): the points, NaN where a run has fewer.
+PC_EXPORT int32_t pc_bound_runs(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
+                                const int64_t* run_ptr, float* runs, float* columns);
 
-// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, 4) -> near (N,), 0 or 1: whether a point is near its cloud's.
+// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made, planes (num_clouds, H, 4), competes (num_clouds, H) 0 or
+// 1, floors (num_clouds,) -> counts (num_clouds, H): the points of each cloud with |((nx*x + ny*y) + nz*z) + d| <
+// distance, where the plane competes and has more of them than all before it that do, and than the floor; else 0.
+PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* points, const int64_t* ptr,
+                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* columns,
+                                   const float* planes, const uint8_t* competes, int64_t num_planes, double distance,
+                                   const int64_t* floors, int64_t* counts);
+
+// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, 4) -> near (N,), 0 or 1:
+// whether a point is near its cloud's.
 PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 const float* planes, double distance, uint8_t* near);
+                                 const int64_t* run_ptr, const float* runs, const float* columns, const float* planes,
+                                 double distance, uint8_t* near);
 
 // points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
 // chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx,

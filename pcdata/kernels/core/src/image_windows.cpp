@@ -1,4 +1,4 @@
-// What points on a depth image are to the pixels around them: the medians of windows, and connected parts.
+// What pixels of a depth image are to those around them: flying pixels, the medians of windows, and connected parts.
 #include <cmath>
 #include <limits>
 
@@ -10,6 +10,28 @@ namespace pc::windows {
 namespace {
 
 constexpr int64_t kPiece = 1 << 13;  // points that a thread takes at once
+
+// -- flying pixels ------------------------------------------------------------------------------------------------
+
+constexpr int kColumns = 256;  // of a row at once
+
+// Write which of `count` neighbors in a row, at most kColumns, fly; rows[r][i] is left of pixel i, row r - 1.
+void fly_in_run(const float* const* rows, int count, float tolerance, int32_t least, uint8_t* flying) {
+  alignas(64) int32_t on_surface[kColumns] = {}, at_edge[kColumns] = {};
+  const float* own = rows[1] + 1;
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c) {
+      if (r == 1 && c == 1) continue;
+      const float* other = rows[r] + c;
+      for (int i = 0; i < count; ++i) {
+        const float a = own[i], b = other[i], nearer = b < a ? b : a;
+        const int32_t both = nearer > 0, same = std::fabs(a - b) <= tolerance * nearer;
+        on_surface[i] += both & same;
+        at_edge[i] |= both & ~same;
+      }
+    }
+  for (int i = 0; i < count; ++i) flying[i] = static_cast<uint8_t>(at_edge[i] & (on_surface[i] < least));
+}
 
 // -- medians of 3 x 3 pixels --------------------------------------------------------------------------------------
 
@@ -89,6 +111,37 @@ struct Linking {
 
 }  // namespace
 }  // namespace pc::windows
+
+PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth, int64_t num_views, int64_t height,
+                                   int64_t width, double tolerance, int64_t least, uint8_t* flying) {
+  using namespace pc;
+  using namespace pc::windows;
+  return guarded([&] {
+    const int64_t rows_at_once = std::max<int64_t>(1, (1 << 15) / std::max<int64_t>(width, 1));
+    parallel_for(*context, num_views * height, rows_at_once, [&](int64_t begin, int64_t end, int64_t) {
+      // Three rows with a pixel without a reading at both ends; above and below the image there is none either.
+      std::vector<float> padded(static_cast<size_t>(3 * (width + 2)), 0.0F);
+      for (int64_t row = begin; row < end; ++row) {
+        const float* rows[3];
+        for (int64_t r = 0; r < 3; ++r) {
+          float* to = padded.data() + (row + r) % 3 * (width + 2);
+          rows[r] = to;
+          if (r < 2 && row > begin && row % height != 0) continue;  // read for the row before
+          const int64_t v = row % height + r - 1;
+          if (v < 0 || v >= height)
+            std::fill_n(to + 1, width, 0.0F);
+          else
+            std::copy_n(depth + (row + r - 1) * width, width, to + 1);
+        }
+        for (int64_t u = 0; u < width; u += kColumns) {
+          const float* const some[3] = {rows[0] + u, rows[1] + u, rows[2] + u};
+          fly_in_run(some, static_cast<int>(std::min<int64_t>(kColumns, width - u)), static_cast<float>(tolerance),
+                     static_cast<int32_t>(least), flying + row * width + u);
+        }
+      }
+    });
+  });
+}
 
 PC_EXPORT int32_t pc_window_medians(const pc_context* context, const float* values, const int64_t* pixel,
                                     const int64_t* ptr, int64_t num_clouds, int64_t height, int64_t width,

@@ -6,7 +6,7 @@ namespace pc::planes {
 namespace {
 
 constexpr int64_t kSummedPiece = 8192;  // points summed on their own; pieces are added in order
-constexpr int kBlock = 512;             // points with one array per coordinate at a time
+constexpr int kBlock = 64;              // points with one array per coordinate at a time
 
 typedef float Float8 __attribute__((vector_size(32)));
 typedef int64_t Long8 __attribute__((vector_size(64)));
@@ -22,6 +22,8 @@ void add_block(const float* points, const uint8_t* mask, int64_t begin, int64_t 
   alignas(64) float axes[3][kBlock];
   alignas(64) int64_t taken[kBlock];  // all ones where chosen
   const int count = static_cast<int>(end - begin);
+  // A sum does not change by the zeros of points that are not chosen.
+  if (std::memchr(mask + begin, 1, static_cast<size_t>(count)) == nullptr) return;
   for (int i = 0; i < count; ++i)
     for (int axis = 0; axis < 3; ++axis) axes[axis][i] = points[3 * (begin + i) + axis];
   for (int i = 0; i < count; ++i) taken[i] = -static_cast<int64_t>(mask[begin + i]);
@@ -58,7 +60,8 @@ PC_EXPORT int32_t pc_moments(const pc_context* context, const float* points, con
   return guarded([&] {
     const auto pieces = cut_clouds(ptr, num_clouds, kSummedPiece);
     std::vector<Sums> found(pieces.size());
-    for_each_piece(*context, pieces, kSummedPiece, [&](const CloudPiece& piece, int64_t number) {
+    constexpr int64_t kRowsAtOnce = 8 * kSummedPiece;  // 50 us of a thread
+    for_each_piece(*context, pieces, kRowsAtOnce, [&](const CloudPiece& piece, int64_t number) {
       Sums own;
       for (int64_t first = piece.begin; first < piece.end; first += kBlock)
         add_block(points, mask, first, std::min<int64_t>(piece.end, first + kBlock), centers + 3 * piece.cloud, own);
