@@ -200,7 +200,8 @@ def ransac_plane(
     num_clouds, counts = len(ptr) - 1, counts_from_ptr(ptr).tolist()
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
-    winners, runs = [], ()
+    winners = []
+    runs: tuple[Tensor, ...] = ()
     for first in range(0, num_clouds, at_once):
         some = slice(first, min(first + at_once, num_clouds))
         own, own_ptr = _clouds_between(points, ptr, some.start, some.stop)
@@ -209,8 +210,8 @@ def ransac_plane(
         is_plane = ~hypotheses[..., 0].isnan()
         competes = is_plane & _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
         runs = bound_runs(own, own_ptr, backend=backend)
-        counts = _count_until_probable(own, own_ptr, runs, hypotheses, competes, distance, probability, backend)
-        winners.append(_best_planes(hypotheses, is_plane, competes, counts, distance, first))
+        near = _count_until_probable(own, own_ptr, runs, hypotheses, competes, distance, probability, backend)
+        winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend, runs)
     return _face(planes, up, distance).to(points.device), inliers
