@@ -11,14 +11,14 @@ from pcdata.contracts.dispatch import why_unavailable
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
-    "points": (416, 35),  # sampling is told its options by the reference, whose step a kernel does; so is the way back
+    "points": (407, 35),  # sampling is told its options by the reference, whose step a kernel does; so is the way back
     "build": (
         3462,
         106,  # the options have a file of their own, and so do what the core finds of planes, and motions
     ),  # of which 600 keep what a build was when it is stopped, 700 write its card, 30 tell rows, 16 look at poses, 56
     # have the hull and the rows of a plane found by the core, on one thread of torch's
     "open": (
-        870,
+        856,
         34,
     ),  # six arrays of the index, each a file that is checked; every field of a step is; limits that are off
 }

@@ -138,7 +138,7 @@ def inner(reference: Callable[P, R]) -> Callable[P, R]:
             tensors = list(_tensors_in((*args, *kwargs.values())))
             backend = REFERENCE
             if tensors and not _wants_gradient(tensors):
-                backend = _choose(operation, "auto", tensors[0].device)
+                backend = first_live(tensors[0].device, operation.serves)
         body: Callable[P, R] = operation.kernels.get(backend, reference)
         return body(*args, **kwargs)
 

@@ -145,9 +145,12 @@ class Transform(nn.Module):
 
     def unit_needed(self) -> str | None:
         """The unit that the fields' lengths are in, or None when no length is given: any will do."""
-        units = length_fields(type(self))
-        given = [unit for name, unit in units.items() if getattr(self, name) is not None]
-        return METRE if self.needs_metres else next(iter(given), None)
+        if self.needs_metres:
+            return METRE
+        for name, unit in length_fields(type(self)).items():
+            if self.__dict__[name] is not None:
+                return unit
+        return None
 
     def unit_given(self) -> str | None:
         """The unit of the result, or None when it is the input's."""

@@ -84,6 +84,8 @@ def draw_planes(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> 
 def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
     """Look at 64 points that follow each other at a time, where that is worth it: in large clouds."""
     counts = counts_from_ptr(ptr)
+    if int(counts.max()) <= _SMALL_CLOUD:
+        return ()
     runs = torch.where(counts > _SMALL_CLOUD, (counts + (_RUN - 1)) // _RUN, 0)
     run_ptr = ptr_from_counts((runs + (_RUNS_AT_ONCE - 1)) // _RUNS_AT_ONCE * _RUNS_AT_ONCE)
     num_runs = int(run_ptr[-1])
@@ -104,9 +106,9 @@ def record_planes(
 ) -> Tensor:
     """Look at runs of points first: they tell of most planes that they are no records, and of most points."""
     counts = room(planes.shape[:2], torch.int64)
-    count, some = len(planes), planes.shape[1]
+    count, some, known = len(planes), planes.shape[1], runs or (None, None, None)
     call(
-        "pc_record_planes", points, ptr, count, *runs, planes.float(), competes, some, float(distance), floors, counts
+        "pc_record_planes", points, ptr, count, *known, planes.float(), competes, some, float(distance), floors, counts
     )  # fmt: skip
     return counts
 

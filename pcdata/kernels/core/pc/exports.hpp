@@ -400,9 +400,9 @@ PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* p
 PC_EXPORT int32_t pc_bound_runs(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                 const int64_t* run_ptr, float* runs, float* columns);
 
-// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made, planes (num_clouds, H, 4), competes (num_clouds, H) 0 or
-// 1, floors (num_clouds,) -> counts (num_clouds, H): the points of each cloud with |((nx*x + ny*y) + nz*z) + d| <
-// distance, where the plane competes and has more of them than all before it that do, and than the floor; else 0.
+// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, H, 4), competes (num_clouds,
+// H) 0 or 1, floors (num_clouds,) -> counts (num_clouds, H): the points of each cloud with |((nx*x + ny*y) + nz*z) + d|
+// < distance, where the plane competes and has more of them than all before it that do, and than the floor; else 0.
 PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* points, const int64_t* ptr,
                                    int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* columns,
                                    const float* planes, const uint8_t* competes, int64_t num_planes, double distance,

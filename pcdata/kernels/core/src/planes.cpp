@@ -136,6 +136,7 @@ class Records {
 
   // False where the runs say too little about the points to be worth it.
   bool find_by_runs() {
+    if (runs_.count == 0) return false;
     std::vector<CountBounds> bounds(static_cast<size_t>(num_planes_), {0, 0});
     parallel_for(context_, num_planes_, kPlanes, [&](int64_t begin, int64_t end, int64_t) {
       for (int64_t h = begin; h < end; ++h)
@@ -253,7 +254,8 @@ PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* point
     const auto* all = reinterpret_cast<const Plane*>(planes);
     const auto rows_of = [&](int64_t cloud) { return Range{ptr[cloud], ptr[cloud + 1]}; };
     const auto find = [&](int64_t cloud) {
-      const Runs mine(runs, columns, run_ptr[num_clouds], run_ptr[cloud], run_ptr[cloud + 1]);
+      const Range own = run_ptr == nullptr ? Range{0, 0} : Range{run_ptr[cloud], run_ptr[cloud + 1]};
+      const Runs mine(runs, columns, run_ptr == nullptr ? 0 : run_ptr[num_clouds], own.begin, own.end);
       Records(*context, points, rows_of(cloud), mine, all + cloud * num_planes, competes + cloud * num_planes,
               num_planes, static_cast<float>(distance), floors[cloud], counts + cloud * num_planes)
           .find();
