@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from pcdata.errors import FrameError, IntrinsicsError, ShapeError
+from pcdata.errors import CaptureError, FrameError, IntrinsicsError, NonFiniteError, ShapeError
 from pcdata.io.sources.still_camera import same_camera
 from pcdata.structures import DepthFrame
 
@@ -45,8 +47,22 @@ def check_like(frame: DepthFrame, like: DepthFrame) -> None:
 
 
 def has_readings(depth: Tensor) -> bool:
-    """Say whether a pixel is not 0."""
-    return bool(np.any(depth.detach().numpy())) if depth.device.type == "cpu" else bool(depth.any())
+    """Say whether a pixel is not 0.
+
+    Raises:
+        NonFiniteError: NaN or infinite depth, which a capture cannot be made with, but changed to.
+        CaptureError: negative depth.
+    """
+    if depth.device.type == "cpu":  # NaN is the least and the largest wherever there is one
+        values = depth.detach().numpy()
+        least, largest = float(values.min()), float(values.max())
+    else:
+        least, largest = torch.stack(depth.aminmax()).tolist()
+    if not math.isfinite(least) or not math.isfinite(largest):
+        raise NonFiniteError("LivePipeline: depth has NaN or infinite values; 0 is the only mark for 'no reading'")
+    if least < 0:
+        raise CaptureError(f"LivePipeline: depth has negative values, down to {least:g} m")
+    return largest > 0
 
 
 def same_pixels(depth: Tensor, other: Tensor) -> bool:

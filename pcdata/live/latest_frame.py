@@ -141,14 +141,14 @@ class LatestFrame:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_JOIN)
 
-    def __iter__(self) -> Iterator[Any]:
-        """Yield every frame that is taken, until the stream ends."""
+    def __iter__(self) -> Iterator[Arrived]:
+        """Yield every frame that is taken, until the stream ends; raise as :meth:`take` does."""
         while True:
             try:
                 arrived = self.take()
             except StopIteration:
                 return
-            yield arrived.item
+            yield arrived
 
     def __enter__(self) -> LatestFrame:
         return self

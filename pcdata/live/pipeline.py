@@ -172,10 +172,11 @@ class LivePipeline:
                 frame = given
             else:
                 frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
+            is_empty = not has_readings(frame.depth)
         except Exception as error:
             fault = next((fault for kind, fault in _KINDS if isinstance(error, kind)), Fault.OTHER_FORM)
             return None, fault, str(error)
-        if not has_readings(frame.depth):
+        if is_empty:
             return None, Fault.EMPTY, "LivePipeline: not one pixel has a reading; is the lens covered?"
         if self._same_pixels and self._last is not None and same_pixels(frame.depth, self._last):
             return None, Fault.FROZEN, "LivePipeline: every pixel is that of the frame before; does the camera stream?"
