@@ -1,4 +1,7 @@
 // The convex hull of points in a plane.
+#include <algorithm>
+#include <limits>
+#include <numeric>
 #include <vector>
 
 #include "pc/threads.hpp"
@@ -37,8 +40,9 @@ class Hull {
   }
 
   // Walk round from the leftmost point; edges are divided at the point farthest outside, as the reference does.
-  int64_t run(int64_t count, int64_t first, int64_t last, Poll& poll, int64_t* corners) const {
-    const auto all = [](int64_t i) { return i; };
+  int64_t run(const std::vector<int64_t>& rows, int64_t first, int64_t last, Poll& poll, int64_t* corners) const {
+    const auto all = [&](int64_t i) { return rows[static_cast<size_t>(i)]; };
+    const auto count = static_cast<int64_t>(rows.size());
     std::vector<Edge> open;
     open.push_back(edge(last, first, count, all));
     open.push_back(edge(first, last, count, all));
@@ -63,6 +67,55 @@ class Hull {
   const double* points_;
 };
 
+std::vector<int64_t> every_row(int64_t count) {
+  std::vector<int64_t> rows(static_cast<size_t>(count));
+  std::iota(rows.begin(), rows.end(), int64_t{0});
+  return rows;
+}
+
+// Rows that may be corners, rising: all but those well inside of a polygon that some of the points make. Such a point
+// is not a corner of the hull, and farthest from no chord of it. Source: Akl & Toussaint, A fast convex hull algorithm,
+// Information Processing Letters 7(5), 1978.
+std::vector<int64_t> near_outline(const double* points, int64_t count) {
+  constexpr int64_t kFew = 512, kStep = 8;  // every eighth point tells as much of the outline
+  constexpr double kInside = 1e-9;          // of the outline's squared size: far above what rounding does
+  if (count < kFew) return every_row(count);
+  // The farthest points in eight directions, counterclockwise, as a polygon.
+  constexpr double kDirections[8][2] = {{1, 0}, {1, 1}, {0, 1}, {-1, 1}, {-1, 0}, {-1, -1}, {0, -1}, {1, -1}};
+  int64_t corner[8] = {};
+  double most[8];
+  std::fill_n(most, 8, -std::numeric_limits<double>::infinity());
+  for (int64_t i = 0; i < count; i += kStep)
+    for (int d = 0; d < 8; ++d) {
+      const double along = kDirections[d][0] * points[2 * i] + kDirections[d][1] * points[2 * i + 1];
+      if (along > most[d]) most[d] = along, corner[d] = i;
+    }
+  const double wide = most[0] + most[4], high = most[2] + most[6];
+  const double least = kInside * (wide * wide + high * high);
+  if (least == 0) return every_row(count);
+  double x[8], y[8], ex[8], ey[8];
+  for (int d = 0; d < 8; ++d) {
+    const double *from = points + 2 * corner[d], *to = points + 2 * corner[(d + 1) % 8];
+    x[d] = from[0], y[d] = from[1], ex[d] = to[0] - from[0], ey[d] = to[1] - from[1];
+  }
+  std::vector<int64_t> rows;
+  for (int64_t begin = 0; begin < count; begin += kFew) {
+    const auto some = static_cast<int>(std::min(kFew, count - begin));
+    double inside[kFew];  // the least of the distances from all edges, times their lengths
+    std::fill_n(inside, kFew, std::numeric_limits<double>::infinity());
+    for (int d = 0; d < 8; ++d) {
+      if (ex[d] == 0 && ey[d] == 0) continue;  // one point is the farthest in both directions
+      for (int i = 0; i < some; ++i) {
+        const double *p = points + 2 * (begin + i), cross = ex[d] * (p[1] - y[d]) - ey[d] * (p[0] - x[d]);
+        inside[i] = cross < inside[i] ? cross : inside[i];
+      }
+    }
+    for (int i = 0; i < some; ++i)
+      if (!(inside[i] > least)) rows.push_back(begin + i);
+  }
+  return rows;
+}
+
 }  // namespace
 }  // namespace pc::outline
 
@@ -73,10 +126,11 @@ PC_EXPORT int32_t pc_convex_hull(const pc_context* context, const double* points
   return guarded([&] {
     *num_corners = 0;
     if (count == 0) return;
+    const std::vector<int64_t> rows = near_outline(points, count);
     // The lowest of the leftmost points and the highest of the rightmost, each the first of equals.
-    int64_t first = 0, last = 0;
-    double left = points[0], bottom = points[1], right = points[0], top = points[1];
-    for (int64_t i = 1; i < count; ++i) {
+    int64_t first = rows[0], last = rows[0];
+    double left = points[2 * first], bottom = points[2 * first + 1], right = left, top = bottom;
+    for (const int64_t i : rows) {
       const double x = points[2 * i], y = points[2 * i + 1];
       if (x < left || (x == left && y < bottom)) first = i, left = x, bottom = y;
       if (x > right || (x == right && y > top)) last = i, right = x, top = y;
@@ -87,6 +141,6 @@ PC_EXPORT int32_t pc_convex_hull(const pc_context* context, const double* points
       return;
     }
     Poll poll(*context);
-    *num_corners = Hull(points).run(count, first, last, poll, corners);
+    *num_corners = Hull(points).run(rows, first, last, poll, corners);
   });
 }
