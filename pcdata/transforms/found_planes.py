@@ -36,8 +36,10 @@ def plane_hulls_in_cloud(cloud: PointCloud, b: int = 0) -> list[Tensor]:
     """
     cloud_from_source = torch.linalg.inv(cloud.source_from_cloud[b].cpu())
     hulls = []
+    mirrored = bool(torch.linalg.det(cloud_from_source[:3, :3]) < 0)
     for plane in cloud.meta[b].get("planes", []):
         corners = torch.tensor(plane["hull"], dtype=torch.float64, device="cpu").reshape(-1, 3)
+        corners = corners.flip(0) if mirrored else corners
         hulls.append(corners @ cloud_from_source[:3, :3].T + cloud_from_source[:3, 3])
     return hulls
 

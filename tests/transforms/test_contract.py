@@ -258,9 +258,11 @@ def test_a_plane_that_was_found_moves_along_and_comes_back(example):
         side = was.points.double() @ old[:3] + old[3]
         clear = side.abs() > 1e-3 * float(was.points.abs().max())
         assert torch.equal(off[clear] > 0, side[clear] > 0)
-        torch.testing.assert_close(
-            T.plane_hulls_in_cloud(result, b)[0], now.points[:3].double(), atol=1e-5 * scale, rtol=0
-        )
+        hull, corner = T.plane_hulls_in_cloud(result, b)[0], now.points[:3].double()
+        mirrored = bool(torch.linalg.det(result.source_from_cloud[b, :3, :3]) < 0)
+        torch.testing.assert_close(hull, corner.flip(0) if mirrored else corner, atol=1e-5 * scale, rtol=0)
+        around = torch.linalg.cross(hull[1] - hull[0], hull[2] - hull[0])
+        assert float(around @ new[:3]) > 0  # counterclockwise from where the normal points to
         back = T.planes_in_cloud(result.in_source_frame(), b)[0]
         expected = torch.tensor([*stored[b]["planes"][0]["normal"], stored[b]["planes"][0]["offset"]])
         torch.testing.assert_close(back, expected.double(), atol=1e-6, rtol=0)
