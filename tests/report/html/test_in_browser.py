@@ -198,3 +198,21 @@ def test_hostile_names_are_text_in_the_viewer(visit):
     tab = visit(cloud.show())
     assert tab.evaluate("window.hit") is None
     assert "<img src=x" in tab.locator("#counted").text_content()
+
+
+def test_several_pages_of_one_notebook_do_not_touch_each_other(browser, tmp_path, grid, steps):
+    outputs = "".join(f"<div>{page._repr_html_()}</div>" for page in (grid, steps, grid))
+    (tmp_path / "notebook.html").write_text(f"<!doctype html><meta charset='utf-8'>{outputs}", encoding="utf-8")
+    tab = browser.new_page(viewport={"width": 1000, "height": 2600})
+    heard: list[str] = []
+    tab.on("console", lambda message: heard.append(message.text))
+    tab.on("pageerror", lambda error: heard.append(str(error)))
+    tab.goto((tmp_path / "notebook.html").as_uri())
+    views = tab.frames[1:]
+    for view in views:
+        until(view, "Boolean(window.pcdata?.stage) && window.pcdata.stage.drawn > 0")
+    assert [view.locator("#counted").inner_text().split()[0] for view in views][::2] == ["25", "25"]
+    views[0].locator("#color").select_option("labels")
+    assert [view.locator("#color").input_value() for view in views] == ["labels", "colors", "colors"]
+    assert heard == []
+    tab.close()
