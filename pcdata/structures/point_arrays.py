@@ -79,7 +79,7 @@ def whole_labels(where: str, labels: NDArray[Any]) -> NDArray[np.int64]:
         raise CaptureError(f"{where}: a label must be one number per point, got {labels.shape[1]}")
     if labels.dtype.kind == "f" and not (np.isfinite(labels).all() and (labels == np.rint(labels)).all()):
         raise CaptureError(f"{where}: labels must be whole numbers, but some are not; rename the field if a score")
-    if labels.dtype.kind != "i" and len(labels) and not labels.max() < 2**63:
+    if labels.dtype.kind != "i" and len(labels) and not int(labels.max()) < 2**63:
         raise CaptureError(f"{where}: labels reach {labels.max()}, above what int64 holds")
     return labels.astype(np.int64)
 

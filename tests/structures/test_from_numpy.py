@@ -11,6 +11,7 @@ import torch
 from pcdata import Camera, DepthFrame, PointCloud, open_source, read_ply, write_capture, write_ply
 from pcdata.errors import (
     CaptureError,
+    ConfigError,
     DTypeError,
     IntrinsicsError,
     NonFiniteError,
@@ -220,3 +221,13 @@ POINTS = np.random.default_rng(1).uniform(0.1, 0.9, (30, 3))
 def test_a_cloud_that_would_be_silently_wrong_is_refused(given, error, message):
     with pytest.raises(error, match=message):
         PointCloud.from_numpy(**({"points": POINTS, "frame_id": "base"} | given))
+
+
+def test_labels_that_are_true_or_false_are_one_and_zero():
+    cloud = PointCloud.from_numpy(np.zeros((3, 3), np.float32), frame_id="base", labels=np.array([True, False, True]))
+    assert cloud.labels.tolist() == [1, 0, 1]
+
+
+def test_an_unknown_kind_is_told_with_those_that_there_are():
+    with pytest.raises(ConfigError, match=r"one of position, direction, invariant, minimum, not 'directon'; did you"):
+        PointCloud.from_numpy(np.zeros((3, 3)), frame_id="base", a=np.zeros(3), kinds={"a": "directon"})

@@ -31,6 +31,7 @@ _TAKEN = {
     "frame_id",
     "unit",
 }
+_MOST_CLOUDS = 1 << 24  # that a "batch" without a "ptr" may number, before memory is taken for so many
 _EDGES = ("edge_index", "edge_attr", "edge_weight", "adj_t")
 
 
@@ -62,6 +63,7 @@ def to_pyg(
     cloud = what.vertices if isinstance(what, SurfaceMesh) else what
     if not isinstance(cloud, PointCloud):
         raise DTypeError(f"{where}: takes a PointCloud or a SurfaceMesh, got {type(what).__name__}")
+    check_texts(where, "features", features)
     chosen_fields(where, cloud, fields)  # refuses what is not there
     present = cloud.fields()
     kept = {name: value for name, value in present.items() if fields is None or name in ("points", *fields)}
@@ -91,7 +93,6 @@ def to_pyg(
 
 
 def _features(where: str, present: Mapping[str, Tensor], names: Sequence[str]) -> Tensor | None:
-    check_texts(where, "features", names)
     if tuple(names) == ("colors",) and "colors" not in present:
         return None
     if missing := [name for name in names if name not in present]:
@@ -114,7 +115,7 @@ def from_pyg(
 
     ``pos`` are the points, ``normal`` (or ``norm``) the normals, ``x`` the colors where it has three columns in 0..1,
     else a field ``x``; whole numbers ``y`` of each point are the labels, ``y`` of each cloud a signal; other tensors
-    with a row for each point are fields. A tensor that needs no change is shared.
+    with a row for each point are fields, texts signals. A tensor that needs no change is shared.
 
     Args:
         data: of PyTorch Geometric; rows of a batch lie cloud by cloud, as its collate puts them.
@@ -150,9 +151,13 @@ def from_pyg(
     num_clouds = 1 if ptr is None else len(ptr) - 1
     tensors: dict[str, Tensor] = {"points": pos}
     signals: dict[str, Tensor] = {}
+    texts: dict[str, tuple[str, ...]] = {}
     for name, value in held.items():
         if not isinstance(value, Tensor):
-            continue  # texts and lists belong to the graph, not to its points
+            listed = (value,) if isinstance(value, str) else value
+            if isinstance(listed, (list, tuple)) and len(listed) == num_clouds:
+                texts |= {name: tuple(listed)} if all(isinstance(text, str) for text in listed) else {}
+            continue  # anything else belongs to the graph, not to its points
         has_rows = value.ndim > 0 and len(value) == len(pos)
         of_cloud = value.ndim > 0 and len(value) == num_clouds
         if known is not None and name in known.recorded_signals:
@@ -182,6 +187,8 @@ def from_pyg(
     )
     for name, value in signals.items():
         cloud = cloud.with_signal(name, value, "invariant")
+    for name, told in texts.items():
+        cloud = cloud if name in cloud.recorded_signals else cloud.with_signal(name, told, "text")
     if face is None:
         return cloud
     return SurfaceMesh(vertices=cloud, triangles=face.T.contiguous().to(torch.int64))
@@ -197,15 +204,23 @@ def _told(where: str, name: str, value: Any) -> str | None:
     if len(told) > 1:
         raise FrameError(f"{where}: the graphs are not of one {name}: {sorted(map(str, told))}; batch those of one")
     one = next(iter(told), None)
-    return None if one is None else str(one)
+    if one is not None and not isinstance(one, str):
+        raise FrameError(f"{where}: {name} of the data must be a text, got {one!r:.100}")
+    return one
 
 
 def _row_pointers(where: str, batch: Tensor | None, ptr: Tensor | None, num_points: int) -> Tensor | None:
     if ptr is None and batch is None:
         return None
     if ptr is None and batch is not None:
-        if len(batch) != num_points or bool((batch[1:] < batch[:-1]).any()):
+        is_whole = batch.ndim == 1 and not (batch.is_floating_point() or batch.is_complex())
+        if not is_whole or len(batch) != num_points or bool((batch[1:] < batch[:-1]).any()):
             raise ShapeError(f"{where}: batch must number the cloud of each of {num_points} points, in order")
+        if num_points and not 0 <= int(batch[0]) <= int(batch[-1]) < _MOST_CLOUDS:
+            raise ShapeError(
+                f"{where}: batch must number clouds from 0 on, at most {_MOST_CLOUDS}, got {int(batch[0])} .. "
+                f"{int(batch[-1])}"
+            )
         ptr = ptr_from_counts(torch.bincount(batch, minlength=1))
     assert ptr is not None
     if batch is not None and not torch.equal(cloud_of_rows(ptr), batch):

@@ -114,6 +114,15 @@ def test_features_are_chosen_and_found_again(pyg):
         pcdata.to_pyg(cloud, features="colors")
 
 
+def test_texts_of_each_cloud_are_signals(pyg):
+    clouds = PointCloud.cat([full_cloud(3).with_signal("task", (text,), "text") for text in ("pick", "place")])
+    batch = pcdata.to_pyg(clouds)
+    assert batch.task == ["pick", "place"]
+    assert pcdata.from_pyg(batch).signals["task"] == ("pick", "place")
+    assert pcdata.from_pyg(pcdata.to_pyg(clouds[1])).signals["task"] == ("place",)
+    check_same(pcdata.from_pyg(batch, like=clouds), clouds)
+
+
 def test_gradients_pass(pyg):
     points = torch.rand(5, 3, requires_grad=True)
     data = pcdata.to_pyg(PointCloud(points=points, frame_id="base"))
@@ -161,6 +170,13 @@ def test_what_cannot_be_a_cloud_is_refused(pyg):
         pcdata.from_pyg(data(pos=pos, other=torch.zeros(4)), frame_id="base")
     with pytest.raises(ShapeError, match="in order"):
         pcdata.from_pyg(data(pos=pos, batch=torch.tensor([1, 0, 0, 0, 1, 1])), frame_id="base")
+    for wrong in (torch.full((6,), -1), torch.zeros(6), torch.full((6,), 10**12), torch.zeros(6, 1, dtype=torch.long)):
+        with pytest.raises(ShapeError, match="batch must number"):
+            pcdata.from_pyg(data(pos=pos, batch=wrong), frame_id="base")
+    with pytest.raises(FrameError, match="must be a text"):
+        pcdata.from_pyg(data(pos=pos, frame_id=3))
+    with pytest.raises(DTypeError, match="features must be names"):
+        pcdata.to_pyg(full_cloud(), features=3)
     mixed = pyg.data.Batch.from_data_list([data(pos=pos, frame_id="a"), data(pos=pos, frame_id="b")])
     with pytest.raises(FrameError, match="not of one frame_id"):
         pcdata.from_pyg(mixed)
