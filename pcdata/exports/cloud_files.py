@@ -82,6 +82,7 @@ def write_clouds(
                     _FORMATS[to](partial / f"{place}.{to}", cloud, **options)
                     written += 1
             except PcdataError as error:
+                error.args = (str(error).replace(str(partial), str(folder)), *error.args[1:])  # as it would be called
                 add_note(error, f"sample {sample_id!r}", sample_id=sample_id)
                 raise
             except OSError as error:
