@@ -87,6 +87,7 @@ def test_folders_of_any_name_serve_every_command(capsys, tmp_path, name):
     assert command("report", at, "--out", f"{out}/report.html", "--samples", "1")[0] == 0
     assert command("evaluate", f"{at}/labels", f"{at}/labels", "--json", f"{out}/evaluate.json")[0] == 0
     assert command("convert", at, "--to", "folder", "--out", f"{out}/converted")[0] == 0
+    assert command("clouds", at, "--out", f"{out}/clouds", "--quality", "labels")[0] == 0
     code, said = command("build", str(tmp_path / "build.yaml"), "--source", at, "--out", f"{out}/set")
     assert code == 0, said
     assert command("report", f"{out}/set", "--out", f"{out}/set.html")[0] == 0
