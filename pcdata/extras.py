@@ -41,6 +41,7 @@ EXTRAS = {
         _Extra("fsspec", "remote", "datasets at a URL"),
         _Extra("s3fs", "remote", "datasets at s3://"),
         _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
+        _Extra("rerun", "rerun", "logs for Rerun's viewer (pcdata view --rerun)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
         _Extra("open3d", "open3d", "global alignment, and handing clouds, meshes and cameras to Open3D and back"),
         _Extra("torch_geometric", "pyg", "handing clouds to PyTorch Geometric and back"),

@@ -13,7 +13,10 @@ import tomllib
 from pcdata import extras
 from pcdata.errors import MissingExtraError
 
-PACKAGES = {"cv2": "opencv_python_headless"}  # where the package bears another name than the module
+PACKAGES = {
+    "cv2": "opencv_python_headless",
+    "rerun": "rerun_sdk",
+}  # where it is no module
 PYPROJECT = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())
 
 

@@ -72,14 +72,20 @@ def stage_of(
     packed.said["total"] = cloud.num_points if total is None else total
     low, high = _bounds(cloud)
     extent = float(np.linalg.norm(high - low)) or 1.0
-    lines = [*_axes(extent), *_frusta(cloud, extent), *_planes(cloud), *_objects(cloud)]
-    if isinstance(step, CropWorkspace) and step.frame == cloud.frame_id:
-        lines.append(_box("workspace", "#8e4ec6", np.array(step.lower), np.array(step.upper)))
+    lines = [*_axes(extent), *_frusta(cloud, extent), *_objects(cloud), *surroundings(cloud, step)]
     if grasps is not None and len(grasps):
         lines.append(_forks(grasps.detach().cpu().double().numpy()))
     packed.said["up"] = _up(cloud)
     packed.said["view"] = _view(cloud, low, high)
     return Stage(caption, packed, tuple(lines))
+
+
+def surroundings(cloud: PointCloud, step: Transform | None = None) -> list[Lines]:
+    """Return the outlines of the planes that were found in a cloud, and the box of the crop that made it."""
+    lines = _planes(cloud)
+    if isinstance(step, CropWorkspace) and step.frame == cloud.frame_id:
+        lines.append(_box("workspace", "#8e4ec6", np.array(step.lower), np.array(step.upper)))
+    return lines
 
 
 def stages_of(
