@@ -92,7 +92,7 @@ EXAMPLES: dict[str, list[Example]] = {
         ),
         *_of(
             T.ClusterObjects(eps=0.1, by="image", min_area=1e-5, max_area=50.0, keep="all"),
-            T.ClusterObjects(eps=0.1, by="image", min_size=1, keep="all", split_touching=True),
+            T.ClusterObjects(eps=0.1, by="image", min_size=1, keep="all", split_touching=True, use_color=True),
             make=_organized,
         ),
     ],

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pcdata.functional.image_grid import ImageGrid, is_lined
 from pcdata.functional.rows import ptr_from_counts, transform_points
+from pcdata.functional.touching.colors import with_colors
 from pcdata.functional.touching.contacts import region_contacts
 from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import REASONS, Objects, join_hollows, join_occluded, merge_weak_contacts
@@ -50,6 +51,7 @@ def separate_objects(
     *,
     height: Tensor | None = None,  # (N,) metres above the table
     noise: float | None = None,
+    colors: Tensor | None = None,  # (N, 3) float in [0, 1]
     limits: Limits | None = None,
     backend: str = "auto",
 ) -> Separation:
@@ -64,13 +66,14 @@ def separate_objects(
         grid: the image they lie on.
         height: above the table; without it bowls and cups may come apart into their inside and their wall.
         noise: standard deviation of 1/z, in 1/m, as measured on a table; None = from second differences of the points.
+        colors: of the points, which make contacts stronger or weaker; None = geometry alone.
         limits: the numbers of the method; None = those of :mod:`pcdata.functional.touching.limits`.
         backend: which body of the pixel operations to run.
     """
     limits = limits or Limits()
     if len(points) == 0:
         return Separation(grid.pixel_index.new_zeros(0), noise or KINECT_NOISE, 0, (), ())
-    objects, region = regions_of(points, grid, height, noise, limits, backend)
+    objects, region = regions_of(points, grid, height, noise, limits, backend, colors)
     merge_weak_contacts(objects)
     join_hollows(objects)
     join_occluded(objects)
@@ -94,7 +97,13 @@ def separate_objects(
 
 
 def regions_of(
-    points: Tensor, grid: ImageGrid, height: Tensor | None, noise: float | None, limits: Limits, backend: str
+    points: Tensor,
+    grid: ImageGrid,
+    height: Tensor | None,
+    noise: float | None,
+    limits: Limits,
+    backend: str,
+    colors: Tensor | None,
 ) -> tuple[Objects, Tensor]:
     """Cut one image into smooth regions, each an object of its own as yet; also return the region (N,) of points."""
     inverse, camera, pixel = _image(points, grid)
@@ -108,6 +117,10 @@ def regions_of(
         heights.view(-1)[pixel] = height.double()
     regions = smooth_regions(inverse, camera, noise, limits, backend=backend)
     contacts = region_contacts(inverse, regions.label, camera, noise, limits, backend=backend)
+    if colors is not None:
+        image = torch.zeros(inverse.numel(), 3, dtype=torch.float64, device=points.device)
+        image[pixel] = colors.double()
+        contacts = with_colors(contacts, regions.label, image)
     scene = Scene(inverse, regions.label, regions.normals, heights, contacts, camera, noise)
     return Objects(scene), regions.label.view(-1)[pixel]
 

@@ -42,6 +42,7 @@ def separate_views(
     *,
     height: Tensor | None = None,  # (N,) metres above the table
     noise: float | None = None,
+    colors: Tensor | None = None,  # (N, 3) float in [0, 1]
     limits: Limits | None = None,
     backend: str = "auto",
 ) -> Separation:
@@ -59,6 +60,7 @@ def separate_views(
         views: of a row at most one knows it; rows of none take the object of their cell.
         height: above the table; without it bowls and cups may come apart into their inside and their wall.
         noise: as there; None = estimated view by view.
+        colors: as there.
         limits: as there.
         backend: as there.
     """
@@ -71,7 +73,8 @@ def separate_views(
         if not len(rows):
             continue
         own_height = None if height is None else height[rows]
-        objects, own = regions_of(points[rows], grid, own_height, noise, limits, backend)
+        own_colors = None if colors is None else colors[rows]
+        objects, own = regions_of(points[rows], grid, own_height, noise, limits, backend, own_colors)
         region[rows] = torch.where(own >= 0, own + evidence.num_regions, -1)
         view_of_row[rows] = number
         evidence.add(objects)
