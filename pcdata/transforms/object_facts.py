@@ -77,8 +77,9 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
     plane = _base(own, up, points)
     axes = plane_axes(plane)
     found = []
-    areas = seen_areas(own.points, own.labels, int(labels.max()) + 1 if len(labels) else 0, own.image_grid())
-    for label in torch.unique(labels).tolist():
+    names, number = own.labels.unique(return_inverse=True)  # labels may be any numbers
+    areas = seen_areas(own.points, torch.where(labeled, number, -1), len(names), own.image_grid())[names >= 0]
+    for label, area in zip(torch.unique(labels).tolist(), areas.tolist(), strict=True):
         rows = points[labels == label]
         height = rows @ plane[:3] + plane[3]
         flat = rows @ axes
@@ -96,7 +97,7 @@ def describe_objects(cloud: PointCloud, b: int = 0, *, up: Tensor | None = None)
             ObjectFacts(
                 label=label,
                 num_points=len(rows),
-                area=float(areas[label]),
+                area=area,
                 centroid=rows.mean(0),
                 height=high,
                 box=box,

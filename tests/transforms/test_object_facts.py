@@ -85,6 +85,19 @@ def test_a_block_that_leans_has_a_tight_box_of_its_own_size():
     assert found.volume == pytest.approx(0.2 * 0.08 * 0.1, rel=0.08)
 
 
+def test_labels_may_be_any_numbers_and_objects_single_points():
+    block = turned_block(10)
+    labels = torch.full((len(block),), 2**40)
+    labels[:3] = torch.tensor([-1, 5, -7])
+    cloud = PointCloud(points=block, labels=labels, frame_id="base")
+    single, whole = describe_objects(cloud, up=UP)
+    assert (single.label, whole.label) == (5, 2**40)
+    assert (single.num_points, single.volume, single.area) == (1, 0.0, 0.0)
+    assert single.tight_size.tolist() == [0.0, 0.0, 0.0]
+    assert whole.area == pytest.approx(0.2 * 0.08 + 2 * 0.1 * (0.2 + 0.08), rel=0.15)  # no bottom
+    assert describe_objects(cloud.with_fields(labels=torch.full((len(block),), -1)), up=UP) == []
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_no_turned_rectangle_is_smaller(seed):
     points = torch.randn(40, 2, generator=seeded(seed)) * torch.tensor([1.0, 0.4])
