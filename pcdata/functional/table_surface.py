@@ -14,6 +14,7 @@ from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_length, checked_positive
 from pcdata.errors import ConfigError, NoPlaneError, ShapeError
 from pcdata.functional.clusters import dbscan
+from pcdata.functional.enclosed import enclosed_points
 from pcdata.functional.image_clusters import linked_pixels
 from pcdata.functional.image_grid import ImageGrid, checked_grid, is_lined
 from pcdata.functional.neighbors import knn
@@ -34,7 +35,8 @@ _EXCHANGES = [
 class TableSurface(NamedTuple):
     """What :func:`table_surface` found in B clouds of N points."""
 
-    table: Tensor  # (N,) bool: the points of the table itself, and crumbs
+    table: Tensor  # (N,) bool: the points of the table itself, and crumbs; none where no table was measured
+    below: Tensor  # (N,) bool: the points under the table, or under the plane as given
     flat: Tensor  # (N,) bool: those of them within its noise, which hull and planes are made of
     height: Tensor  # (N,) float32 above its surface, on the side that the normal points to
     noise: Tensor  # (B,) float64 standard deviation of height at the table's median distance from the viewpoint
@@ -139,12 +141,14 @@ def table_surface(
     suspected to stand on the table where the median height of the points around it (the 3 x 3 pixels of ``grid``, else
     the 9 nearest) exceeds ``cut`` times the noise there. Connected suspects are something where they cover at least
     ``min_size`` squared at more than ``min_height`` times the noise; the rest is an edge, a crumb or a reflection, and
-    counts as table. So does what is below it, unless by more than ``distance`` and, by medians, than the cut.
+    counts as table. So does what is below it, unless by more than ``distance`` and, by medians, than the cut. With a
+    ``grid``, what something encloses is a part of it, as the floor of a bowl: see :func:`enclosed_points`.
 
     A measured surface is not believed where half of what lies within its noise is clutter that crosses it, or where the
     noise is more than a depth camera has: 2 % of the way to it, ``max_noise``, or ``distance`` itself where the
-    viewpoint is not known. Then the table is what is nearer than ``distance`` to the plane as given, on both sides;
-    heights are over that plane, and its noise is NaN.
+    viewpoint is not known. No table hides what crosses it on both sides, so what lies there is not one: no point is the
+    table's. Then ``flat`` is what is nearer than ``distance`` to the plane as given and ``below`` what is farther under
+    it; heights are over that plane, and its noise is NaN.
 
     Args:
         points: the clouds, in any unit of length.
@@ -194,7 +198,9 @@ def table_surface(
     spread = torch.cat([fit.noise * reach[start:stop] for fit, (start, stop) in zip(fits, _bounds(ptr))])
     rise = window_medians((heights / spread).float(), points, ptr, grid, backend=backend)
     something = _standing(points, ptr, rise, cut, min_height, min_size, grid, 5 * distance, backend)
-    below = (rise < -cut) & (heights < -distance)
+    if grid is not None:
+        something |= enclosed_points(something, rise, min_height, ptr, grid, backend=backend)
+    below = ~something & (rise < -cut) & (heights < -distance)
     table = ~(something | below)
     flat = table & (heights.abs() < cut * spread)
     if not bool(believed.all()):
@@ -203,14 +209,16 @@ def table_surface(
         nx, ny, nz, offset = planes[cloud].unbind(1)
         over_plane = ((nx * x + ny * y) + nz * z) + offset
         heights = torch.where(believed[cloud], heights, over_plane)
-        table = torch.where(believed[cloud], table, over_plane.abs() < distance)
-        flat = torch.where(believed[cloud], flat, table)
+        table &= believed[cloud]
+        below = torch.where(believed[cloud], below, over_plane <= -distance)
+        flat = torch.where(believed[cloud], flat, over_plane.abs() < distance)
     refitted = fit_planes(points, ptr, flat, backend=backend).to(points.device)
     # Those of a line stay, and those that are not believed.
     refitted = torch.where(believed[:, None] & ~refitted[:, :1].isnan(), refitted, planes)
     turned = (refitted[:, :3] * planes[:, :3]).sum(1, keepdim=True) < 0
     return TableSurface(
         table,
+        below,
         flat,
         heights.float(),
         torch.where(believed, sigmas * typical, math.nan),

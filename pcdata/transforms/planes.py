@@ -46,7 +46,7 @@ class TiltedPlaneWarning(PcdataWarning):
 
 
 class UnmeasuredTableWarning(PcdataWarning):
-    """A table whose own noise could not be measured, so it was cut as a slab."""
+    """A plane about which no table could be measured, so nothing was cut from it."""
 
 
 class RemovePlane(RemoveTransform):
@@ -76,13 +76,13 @@ class RemovePlane(RemoveTransform):
 
     Warns:
         TiltedPlaneWarning: the plane leans away from up by more than ``tilt_alarm``.
-        UnmeasuredTableWarning: what lies about the plane is no table that could be measured, so it is cut as a slab;
+        UnmeasuredTableWarning: what lies about the plane is no table that could be measured, so none of it goes;
             ``meta["planes"]`` and the history tell so.
     """
 
     runs_statistics = True
     decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
-    version = 4
+    version = 5
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000
@@ -137,14 +137,17 @@ class RemovePlane(RemoveTransform):
         )
         names = ("noise", "disparity_noise", "believed")
         found = {name: getattr(surface, name) for name in names}
-        return {**self._apart(data, surface.planes, surface.flat, surface.table, surface.height), **found}
+        gone = surface.table
+        if self.keep != "both":
+            gone = gone | surface.below
+        return {**self._apart(data, surface.planes, surface.flat, gone, surface.height), **found}
 
     def _apart(
         self,
         data: PointCloud,
         planes: Tensor,
         own: Tensor,  # (N,) points of the plane itself
-        gone: Tensor | None = None,  # (N,) what goes with them; None = they alone
+        gone: Tensor | None = None,  # (N,) what goes, with what is below if that must go; None = they alone
         height: Tensor | None = None,
     ) -> Params:
         """Say which rows stay beside the points of each cloud's plane, by their height above it."""
@@ -155,7 +158,7 @@ class RemovePlane(RemoveTransform):
             if height is None:
                 plane = planes.double()[cloud_of_rows(data.ptr)]
                 height = (plane[:, :3] * data.points).sum(1) + plane[:, 3]
-            keep &= height > 0
+                keep &= height > 0
             if self.max_height is not None:
                 keep &= height <= self.max_height
         if self.keep == "over":
@@ -245,23 +248,23 @@ class RemovePlane(RemoveTransform):
                 if name in params and math.isfinite(value := float(params[name][b])):
                     found[name] = value
             if "believed" in params:
-                found["cut"] = self.cut if bool(params["believed"][b]) else "slab"
-                self._warn_of_slab(data, b, found["cut"])
+                found["cut"] = self.cut if bool(params["believed"][b]) else "nothing"
+                self._warn_of_no_table(data, b, found["cut"])
             if self.up is not None:
                 found["tilt"] = self._tilt(plane)
                 self._warn_of_tilt(data, b, found["tilt"])
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
         return super().transform(data, params).with_meta(entries)
 
-    def _warn_of_slab(self, data: PointCloud, b: int, cut: str) -> None:
+    def _warn_of_no_table(self, data: PointCloud, b: int, cut: str) -> None:
         """Say that the table could not be measured."""
         if cut == self.cut:
             return
         warnings.warn(
             f"RemovePlane: cloud {b}{sample_name(data, b)}: cut='measured' found no table to measure: what lies about "
-            "the plane is clutter, or noisier than a depth camera is, so all that is closer to it than "
-            f"distance={self.distance:g} went instead; crop to the table before, or say which plane it is by up and "
-            "max_tilt",
+            "the plane goes on through it, or is noisier than a depth camera is, so none of it was removed; crop to "
+            "the table before, say which plane it is by up and max_tilt, or cut='slab' to remove all that is closer "
+            f"than distance={self.distance:g}",
             UnmeasuredTableWarning,
             stacklevel=2,
         )
