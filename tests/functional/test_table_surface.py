@@ -151,11 +151,13 @@ def test_clutter_that_crosses_a_table_is_not_its_noise():
     assert 0.0018 < float(found.noise[0]) < 0.004
 
 
-def test_a_surface_that_is_mostly_clutter_is_not_believed_and_the_plane_is_taken_as_given():
+def test_a_surface_that_is_mostly_clutter_is_not_believed_and_none_of_it_is_the_table():
     points = with_clutter(60_000, 60_000)
     found = table_surface(points, planes=LEVEL)
     assert not bool(found.believed[0])
-    assert bool((found.table == (points[:, 2].abs() < 0.01)).all())
+    assert not bool(found.table.any())
+    assert torch.equal(found.flat, points[:, 2].abs() < 0.01)
+    assert torch.equal(found.below, points[:, 2] <= -0.01)
     assert torch.equal(found.height, points[:, 2])
     assert torch.equal(found.planes, LEVEL)
     assert bool(found.noise.isnan().all())

@@ -148,22 +148,35 @@ def join_hollows(objects: Objects) -> None:
                     continue
                 own, beside = objects.contact_pixels(regions, objects.object_of[one])
                 behind = float((depth[beside] - depth[own]).median())
-                touches_at = float(height[beside].median())
                 part = faces[other]
                 is_below = part.top < rim + _RIM
                 is_inside = part.hollow[0] > _NOT_CONVEX and abs(behind) < _WITHIN and is_below
-                is_wall = (
-                    part.hollow[0] <= _HOLLOW_RISE
-                    and behind < 0
-                    and touches_at > part.top - _RIM
-                    and abs(part.top - rim) < _WALL_RIM
-                )
+                is_wall = any(_is_wall(objects, pair, objects.object_of[one], rim, depth, height) for pair in regions)
                 if not (is_inside or is_wall or (is_below and part.area < _SLIVER)):
                     continue
                 seen.add(other)
                 objects.join(start, other, "hollow")
                 if is_inside:
                     todo.append(other)
+
+
+def _is_wall(
+    objects: Objects, pair: tuple[int, int], inside: int, rim: float, depth: torch.Tensor, height: torch.Tensor
+) -> bool:
+    """Say whether of two regions in contact, one of object ``inside``, the other meets it at the rim, not behind it.
+
+    Not the other's object as a whole: other parts of the wall may have joined it already.
+    """
+    own, beside = objects.contact_pixels([pair], inside)
+    if len(own) < _CONTACT_PIXELS:
+        return False
+    part = objects.face([pair[1] if objects.object_of[pair[0]] == inside else pair[0]])
+    return (
+        part.hollow[0] <= _HOLLOW_RISE
+        and abs(part.top - rim) < _WALL_RIM
+        and float((depth[beside] - depth[own]).median()) < objects.scene.noise * float(depth[own].median()) ** 2
+        and float(height[beside].median()) > part.top - _RIM
+    )
 
 
 def join_occluded(objects: Objects) -> None:
