@@ -30,7 +30,8 @@ def enclosed_points(
     A table is seen around what stands on it. A patch that is nowhere connected to it, over pixels of the table and such
     without a point, is the floor of something hollow, even where it is too low to be told from the table by height.
     That something rises from it, on a quarter of the border at least, parts it from a table that is seen through a
-    handle. Where the table itself is enclosed, by the walls of a bin, nothing is marked: its floor may come in pieces.
+    handle. The floor of a bin may come in pieces too: nothing is marked where the table itself is enclosed, or what
+    encloses a patch goes on beyond the image.
 
     Args:
         something: the points that stand on the table.
@@ -51,9 +52,12 @@ def enclosed_points(
         window = _window(wall)
         part = _parts(~wall[window], backend)
         row, column = ((part != part[0, 0]) & ~wall[window]).nonzero().unbind(1)
+        if not len(row):
+            continue
         number = part[row, column]
+        edge = _at_edge(wall, backend)
         row, column = row + (window[0].start - 1), column + (window[1].start - 1)
-        found = _floors(row, column, number, own, rise[start:stop], foot, pixel, grid.size[1])
+        found = _floors(row, column, number, own, rise[start:stop], foot, pixel, edge)
         enclosed[start:stop][found] = True
     return enclosed
 
@@ -66,9 +70,10 @@ def _floors(
     rise: Tensor,
     foot: float,
     pixel: Tensor,
-    width: int,
+    edge: Tensor,  # (H, W) bool: what stands there goes on beyond the image
 ) -> Tensor:  # rows of points of patches that are floors
     """Tell floors of hollow things from what is seen through handles."""
+    width = edge.shape[1]
     own = _rows(row, column, pixel, width)
     there = own >= 0
     there &= ~something[own]
@@ -77,13 +82,21 @@ def _floors(
     sizes = torch.bincount(number)
     if not len(own) or int(sizes.max()) > int((~something).sum()) - len(own):
         return own[:0]
-    border, walls = sizes.new_zeros(len(sizes)), sizes.new_zeros(len(sizes))
+    border, walls, cut = (sizes.new_zeros(len(sizes)) for _ in range(3))
     for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         beside = _rows(row + down, column + right, pixel, width)
         stands = (beside >= 0) & something[beside]
         border += torch.bincount(number[stands], minlength=len(sizes))
         walls += torch.bincount(number[stands & (rise[beside] < foot)], minlength=len(sizes))
-    return own[((border > 0) & (walls >= _LEAST_WALL * border))[number]]
+        cut += torch.bincount(number[stands & edge.flatten()[pixel[beside]]], minlength=len(sizes))
+    return own[((border > 0) & (walls >= _LEAST_WALL * border) & (cut == 0))[number]]
+
+
+def _at_edge(wall: Tensor, backend: str) -> Tensor:
+    """Mark what is connected to the edge of the image, given with a margin of one pixel, which is left out."""
+    part = _parts(wall, backend)[1:-1, 1:-1]
+    touching = torch.cat([part[0], part[-1], part[:, 0], part[:, -1]]).unique()
+    return torch.isin(part, touching[touching >= 0])
 
 
 def _rows(row: Tensor, column: Tensor, pixel: Tensor, width: int) -> Tensor:

@@ -292,7 +292,9 @@ EXAMPLES = [
     Example("spatial_filter", disparity_alone, ("row",), {"delta": 0.3}),
     Example("statistical_outlier_mask", one_cloud, ("row",), {"num_neighbors": 6, "std_ratio": 1.0}),
     Example("supporting_plane", one_cloud, ("cloud", "row"), {"num_hypotheses": 50, "distance": 0.005}),
-    Example("table_surface", with_a_plane, ("row", "row", "row", "row", *("cloud",) * 4), {"viewpoint": (0.1, 0.1, 1.0)}),
+    Example(
+        "table_surface", with_a_plane, ("row", "row", "row", "row", *("cloud",) * 4), {"viewpoint": (0.1, 0.1, 1.0)}
+    ),
     Example("undistort_depth", lens_depth, ("row", "row"), {"rule": "surface", "max_jump": 0.3}),
     Example("undistort_image", lens_image, ("row", "row"), {"size": (7, 30)}),
     Example("voxel_downsample", one_cloud, ("row", "ptr", "group"), {"voxel_size": 0.04}),
