@@ -64,3 +64,5 @@ LEVELS = 24
 NORMAL_PIXELS = (3, 14)
 CREASE_PIXELS = (2, 12)
 CONTACT_PIXELS = (5, 16)
+# Steps that a jump may be smoothed over: stereo matching by windows makes ramps of a dozen.
+RAMP = 12

@@ -14,6 +14,7 @@ from pcdata.functional.touching.contacts import region_contacts
 from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import REASONS, Objects, join_hollows, join_occluded, merge_weak_contacts
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
+from pcdata.functional.touching.ramps import sharpened
 from pcdata.functional.touching.regions import PixelCamera, smooth_regions
 
 _NOISE_STEP = 3  # pixels: neighbors share noise, and whole steps of the sensor
@@ -111,6 +112,7 @@ def regions_of(
         noise = _measured_noise(inverse)
     # Nor is more told apart than pixels show: on a surface that leans by 45 degrees 1/z changes by as much in one.
     noise = max(noise, float(inverse[inverse > 0].median()) / camera.fx)
+    inverse = sharpened(inverse, camera, noise, limits)
     heights = None
     if height is not None:
         heights = torch.zeros_like(inverse)
