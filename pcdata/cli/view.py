@@ -32,8 +32,7 @@ def add_to(commands: Any) -> None:
 
 def _view(arguments: argparse.Namespace) -> int:
     from pcdata.build import load_config
-    from pcdata.datasets import CachedCloudDataset
-    from pcdata.report.html.dataset_report import StoredClouds
+    from pcdata.datasets.stored_clouds import StoredClouds
     from pcdata.report.serving.samples import Samples
     from pcdata.report.serving.server import ViewServer
 
@@ -45,7 +44,7 @@ def _view(arguments: argparse.Namespace) -> int:
         _open(arguments, address)
         return 0
     if is_dataset(arguments):
-        source: Any = StoredClouds(CachedCloudDataset(path, augment=None))
+        source: Any = StoredClouds(path)
     else:
         source = open_captures(arguments.path, arguments, limit=arguments.limit)
     pipeline = None if arguments.config is None else load_config(arguments.config).pipeline

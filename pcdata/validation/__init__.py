@@ -2,6 +2,7 @@
 
 from pcdata.validation.capture_check import CHECKS, Check, register_check
 from pcdata.validation.capture_limits import CaptureLimits
+from pcdata.validation.comparison import Comparison, Difference, Measured, compare_sources
 from pcdata.validation.drift import measure_drift
 from pcdata.validation.drift_result import CameraDrift, DriftLimits, DriftPoint, DriftResult
 from pcdata.validation.grading import Grade, Grading
@@ -18,11 +19,14 @@ __all__ = [
     "CameraOverlap",
     "CaptureLimits",
     "Check",
+    "Comparison",
+    "Difference",
     "DriftLimits",
     "DriftPoint",
     "DriftResult",
     "Grade",
     "Grading",
+    "Measured",
     "ObjectScore",
     "OverlapLimits",
     "OverlapResult",
@@ -31,6 +35,7 @@ __all__ = [
     "SegmentationScores",
     "Summary",
     "check_of_error",
+    "compare_sources",
     "mean_scores",
     "measure_drift",
     "register_check",

@@ -8,11 +8,10 @@ from typing import Any
 
 import yaml
 
-from pcdata.datasets import CachedCloudDataset
+from pcdata.datasets.stored_clouds import StoredClouds
 from pcdata.io.store.manifest import Manifest
 from pcdata.report.html.capture_report import page_of_captures
 from pcdata.report.html.gathering import NUM_SHOWN, Gathered, Known, Progress, gather_captures
-from pcdata.structures import Episode, PointCloud
 from pcdata.validation.grading import Grading
 from pcdata.verdicts import Finding, Verdict
 
@@ -39,36 +38,14 @@ def gather_dataset(
     folder: str | Path, *, num_shown: int = NUM_SHOWN, title: str = "", progress: Progress | None = None
 ) -> Gathered:
     """Judge every stored cloud of a dataset, and look at some; arguments and errors as :func:`dataset_page`."""
-    dataset = CachedCloudDataset(folder, augment=None)
+    stored = StoredClouds(folder)
     return gather_captures(
-        StoredClouds(dataset),
+        stored,
         num_shown=num_shown,
-        title=title or str(dataset),
+        title=title or str(stored),
         progress=progress,
-        known=_known(dataset.manifest),
+        known=_known(stored.manifest),
     )
-
-
-class StoredClouds:
-    """The stored clouds as a source."""
-
-    name = "dataset"
-
-    def __init__(self, dataset: CachedCloudDataset) -> None:
-        self._dataset = dataset
-        self.ids = list(dataset.ids)
-        self._places = {sample_id: place for place, sample_id in enumerate(self.ids)}
-        self.episodes: list[Episode] = dataset.episodes
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def load(self, sample_id: str) -> PointCloud:
-        """Return the cloud as it was stored."""
-        return self._dataset[self._places[sample_id]]
-
-    def __repr__(self) -> str:
-        return repr(self._dataset)
 
 
 def _known(manifest: Manifest) -> Known:
