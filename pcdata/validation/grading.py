@@ -7,6 +7,7 @@ and in which episodes.
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -147,6 +148,16 @@ class Grading:
         """The trends that warn or fail, worst first; of as bad ones those of more captures."""
         bad = [trend for trend in self.trends.values() if trend.verdict.severity >= Verdict.WARN.severity]
         return sorted(bad, key=lambda trend: (-trend.verdict.severity, -len(trend.where_worst())))
+
+    def faults_at(self, place: int) -> list[str]:
+        """Name the checks, each with its view, that warn or fail of one capture, the worst first."""
+        named = []
+        for trend in self.faults():
+            row = bisect_left(trend.places, place)
+            if row < len(trend.places) and trend.places[row] == place:
+                named.append((trend.verdicts[row], " ".join(filter(None, [trend.name, self.name_of(trend.view)]))))
+        bad = [one for one in named if one[0] >= Verdict.WARN.severity]
+        return [name for _, name in sorted(bad, key=lambda one: -one[0])]
 
     def name_of(self, view: int | None) -> str:
         """What the page and the text call a view; nothing where it is the whole."""

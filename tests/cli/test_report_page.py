@@ -59,7 +59,7 @@ def test_what_is_wrong_comes_first(capsys, frozen, tmp_path):
     body = page.read_text(encoding="utf-8").split("<main>")[1]
     assert body.index('class="grade F"') < body.index("repeated_depth") < body.index("<canvas")
     assert body.index("What to do:") < body.index("<canvas")
-    first = re.search(r'data-sample="0">(\w+)<', body)
+    first = re.search(r'data-sample="0">show (\w+)<', body)
     assert first is not None
     assert first[1] == "f1"  # the worst is shown first
 

@@ -77,8 +77,11 @@ def _categories(values: NDArray[np.int64]) -> Coloring:
 
 def _ramp(values: NDArray[np.float64]) -> Coloring:
     # From the 1st to the 99th percentile: one stray point does not take all the colors.
-    low, high = np.quantile(values, [0.01, 0.99]).tolist() if len(values) else (0.0, 1.0)
-    return Coloring(viridis((values - low) / ((high - low) or 1.0)).astype(np.float64), span=(low, high))
+    there = np.isfinite(values)
+    low, high = np.quantile(values[there], [0.01, 0.99]).tolist() if there.any() else (0.0, 1.0)
+    colors = viridis((values - low) / ((high - low) or 1.0)).astype(np.float64)
+    colors[~there] = _bytes(NONE)
+    return Coloring(colors, span=(low, high))
 
 
 def _bytes(color: str) -> list[int]:

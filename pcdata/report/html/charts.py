@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.report.html.text import shown
 
-_ROW = 24
 VERDICT_COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
+_SERIES_COLORS = ("#4269d0", "#efb118", "#ff725c", "#3ca951", "#a463f2", "#6cc5b0", "#ff8ab7", "#9c6b4e")
 
 
-def bars(rows: Sequence[tuple[str, float, str]], *, width: int = 720) -> str:  # name, value, what stands beside it
-    """Bars from left to right, one below another, all from 0."""
+def bars(rows: Sequence[tuple[str, float, str]]) -> str:  # name, value, what stands beside it
+    """Bars from left to right, one below another, all from 0; as wide as the page."""
     most = max((value for _, value, _ in rows), default=0) or 1
-    left, right = 260, 200
-    drawn = []
-    for place, (name, value, told) in enumerate(rows):
-        y = place * _ROW
-        length = (width - left - right) * value / most
-        drawn.append(
-            f'<text x="{left - 8}" y="{y + 16}" text-anchor="end">{shown(name, 40)}</text>'
-            f'<rect x="{left}" y="{y + 4}" width="{length:.1f}" height="16" fill="#4269d0"/>'
-            f'<text x="{left + length + 6:.1f}" y="{y + 16}">{shown(told)}</text>'
-        )
-    return _svg(width, _ROW * len(rows), "".join(drawn))
+    drawn = [
+        f"<span>{shown(name, 60)}</span><span>{shown(told)}</span>"
+        f'<span class="bar-track"><i style="width:{100 * value / most:.1f}%"></i></span>'
+        for name, value, told in rows
+    ]
+    return f'<div class="bars">{"".join(drawn)}</div>'
 
 
 def histogram(values: NDArray[np.floating], unit: str, *, bins: int = 40, width: int = 340, height: int = 110) -> str:
@@ -35,59 +31,160 @@ def histogram(values: NDArray[np.floating], unit: str, *, bins: int = 40, width:
     if not len(finite):
         return '<p class="dim">no numbers</p>'
     counts, edges = np.histogram(finite, bins=bins)
-    bar = width / bins
-    scale = (height - 20) / max(int(counts.max()), 1)
-    drawn = "".join(
-        f'<rect x="{place * bar:.1f}" y="{height - 20 - count * scale:.1f}" width="{max(bar - 1, 1):.1f}" '
+    ends = f'<text x="0" y="{height - 4}">{edges[0]:.3g} {shown(unit)}</text>' + (
+        f'<text x="{width}" y="{height - 4}" text-anchor="end">{edges[-1]:.3g} {shown(unit)}</text>'
+    )
+    return _svg(width, height, _columns(counts, width, height - 20) + ends)
+
+
+def bins(counts: NDArray[np.integer], *, width: int = 160, height: int = 28) -> str:
+    """A small histogram of counts that are known."""
+    return _svg(width, height, _columns(counts, width, height))
+
+
+def _columns(counts: NDArray[np.integer], width: int, height: int) -> str:
+    bar = width / max(len(counts), 1)
+    scale = height / max(int(counts.max(initial=0)), 1)
+    return "".join(
+        f'<rect x="{place * bar:.1f}" y="{height - count * scale:.1f}" width="{max(bar - 1, 1):.1f}" '
         f'height="{count * scale:.1f}" fill="#4269d0"/>'
         for place, count in enumerate(counts.tolist())
         if count
     )
-    ends = f'<text x="0" y="{height - 4}">{edges[0]:.3g} {shown(unit)}</text>' + (
-        f'<text x="{width}" y="{height - 4}" text-anchor="end">{edges[-1]:.3g} {shown(unit)}</text>'
-    )
-    return _svg(width, height, drawn + ends)
 
 
 def time_line(
     values: NDArray[np.floating],
-    colors: Sequence[str],
+    severities: Sequence[int],  # 0 = pass to 3 = fail
     *,
     limit: float | None = None,
     width: int = 720,
-    height: int = 70,
+    height: int = 60,
 ) -> str:
-    """A number over samples in order, each in its color; the limit as a dashed line, gaps where nothing was measured.
+    """A number over samples in order, in the colors of verdicts; the limit as a dashed line.
 
-    Of more samples than pixels the worst of each column is kept: its highest color in the order they are given.
+    Of many more samples than pixels the lowest, the highest and the worst of each column of pixels are drawn.
     """
     finite = np.isfinite(values)
     inside = [*values[finite].tolist(), *([] if limit is None else [limit])]
     low, high = (min(inside), max(inside)) if inside else (0.0, 1.0)
     span = (high - low) or 1.0
 
-    def across(place: int) -> float:
-        return 4 + (width - 8) * (place + 0.5) / max(len(values), 1)
-
     def down(value: float) -> float:
-        return height - 16 - (height - 24) * (value - low) / span
+        return height - 4 - (height - 8) * (value - low) / span
 
     drawn = []
     if limit is not None:
+        y = down(limit)
         drawn.append(
-            f'<line x1="0" x2="{width}" y1="{down(limit):.1f}" y2="{down(limit):.1f}" stroke="currentColor" '
-            'stroke-dasharray="4 4" opacity=".5"/>'
+            f'<path d="M0 {y:.1f}H{width}" stroke="currentColor" stroke-dasharray="4 4" opacity=".5" '
+            'vector-effect="non-scaling-stroke"/>'
         )
-    for place, value in enumerate(values.tolist()):
-        if np.isfinite(value):
-            drawn.append(f'<circle cx="{across(place):.1f}" cy="{down(value):.1f}" r="2.2" fill="{colors[place]}"/>')
-    drawn.append(f'<text x="0" y="{height - 2}">{low:.3g}</text>')
-    drawn.append(f'<text x="{width}" y="{height - 2}" text-anchor="end">{high:.3g}</text>')
-    return _svg(width, height, "".join(drawn))
+    for place in _some_of(values, width, severities).tolist():
+        if finite[place]:
+            across = 4 + (width - 8) * (place + 0.5) / len(values)
+            drawn.append(_dot(across, down(values[place]), VERDICT_COLORS[severities[place]]))
+    return _stretched(width, height, "".join(drawn))
+
+
+def strip(
+    severities: NDArray[np.integer],  # (N,) of each sample in order, 0 = pass to 3 = fail, -1 = none
+    *,
+    gaps: Sequence[int] = (),
+    width: int = 720,
+) -> str:
+    """Verdicts over samples in order as one colored band, the worst of each column; gaps as dark marks above it."""
+    count = len(severities)
+    columns = min(count, width)
+    worst = np.full(columns, -1, dtype=np.int64)
+    np.maximum.at(worst, np.arange(count) * columns // max(count, 1), severities)
+    edges = [0, *(np.flatnonzero(np.diff(worst)) + 1).tolist(), columns] if columns else [0]
+    drawn = []
+    for start, stop in itertools.pairwise(edges):
+        x, end = (width * edge / columns for edge in (start, stop))
+        color = VERDICT_COLORS[worst[start]] if worst[start] >= 0 else "transparent"
+        drawn.append(f'<rect x="{x:.1f}" y="6" width="{end - x:.1f}" height="14" fill="{color}"/>')
+    for place in gaps:
+        x = width * place / max(count, 1)
+        drawn.append(f'<path d="M{x - 4:.1f} 0h8l-4 6z" fill="currentColor"/>')
+    return _stretched(width, 20, "".join(drawn))
+
+
+def curves(
+    series: Mapping[str, NDArray[np.floating]],  # name -> (N,) over the same samples in order, NaN = none
+    unit: str,
+    *,
+    width: int = 720,
+    height: int = 90,
+) -> str:
+    """Several numbers over samples in order, each in its color, in one chart with one scale."""
+    finite = [values[np.isfinite(values)] for values in series.values()]
+    if not any(map(len, finite)):
+        return '<p class="dim">no numbers</p>'
+    low, high = min(float(v.min()) for v in finite if len(v)), max(float(v.max()) for v in finite if len(v))
+    span = (high - low) or 1.0
+    drawn, legend = [], []
+    for number, (name, values) in enumerate(series.items()):
+        color = _SERIES_COLORS[number % len(_SERIES_COLORS)]
+        places = _some_of(values, width)
+        across = 4 + (width - 8) * (places + 0.5) / max(len(values), 1)
+        down = height - 4 - (height - 8) * (values[places] - low) / span
+        drawn.append(_curve(across, down, color))
+        legend.append(f'<span><i style="background:{color}"></i>{shown(name, 80)}</span>')
+    told = f"<span>{low:.4g} to {high:.4g} {shown(unit)}</span>"
+    named = "".join(legend) if len(series) > 1 else ""
+    return f'{_stretched(width, height, "".join(drawn))}<p class="legend">{told}{named}</p>'
+
+
+def _curve(across: NDArray[np.floating], down: NDArray[np.floating], color: str) -> str:
+    """One line, broken where there is no number; what stands alone is a dot."""
+    there = np.isfinite(down)
+    starts = np.flatnonzero(there & ~np.concatenate([[False], there[:-1]]))
+    stops = np.flatnonzero(there & ~np.concatenate([there[1:], [False]])) + 1
+    drawn = []
+    for start, stop in zip(starts.tolist(), stops.tolist()):
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across[start:stop], down[start:stop]))
+        if stop - start == 1:
+            drawn.append(_dot(across[start], down[start], color))
+        else:
+            drawn.append(
+                f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="1.6" '
+                'vector-effect="non-scaling-stroke"/>'
+            )
+    return "".join(drawn)
+
+
+def _some_of(
+    values: NDArray[np.floating], columns: int, severities: Sequence[int] | None = None
+) -> NDArray[np.int64]:  # rising
+    """Return which samples are drawn: all, or of each column of pixels the lowest, the highest and the worst."""
+    count = len(values)
+    if count <= 2 * columns:
+        return np.arange(count)
+    column = np.arange(count) * columns // count
+    ranks = [values, -values, *([] if severities is None else [-np.asarray(severities, dtype=np.float64)])]
+    kept = []
+    for rank in ranks:
+        order = np.lexsort([np.where(np.isfinite(rank), rank, np.inf), column])
+        kept.append(order[np.searchsorted(column[order], np.arange(columns))])
+    return np.unique(np.concatenate(kept))
+
+
+def _dot(across: float, down: float, color: str) -> str:
+    """A dot that stays round however wide its chart is stretched: a line of no length with round ends."""
+    return (
+        f'<path d="M{across:.1f} {down:.1f}h0" stroke="{color}" stroke-width="4.4" stroke-linecap="round" '
+        'vector-effect="non-scaling-stroke"/>'
+    )
+
+
+def _stretched(width: int, height: int, drawn: str) -> str:
+    """A chart as wide as there is room, up to ``width``; it has no text, which would be stretched too."""
+    return (
+        f'<svg role="img" class="stretched" viewBox="0 0 {width} {height}" preserveAspectRatio="none" '
+        f'style="height:{height}px">{drawn}</svg>'
+    )
 
 
 def _svg(width: int, height: int, drawn: str) -> str:
-    return (
-        f'<svg role="img" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
-        f'style="max-width:100%">{drawn}</svg>'
-    )
+    return f'<svg role="img" width="{width}" height="{height}" viewBox="0 0 {width} {height}">{drawn}</svg>'

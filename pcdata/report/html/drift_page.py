@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcdata.report.html.charts import VERDICT_COLORS, time_line
+from pcdata.report.html.charts import time_line
 from pcdata.report.html.page import Section, page_of
 from pcdata.report.html.text import shown
 from pcdata.validation.drift_result import MOVING, CameraDrift, DriftResult
@@ -25,13 +25,13 @@ def drift_page(result: DriftResult, title: str) -> str:
 
 def _way(camera: CameraDrift, result: DriftResult) -> str:
     limits = result.limits
-    colors = [VERDICT_COLORS[point.verdict.severity] for point in camera.points]
+    severities = [point.verdict.severity for point in camera.points]
     shifts = np.array([1e3 * point.shift for point in camera.points])
     turns = np.array([point.rotation_degrees for point in camera.points])
     first, last = camera.points[0].first, camera.points[-1].last
     unknown = f"<p>Not measurable: {shown('; '.join(camera.unmeasurable))}.</p>" if camera.unmeasurable else ""
     return (
         f"<p>{shown(first)} to {shown(last)}, {len(camera.points)} windows.</p>"
-        f"<h3>Shift of what it sees [mm]</h3>{time_line(shifts, colors, limit=1e3 * limits.shift[0])}"
-        f"<h3>Rotation [degrees]</h3>{time_line(turns, colors, limit=limits.rotation_degrees[0])}{unknown}"
+        f"<h3>Shift of what it sees [mm]</h3>{time_line(shifts, severities, limit=1e3 * limits.shift[0])}"
+        f"<h3>Rotation [degrees]</h3>{time_line(turns, severities, limit=limits.rotation_degrees[0])}{unknown}"
     )

@@ -37,15 +37,22 @@ def page_of(title: str, sections: Sequence[Section], scenes: Sequence[SampleScen
         scenes: what the viewer shows; without any there is none.
         viewer_after: how many sections stand before the viewer.
     """
-    parts = [f"<section><h2>{shown(one.title)}</h2>{one.html}</section>" for one in sections]
+    parts = [
+        f'<section id="part-{place}"><h2>{shown(one.title)}</h2>{one.html}</section>'
+        for place, one in enumerate(sections)
+    ]
+    titles = [(f"part-{place}", shown(one.title)) for place, one in enumerate(sections)]
     data = ""
     if scenes:
         index, blobs = _index(scenes)
         parts.insert(viewer_after, _viewer())
+        titles.insert(viewer_after, ("space", _VIEWER_TITLE))
         data = f'<script type="application/json" id="pcdata-index">{index}</script>' + "".join(
             f'<script type="text/plain" id="{name}">{text}</script>' for name, text in blobs.items()
         )
-    return _document(title, "".join(parts), data, has_viewer=bool(scenes))
+    links = " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in titles)
+    contents = f"<nav>{links}</nav>" if len(titles) > 3 else ""
+    return _document(title, contents + "".join(parts), data, has_viewer=bool(scenes))
 
 
 def served_page(title: str, total: int) -> str:
@@ -126,7 +133,8 @@ def _viewer(choice: str = "") -> str:
     return _VIEWER.replace("<!--choice-->", choice)
 
 
-_VIEWER = """<section><h2>In three dimensions</h2><div id="viewer">
+_VIEWER_TITLE = "In three dimensions"
+_VIEWER = f"""<section id="space"><h2>{_VIEWER_TITLE}</h2><div id="viewer">
 <div class="bar"><!--choice--><label>sample <select id="sample"></select></label>
 <span><button id="before" title="the step before ([)">&#8592;</button>
 <label>step <select id="step"></select></label>

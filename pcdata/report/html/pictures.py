@@ -25,11 +25,15 @@ _STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Ki
 
 
 def depth_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes:
-    """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a PNG."""
+    """Depth from near (dark) to far (bright), pixels without a reading in magenta; as a PNG.
+
+    The colors are even in 1/depth, as the precision of stereo is: a far wall does not take them from the table.
+    """
     depth = _reduced(frame.depth[view].cpu().numpy(), width)
     valid = depth > 0
-    near, far = np.quantile(depth[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
-    return _ramp_png((depth - near) / max(far - near, 1e-9), valid)
+    inverse = 1 / np.where(valid, depth, 1.0)
+    far, near = np.quantile(inverse[valid], [0.01, 0.99]) if valid.any() else (0.0, 1.0)
+    return _ramp_png((near - inverse) / max(near - far, 1e-9), valid)
 
 
 def confidence_picture(frame: DepthFrame, view: int, width: int = WIDTH) -> bytes | None:

@@ -109,15 +109,17 @@ def raw_cloud(frame: DepthFrame) -> PointCloud:
 
 
 def _bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where most points are: far strays do not make the rest small."""
+    """Where most points are: neither strays nor a floor and walls far behind make the rest small."""
     points = cloud.points.detach().cpu()
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 20_000)].double().numpy()
-    low, high = np.quantile(some, [0.01, 0.99], axis=0)
+    low, high = np.quantile(some, [0.1, 0.9], axis=0)
+    low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
     all_low, all_high = (end.double().numpy() for end in points.aminmax(dim=0))
-    strays = np.linalg.norm(all_high - all_low) > 1.5 * np.linalg.norm(high - low)
-    return (low, high) if strays else (all_low, all_high)
+    low, high = np.maximum(low, all_low), np.minimum(high, all_high)
+    reaches_farther = np.linalg.norm(all_high - all_low) > 1.5 * np.linalg.norm(high - low)
+    return (low, high) if reaches_farther else (all_low, all_high)
 
 
 def _is_camera(cloud: PointCloud) -> bool:
