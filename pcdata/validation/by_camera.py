@@ -21,7 +21,8 @@ class CameraHistory:
     Args:
         view: its number in the captures.
         name: what it is called.
-        severities: (N,) int8 the worst verdict of each capture's checks on it, 0 = pass to 3 = fail; -1 = none.
+        severities: (N,) int8 the worst verdict of each capture's checks on it, 0 = pass to 3 = fail; -1 = none. What
+            could not be measured counts where nothing else was.
         faults: the checks that warned or failed, the worst first.
         since: in words, in how many captures it was at its worst, and from which on; "" = nothing was found.
     """
@@ -53,9 +54,13 @@ def cameras_of(grading: Grading) -> list[CameraHistory]:
 def _history(grading: Grading, view: int) -> CameraHistory:
     own = [trend for trend in grading.trends.values() if trend.view == view]
     severities = np.full(len(grading.ids), -1, dtype=np.int8)
+    unmeasured = np.zeros(len(grading.ids), dtype=bool)
     for trend in own:
-        places = np.array(trend.places)
-        severities[places] = np.maximum(severities[places], np.array(trend.verdicts, dtype=np.int8))
+        places, verdicts = np.array(trend.places), np.array(trend.verdicts, dtype=np.int8)
+        measured = verdicts != Verdict.UNKNOWN.severity
+        severities[places[measured]] = np.maximum(severities[places[measured]], verdicts[measured])
+        unmeasured[places[~measured]] = True
+    severities[(severities < 0) & unmeasured] = Verdict.UNKNOWN.severity
     faults = tuple(fault for fault in grading.faults() if fault.view == view)
     return CameraHistory(view, grading.name_of(view), severities, faults, _since(grading, severities) if faults else "")
 

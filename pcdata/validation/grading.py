@@ -173,7 +173,9 @@ class Grading:
         if len(where) == len(trend.places) > 1:
             return f"in all {len(where):,} captures"
         told += f", from {self.ids[first]!r} on" if ever_since else f", first {self.ids[first]!r}"
-        if bad := self._episodes_of(where):
+        if trend.verdict is Verdict.FAIL and (warning := list(trend.verdicts).count(Verdict.WARN.severity)):
+            told += f"; {warning:,} more warn{'s' * (warning == 1)}"
+        if len(self.episodes) > 1 and (bad := self._episodes_of(where)):
             shown = ", ".join(f"{name} ({count})" for name, count in bad.most_common(3))
             told += f"; episodes {shown}" + (f" and {len(bad) - 3} more" if len(bad) > 3 else "")
         return told

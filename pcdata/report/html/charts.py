@@ -110,6 +110,13 @@ def strip(
     return _stretched(width, 20, "".join(drawn))
 
 
+def verdict_legend() -> str:
+    """Say what the colors of verdicts mean."""
+    told = zip(VERDICT_COLORS, ("pass", "could not be measured", "warn", "fail"))
+    entries = "".join(f'<span><i style="background:{color}"></i>{name}</span>' for color, name in told)
+    return f'<p class="legend">{entries}</p>'
+
+
 def curves(
     series: Mapping[str, NDArray[np.floating]],  # name -> (N,) over the same samples in order, NaN = none
     unit: str,

@@ -189,7 +189,7 @@ def look(
     steps, problem = _steps(capture, pipeline)
     clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
     first = None
-    if not clouds or overlap is not None:
+    if not clouds or overlap is not None or isinstance(capture, PointCloud):
         try:
             first = capture if isinstance(capture, PointCloud) else raw_cloud(capture)
         except PcdataError as error:

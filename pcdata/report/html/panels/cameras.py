@@ -9,14 +9,13 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.report.html.charts import bins, curves, strip
+from pcdata.report.html.charts import bins, curves, strip, verdict_legend
 from pcdata.report.html.gathering import Gathered
 from pcdata.report.html.page import Section
 from pcdata.report.html.text import shown
 from pcdata.validation.by_camera import CameraHistory, cameras_of
 from pcdata.validation.grading import Grading
 from pcdata.validation.overlap_result import PairOverlap
-from pcdata.verdicts import Verdict
 
 _PLANES = (  # finding, heading, unit that is shown, of it in one of the finding's
     ("plane_noise", "Noise: scatter of readings on the largest plane", "mm", 1e3),
@@ -32,17 +31,14 @@ def cameras_panel(gathered: Gathered) -> Section | None:
         return None
     first, last = gathered.grading.ids[0], gathered.grading.ids[-1]
     ends = f'<p class="ends"><span>{shown(first, 60)}</span><span>{shown(last, 60)}</span></p>'
-    return Section("Cameras over the captures", "".join(map(_history, histories)) + ends)
+    return Section("Cameras over the captures", "".join(map(_history, histories)) + ends + verdict_legend())
 
 
 def _history(camera: CameraHistory) -> str:
     checks = ", ".join(dict.fromkeys(fault.name for fault in camera.faults))
     since = f"{shown(camera.since)}: {shown(checks)}" if camera.faults else ""
-    verdict = camera.verdict if camera.faults or camera.verdict is not Verdict.UNKNOWN else Verdict.PASS
-    return (
-        f'<p class="row"><b>{shown(camera.name, 120)}</b> <span class="{verdict}">{verdict}</span> {since}</p>'
-        f"{strip(camera.severities)}"
-    )
+    verdict = f'<span class="{camera.verdict}">{camera.verdict}</span>'
+    return f'<p class="row"><b>{shown(camera.name, 120)}</b> {verdict} {since}</p>{strip(camera.severities)}'
 
 
 def overlap_panel(gathered: Gathered) -> Section | None:

@@ -79,16 +79,19 @@ def _trend(name: str, trend: Trend, ids: Sequence[str]) -> str:
     values = np.array(trend.values)
     values, limit, unit = _shown_in(values, trend.worst.threshold, trend.worst.unit)
     head = f'<h3>{shown(name)} <span class="{trend.verdict}">{trend.verdict}</span></h3>'
-    passes = "" if limit is None else f"; passes {'down' if trend.worst.at_least else 'up'} to {limit:.4g} {unit}"
+    passes = (
+        "" if limit is None else f"; passes {'down' if trend.worst.at_least else 'up'} to {limit:.4g} {unit}".rstrip()
+    )
     if len(values) < 2:
         return f"{head}<p>{values[0]:.4g} {shown(unit)}{shown(passes)}</p>"
     low, high = np.nanmin(values), np.nanmax(values)
-    told = f"{low:.4g} to {high:.4g} {unit}{passes}{' (dashed)' if limit is not None else ''}"
+    told = f"{low:.4g} to {high:.4g} {unit}".rstrip() + passes + (" (dashed)" if limit is not None else "")
     spread = histogram(values, unit) if len(values) > 20 else ""
     first, last = (shown(ids[trend.places[end]], 60) for end in (0, -1))
     return (
-        f'{head}<p class="dim">{shown(told)}</p>{time_line(values, trend.verdicts, limit=limit)}'
-        f'<p class="ends"><span>{first}</span><span>{last}</span></p>{spread}'
+        f'{head}<p class="dim">{shown(told)}</p><div class="charts"><div>'
+        f"{time_line(values, trend.verdicts, limit=limit)}"
+        f'<p class="ends"><span>{first}</span><span>{last}</span></p></div>{spread}</div>'
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcdata.report.html.charts import curves, strip
+from pcdata.report.html.charts import curves, strip, verdict_legend
 from pcdata.report.html.episode_lines import EpisodeLine
 from pcdata.report.html.gathering import Gathered
 from pcdata.report.html.page import Section
@@ -25,10 +25,12 @@ def time_panel(gathered: Gathered) -> Section | None:
     if not grading.episodes and not any(line.gaps or line.signals for line in gathered.lines):
         return None  # the cameras' bands say it all
     lines = [_line(grading, line, is_open=number < _OPEN) for number, line in enumerate(gathered.lines)]
-    table = _table(grading) if grading.episodes else ""
+    table = _table(grading) if len(grading.episodes) > 1 else ""
     has_gaps = any(line.gaps for line in gathered.lines)
     note = '<p class="dim">Marks above a band: captures are missing before it.</p>' if has_gaps else ""
-    return Section("Episodes over time" if grading.episodes else "Over time", note + "".join(lines) + table)
+    return Section(
+        "Episodes over time" if grading.episodes else "Over time", note + "".join(lines) + verdict_legend() + table
+    )
 
 
 def _line(grading: Grading, line: EpisodeLine, *, is_open: bool) -> str:
@@ -50,8 +52,9 @@ def _line(grading: Grading, line: EpisodeLine, *, is_open: bool) -> str:
         f'<p class="ends"><span>{shown(first, 60)}</span><span>{shown(last, 60)}</span></p>'
     )
     if signals:
+        count = f"{len(line.signals)} signal{'s' * (len(line.signals) > 1)}"
         told += (
-            f"<details{' open' if is_open else ''}><summary>{len(line.signals)} signals</summary>"
+            f"<details{' open' if is_open else ''}><summary>{count}</summary>"
             f"{''.join(signals)}"
             f"{f'<p>{left} more.</p>' if left > 0 else ''}</details>"
         )

@@ -37,11 +37,13 @@ def _sample(grading: Grading, one: Looked, place: int, scene: int | None, *, is_
         f'<figure><img src="{uri}" alt="{told}"><figcaption>{told}</figcaption></figure>'
         for told, uri in ((shown(picture.caption), png_uri(picture.png)) for picture in one.pictures)
     )
-    return (
-        f"<details{' open' if is_open else ''}><summary><b>{shown(one.sample_id, 200)}</b> "
-        f'<span class="{verdict}">{verdict}</span> {_faults(grading, place)}</summary>'
-        f'<p>{link}</p>{problem}<div class="pictures">{figures}</div></details>'
+    head = (
+        f'<b>{shown(one.sample_id, 200)}</b> <span class="{verdict}">{verdict}</span> {_faults(grading, place)} {link}'
     )
+    if not figures:
+        return f'<p class="row">{head}</p>{problem}'
+    opened = " open" if is_open else ""
+    return f'<details{opened}><summary>{head}</summary>{problem}<div class="pictures">{figures}</div></details>'
 
 
 def _faults(grading: Grading, place: int) -> str:
