@@ -1,4 +1,4 @@
-"""The panels of the page say what was gathered: since when a camera is off, gaps, planes, objects, episodes over time."""
+"""Panels say what was gathered: since when a camera is off, gaps, planes, objects, episodes over time."""
 
 from __future__ import annotations
 
