@@ -45,7 +45,7 @@ def test_the_page_stands_alone(capsys, made, tmp_path):
     assert code == 0
     assert out.startswith("grade    A\n")
     text = page.read_text(encoding="utf-8")
-    assert not re.findall(r"(?:src|href)=[\"'](?!data:)", text)
+    assert not re.findall(r"(?:src|href)=[\"'](?!data:|#)", text)
     assert "default-src 'none'" in text
     assert '<span class="grade A">A</span>' in text
     assert "No pipeline was given" in text
