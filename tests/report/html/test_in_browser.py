@@ -13,8 +13,13 @@ import pytest
 import torch
 
 from pcdata import Compose, PointCloud
+from pcdata.report import Page
+from pcdata.report.html.capture_report import page_of_captures
+from pcdata.report.html.gathering import gather_captures
+from pcdata.report.html.overlaps import GAP
 from pcdata.transforms import Deproject, EstimateNormals, FarthestPointSample
 from tests.factories import tabletop_frame
+from tests.report.html.recorded import Recorded, rig_frames
 
 pytestmark = pytest.mark.browser
 playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
@@ -51,9 +56,9 @@ def visit(browser, tmp_path) -> Iterator[Any]:
     asked: list[str] = []
     pages = []
 
-    def opened(page: Any, scheme: str = "light") -> Any:
+    def opened(page: Any, scheme: str = "light", width: int = 1000) -> Any:
         file = page.save(tmp_path / "page.html")
-        tab = browser.new_page(viewport={"width": 1000, "height": 900}, color_scheme=scheme)
+        tab = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
         tab.on("console", lambda message: heard.append(message.text))
         tab.on("pageerror", lambda error: heard.append(str(error)))
         tab.on("request", lambda request: asked.append(request.url))
@@ -81,6 +86,12 @@ def grid() -> Any:
 def steps() -> Any:
     chain = Compose([Deproject(), FarthestPointSample(num_points=2000), EstimateNormals(radius=0.05)])
     return chain.show_steps(tabletop_frame(1))
+
+
+@pytest.fixture(scope="module")
+def recording() -> Page:
+    """The page of a recording in which the second of three cameras moved."""
+    return Page(page_of_captures(gather_captures(Recorded(rig_frames()), num_shown=6)))
 
 
 def until(tab: Any, condition: str) -> None:
@@ -216,3 +227,63 @@ def test_several_pages_of_one_notebook_do_not_touch_each_other(browser, tmp_path
     assert [view.locator("#color").input_value() for view in views] == ["labels", "colors", "colors"]
     assert heard == []
     tab.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_narrow_screen_shows_all_without_moving_it_sideways(visit, recording, scheme):
+    tab = visit(recording, scheme, width=390)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+    band = tab.locator("svg.stretched").first.bounding_box()
+    assert 300 < band["width"] <= 390  # the end of the recording, where the fault is, is in sight
+    ink, ground = (tab.evaluate(f"getComputedStyle(document.body).{one}") for one in ("color", "backgroundColor"))
+    assert contrast(ink, ground) > 7  # WCAG 2.2, 1.4.6
+
+
+def test_a_link_of_a_fault_and_of_a_sample_opens_its_clouds(visit, recording):
+    tab = visit(recording)
+    tab.locator("#sample").select_option(index=5)
+    until(tab, "window.pcdata.sample === 5")
+    tab.get_by_role("button", name="show f3").click()
+    until(tab, "window.pcdata.sample === 0")
+    tab.get_by_role("button", name="in three dimensions").nth(2).press("Enter")
+    until(tab, "window.pcdata.sample === 2")
+    assert tab.locator("#sample").evaluate("one => one.selectedOptions[0].textContent") == "f5"
+
+
+def test_gaps_between_cameras_color_the_cloud_and_say_where_there_is_none(visit, recording):
+    tab = visit(recording)
+    before = pixels(tab)
+    tab.locator("#color").select_option(GAP)
+    assert (pixels(tab) != before).any()
+    assert tab.locator("#legend").text_content().endswith("gray: none")
+    told = set()
+    for row in range(0, 4000, 400):
+        x, y = place_of(tab, row)
+        tab.evaluate(f"window.pcdata.pick({x}, {y})")
+        told.add(f"{GAP} none" in tab.locator("#picked").text_content())
+    assert told == {True, False}
+
+
+def test_the_parts_of_a_page_are_reached_by_its_links_and_keys(visit, recording):
+    tab = visit(recording)
+    links = tab.locator("nav a").all_text_contents()
+    headings = tab.locator("h2").all_text_contents()
+    assert links == headings
+    assert headings[:4] == ["Verdict", "In three dimensions", "Cameras over the captures", "Episodes over time"]
+    tab.get_by_role("link", name="Planes and noise").press("Enter")
+    until(tab, "document.querySelector(location.hash).getBoundingClientRect().top < innerHeight")
+    last = tab.locator("details:not([open]) > summary").last
+    last.press("Enter")
+    until(tab, "document.activeElement.parentElement.open")
+
+
+def contrast(one: str, other: str) -> float:
+    """How far two colors, as ``rgb(r, g, b)``, are apart in lightness; WCAG 2.2, relative luminance."""
+
+    def lightness(color: str) -> float:
+        channels = [int(part) / 255 for part in color[color.index("(") + 1 : -1].split(",")[:3]]
+        linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in channels]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted([lightness(one), lightness(other)])
+    return (high + 0.05) / (low + 0.05)

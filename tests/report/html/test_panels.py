@@ -9,62 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata import Compose, DepthFrame
+from pcdata import Compose
 from pcdata.report.html.capture_report import page_of_captures
 from pcdata.report.html.charts import curves, strip, time_line
 from pcdata.report.html.gathering import Gathered, gather_captures
 from pcdata.report.html.overlaps import GAP, overlap_of
 from pcdata.report.html.scene import raw_cloud
 from pcdata.report.html.unpacking import unpack_cloud
-from pcdata.structures import Episode, Signal
 from pcdata.synthetic import tabletop
 from pcdata.transforms import ClusterObjects, Deproject, MergeViews, RemovePlane, ToFrame
 from pcdata.validation import SampleReport, validate_frame
 from pcdata.validation.by_camera import cameras_of
 from pcdata.validation.grading import Grading
 from pcdata.verdicts import Finding, Verdict
-
-SIZE = (240, 320)
-MOVED_FROM = 3
-NUM_FRAMES = 6
-
-
-def rig_frames() -> list[DepthFrame]:
-    """Three cameras; from the fourth capture on the second stands 6 mm from where its pose says."""
-    here = tabletop(0, num_views=3, noise="stereo", size=SIZE).frame.world_from_camera
-    there = here.clone()
-    there[1, :3, 3] += torch.tensor([0.0036, 0.0048, 0.0])
-    scenes = [tabletop(0, num_views=3, noise="stereo", size=SIZE, world_from_camera=pose) for pose in (here, there)]
-    frames = [scenes[number >= MOVED_FROM].render(seed_noise=number) for number in range(NUM_FRAMES)]
-    names = {"cameras": ["left", "front", "right"]}
-    return [
-        replace(frame, world_from_camera=here, labels=None, colors=frame.colors ^ number, provenance=names)
-        for number, frame in enumerate(frames)
-    ]
-
-
-class Recorded:
-    """Frames in memory, as an episode with signals and a gap."""
-
-    name = "recorded"
-
-    def __init__(self, frames: list[DepthFrame]) -> None:
-        self.frames = frames
-        self.ids = [f"f{number}" for number in range(len(frames))]
-        times = [0.1 * number + 3.0 * (number >= 4) for number in range(len(frames))]
-        self.episodes = [Episode("pick", 0, len(frames), times)]
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def load(self, sample_id: str) -> DepthFrame:
-        return replace(self.frames[self.ids.index(sample_id)], sample_id=sample_id)
-
-    def signals(self, sample_id: str) -> dict[str, Signal]:
-        number = self.ids.index(sample_id)
-        values = torch.tensor([[float(number), -float(number)]])
-        texts = Signal(values=("pick it",), kind="text")
-        return {"joints<b>": Signal(values=values, kind="invariant"), "task": texts}
+from tests.report.html.recorded import MOVED_FROM, NUM_FRAMES, SIZE, Recorded, rig_frames
 
 
 @pytest.fixture(scope="module")
