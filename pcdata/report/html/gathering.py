@@ -216,7 +216,7 @@ def look(
         funnel=tuple((type(step).__name__, cloud.num_points) for step, cloud in clouds),
         problem=problem,
         pairs=() if overlap is None else overlap.pairs,
-        objects=_boxes(clouds[-1][1] if clouds else capture),
+        objects=next(filter(None, map(_boxes, (*(cloud for _, cloud in reversed(clouds)), capture))), None),
     )
 
 
