@@ -188,6 +188,7 @@ def look(
     overlap = overlap_of(capture) if isinstance(capture, DepthFrame) else None
     steps, problem = _steps(capture, pipeline)
     clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
+    afterwards = [cloud for _, cloud in reversed(clouds)]
     first = None
     if not clouds or overlap is not None or isinstance(capture, PointCloud):
         try:
@@ -216,7 +217,7 @@ def look(
         funnel=tuple((type(step).__name__, cloud.num_points) for step, cloud in clouds),
         problem=problem,
         pairs=() if overlap is None else overlap.pairs,
-        objects=next(filter(None, map(_boxes, (*(cloud for _, cloud in reversed(clouds)), capture))), None),
+        objects=next((own for one in (*afterwards, capture) if (own := _boxes(one)) is not None), None),
     )
 
 

@@ -17,7 +17,7 @@ from pcdata.report.html.overlaps import GAP, overlap_of
 from pcdata.report.html.scene import raw_cloud
 from pcdata.report.html.unpacking import unpack_cloud
 from pcdata.synthetic import tabletop
-from pcdata.transforms import ClusterObjects, Deproject, MergeViews, RemovePlane, ToFrame
+from pcdata.transforms import ClusterObjects, Deproject, MergeViews, NormalizeUnitSphere, RemovePlane, ToFrame
 from pcdata.validation import SampleReport, validate_frame
 from pcdata.validation.by_camera import cameras_of
 from pcdata.validation.grading import Grading
@@ -34,6 +34,7 @@ def gathered() -> Gathered:
             MergeViews(),
             RemovePlane(up=(0, 0, 1), frame="base", max_tilt=0.2, keep="above"),
             ClusterObjects(eps=0.03, min_points=12, min_size=30),
+            NormalizeUnitSphere(),
         ]
     )
     return gather_captures(Recorded(rig_frames()), pipeline=chain, num_shown=3)
