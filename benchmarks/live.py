@@ -246,11 +246,11 @@ def camera_at(frames: list[pcdata.DepthFrame], rate: float, seconds: float) -> C
 
 def memory(quick: bool) -> dict[str, int]:
     """Bytes that are resident after 100 small frames, and after many."""
-    scene = tabletop(0, noise="stereo", size=(60, 106), num_views=1)
+    scene = tabletop(0, noise="stereo", size=(180, 318), num_views=1)
     some = [replace(scene.render(seed_noise=number), labels=None) for number in range(8)]
     steps = chain(SETS["synthetic"])
     live = LivePipeline(steps, like=some[0])
-    found, count = {}, 1000 if quick else 10_000
+    found, count = {}, 200 if quick else 10_000
     for number, frame in zip(range(1, count + 1), itertools.cycle(some)):
         cloud_of(live(frame))
         if number in (100, count // 2, count):
