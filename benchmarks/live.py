@@ -209,7 +209,7 @@ def replay(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: floa
 
 
 def replay_beside(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: float) -> dict[str, Any]:
-    live = LivePipeline(chain(box), like=frames[0], max_age=1.0, same_pixels=len(frames) > 1)
+    live = LivePipeline(chain(box), like=frames[0], max_age=1.0, same_pixels=False)  # a few frames, again and again
     with LatestFrame.reading(camera_at(frames, rate, seconds), timeout=1.0) as camera:
         stamps, ages = [], []
         for answer in live.follow(camera):
