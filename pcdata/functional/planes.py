@@ -74,6 +74,15 @@ def checked_probability(where: str, name: str, arguments: Mapping[str, Any]) -> 
     return value
 
 
+def checked_guess(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
+    """Require one plane per cloud; bodies get (B, 4) float64 on the CPU with unit normals, NaN where there is none."""
+    planes = torch.as_tensor(arguments[name], dtype=torch.float64, device="cpu").detach()
+    if planes.shape != (len(arguments["ptr"]) - 1, 4):
+        raise ShapeError(f"{where}: guess must be ({len(arguments['ptr']) - 1}, 4), got {tuple(planes.shape)}")
+    planes = planes / planes[:, :3].norm(dim=1, keepdim=True)
+    return planes.masked_fill(~planes.isfinite().all(1, keepdim=True), torch.nan)
+
+
 # The steps of the search that touch every point, for all clouds at once.
 
 
@@ -148,6 +157,7 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "a
     up=checked_up,
     max_tilt=checked_tilt,
     probability=checked_probability,
+    guess=checked_guess,
     steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes),
     gradient=False,
 )
@@ -161,6 +171,7 @@ def ransac_plane(
     up: Tensor | Sequence[float] | None = None,
     max_tilt: float | None = None,
     probability: float | None = None,
+    guess: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Find each cloud's plane with the most points nearer than ``distance`` (strictly, as Open3D).
@@ -185,6 +196,8 @@ def ransac_plane(
         probability: stop at the first hypothesis by which, if the best so far holds the share w of the points, three
             points within that plane have been drawn with this probability: after log(1 - probability) /
             log(1 - w^3) tries. Hypotheses count in the order drawn, so every backend stops at the same. None = try all.
+        guess: (B, 4) planes that compete before those drawn, such as those of the frame before; NaN = none. They are
+            scored like the others, so a wrong one loses and changes nothing; they are not counted as tries.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
 
     Raises:
@@ -207,10 +220,22 @@ def ransac_plane(
         own, own_ptr = _clouds_between(points, ptr, some.start, some.stop)
         triples, which = _draw_triples(counts[some], num_hypotheses, seed[some])
         hypotheses = draw_planes(own, own_ptr, triples, which, backend=backend)
+        if guess is not None:
+            hypotheses = torch.cat([guess[some, None], hypotheses], 1)
         is_plane = ~hypotheses[..., 0].isnan()
         competes = is_plane & _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
         runs = bound_runs(own, own_ptr, backend=backend)
-        near = _count_until_probable(own, own_ptr, runs, hypotheses, competes, distance, probability, backend)
+        near = _count_until_probable(
+            own,
+            own_ptr,
+            runs,
+            hypotheses,
+            competes,
+            distance,
+            probability,
+            backend,
+            hypotheses.shape[1] - num_hypotheses,
+        )
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend, runs)
@@ -226,6 +251,7 @@ def _count_until_probable(
     distance: float,
     probability: float | None,
     backend: str,
+    not_drawn: int,  # of the first planes
 ) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
     """Score hypotheses, in blocks where few may do, until the last cloud has been tried often enough."""
     floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
@@ -242,7 +268,8 @@ def _count_until_probable(
         best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
         # log1p(-1) = -inf: one try finds a plane that holds all
         needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))
-        done = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") >= needed
+        drawn = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") - not_drawn
+        done = drawn >= needed
         stop = torch.where(done.any(1, keepdim=True), first + done.int().argmax(1, keepdim=True) + 1.0, last)
         last = torch.where(last > first, stop, last)
         floors = best[:, -1].clone()

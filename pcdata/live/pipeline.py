@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -37,6 +37,7 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.structure import with_tensors
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms import Compose
+from pcdata.transforms.found_planes import guessing_planes
 
 _KINDS: tuple[tuple[type[Exception], Fault], ...] = (  # of what making a frame raises; the first that fits
     (IntrinsicsError, Fault.OTHER_CAMERA),
@@ -69,6 +70,8 @@ class LivePipeline:
         invalid_values: stored numbers of arrays besides 0 that mean "no reading".
         same_pixels: whether a frame equal to the one before in every depth pixel is frozen. No sensor gives one; a
             simulator without noise does.
+        warm_planes: let RemovePlane score the plane of the frame before first. A wrong one loses, and a good one is
+            refined in fewer rounds; but what is found is no longer bit for bit what the chain finds offline.
         seed: needed where steps are random: each frame is drawn for anew with it.
 
     Raises:
@@ -86,6 +89,7 @@ class LivePipeline:
         before: OverTime | None = None,
         invalid_values: Collection[int] = (),
         same_pixels: bool = True,
+        warm_planes: bool = False,
         seed: int | None = None,
     ) -> None:
         self.chain = chain if isinstance(chain, Compose) else load_config(Path(chain)).pipeline
@@ -97,6 +101,8 @@ class LivePipeline:
             )
         self.before, self.max_age = before, max_age
         self._like, self._seed, self._same_pixels = like, seed, same_pixels
+        self._warm_planes = warm_planes
+        self._planes: Sequence[Mapping[str, Any]] = ()  # of the last cloud
         self._arrays = ArrayReader(like, like.provenance.get("metres_per_unit"), invalid_values)
         self._stamps = Stamps(max_age, clock)
         self._camera: LatestFrame | None = None
@@ -220,8 +226,10 @@ class LivePipeline:
             self._count(" + ".join(self._names[position] for position in steps), now - since)
             since = now
 
-        with torch_on_one_thread(), torch.no_grad():
+        with torch_on_one_thread(), torch.no_grad(), guessing_planes(self._planes):
             cloud: PointCloud = self.chain.run_in_passes(frame, generator=generator, after=after)
+        if self._warm_planes:
+            self._planes = cloud.meta[0].get("planes", ())
         return cloud
 
     def _count(self, name: str, seconds: float) -> None:
@@ -257,7 +265,7 @@ class LivePipeline:
         """Forget the frames before: their stamps, their pixels, what filters gathered. The counts stay."""
         with self._turn:
             self._stamps.reset()
-            self._last = None
+            self._last, self._planes = None, ()
             if self.before is not None:
                 self.before.reset()
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,8 @@ from torch import Tensor
 
 from pcdata.functional.selection import hull_rows, plane_axes
 from pcdata.structures import PointCloud
+
+plane_guesses: ContextVar[tuple[Mapping[str, Any], ...]] = ContextVar("plane_guesses", default=())
 
 _MOST_CORNERS = 24  # of a stored hull: meta is written with every sample
 _DIGITS = 5  # of metres: a hundredth of a millimetre
@@ -42,6 +47,33 @@ def plane_hulls_in_cloud(cloud: PointCloud, b: int = 0) -> list[Tensor]:
         corners = corners.flip(0) if mirrored else corners
         hulls.append(corners @ cloud_from_source[:3, :3].T + cloud_from_source[:3, 3])
     return hulls
+
+
+@contextmanager
+def guessing_planes(planes: Sequence[Mapping[str, Any]]) -> Iterator[None]:
+    """Let RemovePlane begin its searches with planes of another cloud, as ``meta["planes"]`` holds them.
+
+    They are what a stream's frame before had. Each is scored like any other, and a wrong one loses.
+    """
+    token = plane_guesses.set(tuple(planes))
+    try:
+        yield
+    finally:
+        plane_guesses.reset(token)
+
+
+def guessed_planes(cloud: PointCloud) -> Tensor:
+    """Return the planes (B, 4) to begin the search of the next plane with, in the clouds' coordinates; NaN = none."""
+    guesses = plane_guesses.get()
+    planes = torch.full((cloud.num_clouds, 4), torch.nan, dtype=torch.float64, device="cpu")
+    for b in range(cloud.num_clouds):
+        place = len(cloud.meta[b].get("planes", []))
+        if place < len(guesses) and guesses[place]["frame"] == cloud.source_frame:
+            told = torch.tensor(
+                [*guesses[place]["normal"], guesses[place]["offset"]], dtype=torch.float64, device="cpu"
+            )
+            planes[b] = map_planes(told[None], cloud.source_from_cloud[b : b + 1].cpu())[0]
+    return planes
 
 
 def map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
-from pcdata.transforms.found_planes import plane_facts
+from pcdata.transforms.found_planes import guessed_planes, plane_facts, plane_guesses
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.
 _LEAST_RISE = math.radians(5)
@@ -188,6 +188,8 @@ class RemovePlane(RemoveTransform):
             "probability": self.probability,
         }
         if self.which == "largest":
+            if plane_guesses.get():
+                search["guess"] = guessed_planes(data)
             return ransac_plane(data.points, data.ptr, **search)
         likely_up = None
         if self.up is None and data.source_frame == CAMERA_FRAME:

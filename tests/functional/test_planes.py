@@ -112,6 +112,24 @@ def test_among_equal_hypotheses_the_earliest_wins():
     assert torch.equal(best, hypotheses[1:2])
 
 
+@pytest.mark.parametrize("probability", [None, 0.99])
+def test_a_guess_is_scored_like_any_other(probability):
+    points = scene()
+    planes, inliers = ransac_plane(points, probability=probability)
+    wrong = torch.tensor([[0.0, 0, 2.0, -90.0]], dtype=torch.float64)
+    for guess in (wrong, wrong * torch.nan, wrong * 0):
+        again = ransac_plane(points, probability=probability, guess=guess)
+        assert torch.equal(again[0], planes)
+        assert torch.equal(again[1], inliers)
+    few = ransac_plane(points, num_hypotheses=1, seed=5, guess=3 * planes)
+    assert int(few[1].sum()) >= int(inliers.sum())
+    with pytest.raises(ShapeError, match="guess"):
+        ransac_plane(points, guess=planes[0])
+    up = torch.linalg.cross(planes[0, :3], torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64))
+    tilted, _ = ransac_plane(points, guess=planes, up=up, max_tilt=0.5)
+    assert angle_to(tilted[0], up.tolist()) <= 0.5 + 1e-9
+
+
 def test_hypotheses_beyond_the_tilt_are_never_scored(monkeypatch):
     scored = []
     monkeypatch.setattr(planes_module, "_count_near", lambda points, planes, distance: _kept(scored, points, planes))

@@ -229,6 +229,20 @@ def test_the_average_is_that_of_the_last_frames_and_forgets_a_scene_that_moved(s
     assert average.resets == 1
 
 
+def test_a_warm_start_is_checked_and_not_trusted(scene):
+    live, cold = LivePipeline(chain(), like=scene, warm_planes=True), chain()
+    for number in range(3):
+        plane, expected = (
+            one.meta[0]["planes"][0] for one in (live(moved(scene, number)).cloud, cold(moved(scene, number)))
+        )
+        assert np.dot(plane["normal"], expected["normal"]) > 0.999
+        assert plane["num_inliers"] > 0.98 * expected["num_inliers"]
+    for wrong in (([0.0, 0.0, 1.0], -9.0), ([1.0, 0.0, 0.0], 0.0), ([0.0, 0.0, 0.0], 0.0)):
+        live._planes = [{"normal": wrong[0], "offset": wrong[1], "frame": "camera"}]
+        assert_equal(live(moved(scene, 5)).cloud, cold(moved(scene, 5)))
+        live.reset()
+
+
 def test_memory_does_not_grow(scene):
     """With faults among the frames; benchmarks/live.py looks at 10,000 of the whole chain."""
     small = tabletop(3, num_views=1, size=(12, 16)).frame

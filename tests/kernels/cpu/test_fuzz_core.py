@@ -431,6 +431,8 @@ def fuzz_images(rng: np.random.Generator) -> None:
     intrinsics = camera.expand(views, 3, 3)
     lens = a_lens(rng, views)
     check("deproject_depth", depth, intrinsics, distortion=lens)
+    tolerance, least = float(rng.choice([1e-4, 0.02, 0.5])), int(rng.integers(1, 9))
+    check("flying_pixel_mask", depth, tolerance=tolerance, min_neighbors=least)
     motion = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
     motion[:, :3, 3] = torch.from_numpy(rng.normal(size=(views, 3)) * 0.05)
     size = int(rng.integers(1, 40)), int(rng.integers(1, 50))
