@@ -92,12 +92,16 @@ class LivePipeline:
         warm_planes: bool = False,
         seed: int | None = None,
     ) -> None:
-        self.chain = chain if isinstance(chain, Compose) else load_config(Path(chain)).pipeline
+        self.chain = _chain_of(chain)
         self._check_chain(seed)
         if not isinstance(like, DepthFrame):
             raise DTypeError(
                 f"LivePipeline: like must be a DepthFrame, got {type(like).__name__}; of arrays make one by "
                 "DepthFrame.from_numpy(depth, intrinsics, metres_per_unit=0.001)"
+            )
+        if before is not None and not isinstance(before, OverTime):
+            raise DTypeError(
+                f"LivePipeline: before must be a LiveTemporalFilter or a LiveAverage, got {type(before).__name__}"
             )
         self.before, self.max_age = before, max_age
         self._like, self._seed, self._same_pixels = like, seed, same_pixels
@@ -298,6 +302,17 @@ class LivePipeline:
     def __repr__(self) -> str:
         height, width = self._like.size
         return f"LivePipeline({len(self._names)} steps, {self._like.num_views} views of {width}x{height})"
+
+
+def _chain_of(given: Any) -> Compose:
+    if isinstance(given, Compose):
+        return given
+    if isinstance(given, str | PathLike):
+        return load_config(Path(given)).pipeline
+    raise DTypeError(
+        f"LivePipeline: the chain must be a Compose or the path of a YAML file, got {type(given).__name__}; of what "
+        "load_config returns give .pipeline, of a list of steps make a Compose"
+    )
 
 
 def _tensors_of(cloud: PointCloud) -> list[Tensor]:

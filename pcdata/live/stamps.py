@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from numbers import Real
 
 from pcdata.errors import ConfigError
 from pcdata.live.faults import Fault
@@ -63,4 +64,4 @@ class Stamps:
 
 
 def _is_number(stamp: object) -> bool:
-    return isinstance(stamp, int | float) and not isinstance(stamp, bool) and math.isfinite(stamp)
+    return isinstance(stamp, Real) and not isinstance(stamp, bool) and math.isfinite(stamp)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import threading
 import time
 import tracemalloc
 import warnings
@@ -165,7 +166,7 @@ def test_late_frames_old_ones_and_other_clocks_are_told(scene):
     assert fault(5, 1000.0) is Fault.WRONG_CLOCK
     assert fault(6, float("nan")) is Fault.WRONG_CLOCK
     assert fault(7, "now") is Fault.WRONG_CLOCK
-    assert fault(8, 100.06) is None
+    assert fault(8, np.float32(100.0625)) is None
     assert live.stats().faults == {"late": 1, "out_of_order": 1, "wrong_clock": 3}
 
 
@@ -187,6 +188,10 @@ def test_what_is_wrong_with_the_chain_is_raised_at_the_start(scene):
         LivePipeline(chain(), like=replace(scene, depth=scene.depth * 0))
     with pytest.raises(DTypeError, match="from_numpy"):
         LivePipeline(chain(), like=scene.depth.numpy())
+    with pytest.raises(DTypeError, match="Compose"):
+        LivePipeline([pcdata.Deproject()], like=scene)
+    with pytest.raises(DTypeError, match="LiveTemporalFilter"):
+        LivePipeline(chain(), like=scene, before=pcdata.TemporalFilterDepth())
     with pytest.raises(ConfigError, match="max_age"):
         LivePipeline(chain(), like=scene, max_age=0)
 
@@ -320,6 +325,35 @@ def test_a_warning_is_no_fault(scene):
         warnings.simplefilter("error")
         live = LivePipeline(pcdata.Compose([pcdata.Deproject()]), like=scene)
         assert live(moved(scene, 0)).fault is None
+
+
+def test_other_defaults_of_torch_change_nothing(scene):
+    frame, like = moved(scene, 1), of_arrays(scene)
+    expected = chain()(frame)
+    depth, colors, pose = arrays(frame)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert_equal(LivePipeline(chain(), like=scene)(frame).cloud, expected)
+        live = LivePipeline(chain(), like=like, warm_planes=True, before=LiveTemporalFilter())
+        for _ in range(2):
+            assert live(depth, colors=colors, pose=pose).cloud.points.dtype is torch.float32
+            depth[5, 5] += 1
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_threads_take_turns(scene):
+    live, found = LivePipeline(chain(), like=scene, same_pixels=False), {}
+    expected = [chain()(moved(scene, number)) for number in range(4)]
+    frames = [moved(scene, number) for number in range(4)]
+    threads = [threading.Thread(target=lambda n=n: found.update({n: live(frames[n])})) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for number in range(4):
+        assert_equal(found[number].cloud, expected[number])
+    assert sorted(answer.number for answer in found.values()) == [0, 1, 2, 3]
 
 
 def test_interrupts_pass(scene, monkeypatch):
