@@ -64,4 +64,6 @@ class Stamps:
 
 
 def _is_number(stamp: object) -> bool:
-    return isinstance(stamp, Real) and not isinstance(stamp, bool) and math.isfinite(stamp)
+    if isinstance(stamp, bool):
+        return False
+    return isinstance(stamp, Real) and math.isfinite(stamp)
