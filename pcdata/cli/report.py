@@ -65,10 +65,10 @@ def is_dataset(arguments: argparse.Namespace) -> bool:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from pcdata import extras
     from pcdata.build import load_config
     from pcdata.files.opening import replacing
     from pcdata.io.sources.capture_source import check_apart
+    from pcdata.report.figures.report_pictures import check_pictures, write_pictures
     from pcdata.report.html.capture_report import page_of_captures
     from pcdata.report.html.dataset_report import gather_dataset
     from pcdata.report.html.gathering import gather_captures
@@ -77,7 +77,7 @@ def _report(arguments: argparse.Namespace) -> int:
     if out:
         check_apart("--out", out, arguments.path)
     if arguments.png:
-        extras.require("matplotlib")
+        check_pictures(arguments.png)
     with ExitStack() as opened:
         temporary = opened.enter_context(replacing("report --out", out)) if out else None
         with ProgressBar("report") as progress:
@@ -101,8 +101,6 @@ def _report(arguments: argparse.Namespace) -> int:
     if out:
         print(f"page     {out} ({len(page) / 1e6:.1f} MB)")
     if arguments.png:
-        from pcdata.report.figures.report_pictures import write_pictures
-
         written = write_pictures(gathered, arguments.png)
         print(f"pictures {arguments.png} ({len(written)})")
     return 0

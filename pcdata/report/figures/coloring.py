@@ -16,7 +16,7 @@ PALETTE = (
     *("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7"),
     *("#a463f2", "#97bbf5", "#9c6b4e", "#e15759", "#76b7b2", "#edc948"),
 )
-NONE = "#9498a0"  # of a category below zero: no label
+NONE = "#9498a0"  # of a category below zero, no label, and of what is no number
 HEIGHT, DISTANCE = "height", "distance"
 
 

@@ -45,13 +45,10 @@ def write_pictures(gathered: Gathered, path: str | Path) -> list[Path]:
         CaptureError: the folder's name is that of a file.
         WriteError: a file cannot be written.
     """
-    extras.require("matplotlib")
-    target = Path(path)
+    target = check_pictures(path)
     if target.suffix.lower() == ".png":
         _write(target, _all_in_one(gathered))
         return [target]
-    if target.exists() and not target.is_dir():
-        raise CaptureError(f"report --png: {target} is a file; give a folder, or a name that ends in .png")
     written: list[Path] = []
     for name, figure in _figures(gathered):
         target.mkdir(parents=True, exist_ok=True)
@@ -61,6 +58,24 @@ def write_pictures(gathered: Gathered, path: str | Path) -> list[Path]:
         if _OWN.fullmatch(file.name) and file not in written:
             file.unlink()
     return written
+
+
+def check_pictures(path: str | Path) -> Path:
+    """Require that pictures can be drawn, and that their place is none of something else; before captures are judged.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        CaptureError: the folder's name is that of a file, or the file's that of a folder.
+    """
+    extras.require("matplotlib")
+    target = Path(path)
+    single = target.suffix.lower() == ".png"
+    if target.exists() and target.is_dir() == single:
+        raise CaptureError(
+            f"report --png: {target} is a {'folder' if single else 'file'}; "
+            "give a folder for several pictures, or a name that ends in .png for one"
+        )
+    return target
 
 
 def _figures(gathered: Gathered) -> Iterator[tuple[str, Any]]:

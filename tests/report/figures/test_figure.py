@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,7 @@ from pcdata.report.figures.cloud_picture import cloud_picture
 from pcdata.report.figures.coloring import PALETTE, coloring_of
 from pcdata.report.html.scene import stage_of
 from pcdata.report.html.unpacking import unpack_cloud
+from pcdata.structures.kinds import Kind
 from pcdata.transforms import Deproject, EstimateNormals, FarthestPointSample
 from pcdata.validation import validate_source
 from pcdata.validation.grading import Grading
@@ -158,6 +161,18 @@ def test_a_grading_is_drawn_by_its_trends():
 def test_few_points_are_drawn_too(tmp_path, count):
     cloud = PointCloud(points=torch.ones(count, 3), frame_id="base")
     figure(cloud, title="few").savefig(tmp_path / "few.png")
+
+
+def test_numbers_that_are_none_keep_the_colors_of_the_others():
+    values = torch.linspace(0, 1, 100)
+    cloud = PointCloud(points=torch.rand(100, 3), extra={"c": values}, kinds={"c": Kind.INVARIANT}, frame_id="base")
+    with_none = replace(cloud, extra={"c": torch.where(torch.arange(100) == 50, torch.nan, values)})
+    one, other = (
+        coloring_of(unpack_cloud(stage_of("", each).cloud), "c", np.array([0, 0, 1.0])) for each in (cloud, with_none)
+    )
+    assert other.span == pytest.approx(one.span, abs=0.02)
+    assert [*other.colors[50]] == [0x94, 0x98, 0xA0]  # gray, as in the viewer
+    figure(with_none, color="c")
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])

@@ -57,7 +57,9 @@ def test_one_picture_of_all_beside_the_page(captures, tmp_path):
 def test_a_file_is_no_folder_and_captures_are_left_alone(captures, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert main(["report", str(captures), "--png", str(tmp_path / "notes.txt")]) == 1
-    assert "is a file; give a folder, or a name that ends in .png" in capsys.readouterr().err
+    heard = capsys.readouterr()
+    assert "is a file; give a folder for several pictures, or a name that ends in .png" in heard.err
+    assert "report 1/" not in heard.err  # told before captures are judged
     before = names(captures)
     assert main(["report", str(captures), "--png", str(captures / "shown")]) == 2
     assert "inside the captures" in capsys.readouterr().err
