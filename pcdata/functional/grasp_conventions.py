@@ -90,6 +90,10 @@ def _convention(where: str, name: str, given: str | GraspConvention | ParallelJa
                 f"ParallelJaw{near_matches(given, GRASP_CONVENTIONS)}"
             )
         return GRASP_CONVENTIONS[given]
+    if not isinstance(given, GraspConvention):
+        raise ConfigError(
+            f"{where}: {name} must be a name of GRASP_CONVENTIONS, a GraspConvention or a ParallelJaw, got {given!r}"
+        )
     if given.approach not in _AXES or given.closing not in _AXES or given.approach == given.closing:
         raise ConfigError(f"{where}: {name} must have two axes of {_AXES}, got {given.approach!r}, {given.closing!r}")
     return given

@@ -101,7 +101,7 @@ class ClusterObjects(DropLimit):
     def _counts(self) -> tuple[int, float]:
         """Return the limits of points that hold."""
         fewest = self.min_size or (1 if self.min_area is not None else _FEWEST)
-        most = self.max_size or (math.inf if self.max_area is not None else max(_MOST, fewest))
+        most = self.max_size or (math.inf if self.max_area is not None else _MOST)
         return fewest, most
 
     @torch_on_one_thread()

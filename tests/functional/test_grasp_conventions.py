@@ -168,6 +168,8 @@ def test_unknown_names_and_missing_tips_are_told():
         convert_grasps(grasps, source="graspnet", target="m2t2")
     with pytest.raises(ShapeError, match=r"source_tips must be one number or \(2,\)"):
         convert_grasps(grasps, source="graspnet", target="m2t2", source_tips=torch.zeros(3))
+    with pytest.raises(ConfigError, match=r"source must be a name of GRASP_CONVENTIONS, .* got None"):
+        convert_grasps(grasps, source=None, target="m2t2")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="must have two axes"):
         convert_grasps(grasps, source=GraspConvention("x", "x", 0.0), target="m2t2")
     assert convert_grasps(grasps[:0], source=PANDA, target="graspnet", target_tips=0.02).shape == (0, 4, 4)

@@ -147,3 +147,6 @@ def test_a_cloud_with_nothing_to_split_is_an_error_alone_and_in_a_batch():
 def test_sizes_must_be_in_order():
     with pytest.raises(ConfigError, match="min_size 200 exceeds max_size 100"):
         ClusterObjects(min_size=200, max_size=100)
+    with pytest.raises(ConfigError, match="min_size 60000 exceeds max_size 50000"):
+        ClusterObjects(min_size=60_000)
+    ClusterObjects(min_size=60_000, max_area=1.0)
