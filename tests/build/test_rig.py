@@ -14,6 +14,7 @@ from pcdata.cli import main
 from pcdata.datasets import CachedCloudDataset
 from pcdata.io import open_source, write_calibration
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
+from pcdata.transforms import ClusterObjects, Compose
 from tests.rigs import calibration_of, write_rig
 
 ROOT = Path(__file__).parents[2]
@@ -53,3 +54,13 @@ def test_the_page_s_commands_find_and_mend_a_camera_and_build_one_cloud(scene: T
     assert float(off.median()) < 0.004  # noise and voxels; 10 mm out of place would be 6 mm from the surfaces
     assert float(metres[:, 2].min()) > 0.002  # the table is gone
     assert open_source("dataset/shards/00000/raw/f0").kind == "rig"
+
+
+def test_the_config_parts_objects_that_touch() -> None:
+    pipeline = (ROOT / CONFIG).read_text(encoding="utf-8").split("\noutput:")[0]
+    steps = Compose.from_yaml(pipeline)
+    frame = tabletop(5, 6, 4, size=(240, 320), touching=True, floor=False).frame
+    passing = steps.step_through(frame, generator=torch.Generator().manual_seed(0))
+    found = next(cloud for step, cloud in passing if isinstance(step, ClusterObjects))
+    assert len(found.meta[0]["objects"]) == 6
+    assert len(found.meta[0]["touching"]["cuts"]) >= 5

@@ -294,6 +294,25 @@ def _seeds(
     return seeds
 
 
+def parted_at_jumps(
+    inverse: Tensor,  # (H, W) float64
+    label: Tensor,  # (H, W) int64, -1 = none
+    camera: PixelCamera,
+    noise: float,
+    limits: Limits,
+) -> Tensor:  # (H, W) int64
+    """Make regions of their own of what jumps part in one; parts smaller than seeds are of none."""
+    across, along = _jumps(inverse, inverse > 0, limits.jump * noise)
+    across, along = across | (label[:, 1:] != label[:, :-1]), along | (label[1:] != label[:-1])
+    part = connected_pixels(label >= 0, across, along)
+    area = torch.where(inverse > 0, 1 / (inverse * inverse).clamp(min=1e-12), 0.0) / (camera.fx * camera.fy)
+    size = torch.zeros(label.numel() + 1, dtype=torch.float64, device=label.device)
+    size.index_add_(0, part.flatten(), area.flatten())
+    large = size >= limits.seed_area
+    large[-1] = False
+    return torch.where(large, large.cumsum(0) - 1, -1)[part]
+
+
 def connected_pixels(mask: Tensor, across: Tensor, along: Tensor) -> Tensor:
     """Return for every pixel of the mask the lowest pixel it is connected to, over neighbors without a jump.
 

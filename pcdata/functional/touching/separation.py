@@ -15,7 +15,7 @@ from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import REASONS, Objects, join_hollows, join_occluded, merge_weak_contacts
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
 from pcdata.functional.touching.ramps import sharpened
-from pcdata.functional.touching.regions import PixelCamera, smooth_regions
+from pcdata.functional.touching.regions import PixelCamera, parted_at_jumps, smooth_regions
 
 _NOISE_STEP = 3  # pixels: neighbors share noise, and whole steps of the sensor
 _NOISE_FACTOR = 1.75  # of the table's noise to that of second differences over 3 pixels, on 45 tables of a Kinect
@@ -105,8 +105,13 @@ def regions_of(
     limits: Limits,
     backend: str,
     colors: Tensor | None,
+    *,
+    over_jumps: bool = True,
 ) -> tuple[Objects, Tensor]:
-    """Cut one image into smooth regions, each an object of its own as yet; also return the region (N,) of points."""
+    """Cut one image into smooth regions, each an object of its own as yet; also return the region (N,) of points.
+
+    What no seed reaches but over a jump belongs to the region that does; without ``over_jumps`` to one of its own.
+    """
     inverse, camera, pixel = _image(points, grid)
     if noise is None:
         noise = _measured_noise(inverse)
@@ -118,6 +123,8 @@ def regions_of(
         heights = torch.zeros_like(inverse)
         heights.view(-1)[pixel] = height.double()
     regions = smooth_regions(inverse, camera, noise, limits, backend=backend)
+    if not over_jumps:
+        regions = regions._replace(label=parted_at_jumps(inverse, regions.label, camera, noise, limits))
     contacts = region_contacts(inverse, regions.label, camera, noise, limits, backend=backend)
     if colors is not None:
         image = torch.zeros(inverse.numel(), 3, dtype=torch.float64, device=points.device)
