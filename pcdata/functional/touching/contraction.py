@@ -25,7 +25,12 @@ class Edge(NamedTuple):
     lines: int = 0
 
     def __add__(self, other: Edge) -> Edge:  # type: ignore[override]
-        return Edge(*(a + b for a, b in zip(self, other)))
+        return Edge(
+            self.drawn + other.drawn,
+            self.weight + other.weight,
+            self.free + other.free,
+            self.lines + other.lines,
+        )
 
     def sum(self) -> float:
         """How strongly they are drawn together; below 0 they are driven apart."""
