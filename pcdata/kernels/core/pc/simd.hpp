@@ -1,7 +1,7 @@
 // Numbers handled side by side.
 //
 // A register (FloatRegister, Int32Register, ...) holds as many as the processor handles at once: 16 floats with
-// AVX-512, 8 with AVX2, 4 with SSE2. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in one to
+// AVX-512, 8 with AVX2, 4 with SSE2 and NEON. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in one to
 // eight registers: what a search for sixteen queries works on.
 //
 // Arithmetic and comparisons are GCC's and Clang's vector extension; intrinsics stand only where it has no word for an
@@ -17,6 +17,9 @@
 
 #if defined(__SSE2__)
 #include <immintrin.h>
+#elif defined(__aarch64__) && defined(__ARM_NEON)
+#include <arm_neon.h>
+#define PC_NEON 1
 #endif
 
 // Registers are passed between inline functions only, so no calling convention is at stake.
@@ -100,6 +103,11 @@ inline FloatRegister maximum(const FloatRegister& a, const FloatRegister& b) { r
 inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) { return _mm_min_pd(a, b); }
 inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) { return _mm_max_pd(a, b); }
 inline DoubleRegister square_root(const DoubleRegister& a) { return _mm_sqrt_pd(a); }
+#elif defined(PC_NEON)
+// Its own minimum and maximum of NaN and a number are NaN.
+inline DoubleRegister square_root(const DoubleRegister& a) {
+  return reinterpret_cast<DoubleRegister>(vsqrtq_f64(reinterpret_cast<float64x2_t>(a)));
+}
 #else
 inline DoubleRegister square_root(DoubleRegister a) {
   for (int i = 0; i < kLanes / 2; ++i) a[i] = std::sqrt(a[i]);
@@ -188,6 +196,9 @@ struct RegisterMask {
     return static_cast<uint32_t>(_mm256_movemask_ps(reinterpret_cast<__m256>(native)));
 #elif defined(__SSE2__)
     return static_cast<uint32_t>(_mm_movemask_ps(reinterpret_cast<__m128>(native)));
+#elif defined(PC_NEON)
+    constexpr Int32Register places = {1, 2, 4, 8};
+    return vaddvq_u32(reinterpret_cast<uint32x4_t>(native & places));
 #else
     uint32_t bits = 0;
     for (int i = 0; i < kLanes; ++i) bits |= static_cast<uint32_t>(native[i] & 1) << i;
@@ -254,6 +265,10 @@ inline Int32Register floored(const FloatRegister& x) {
   return reinterpret_cast<Int32Register>(_mm512_maskz_cvt_roundps_epi32(kAll16, native(x), down));
 #elif defined(__AVX2__)
   return reinterpret_cast<Int32Register>(_mm256_cvtps_epi32(_mm256_floor_ps(reinterpret_cast<__m256>(x))));
+#elif defined(PC_NEON)
+  const Int32Register whole = reinterpret_cast<Int32Register>(vcvtmq_s32_f32(reinterpret_cast<float32x4_t>(x)));
+  const Int32Register held = (x >= -2147483648.0f) & (x < 2147483648.0f);  // NEON gives 0 for NaN, else the nearest
+  return held ? whole : Int32Register{} + INT32_MIN;
 #else
   const Int32Register whole = truncated(x);
   return whole + (as_float(whole) > x);  // a comparison is -1 where it holds
@@ -266,6 +281,8 @@ inline Int32Register rounded(const FloatRegister& x) {
   return reinterpret_cast<Int32Register>(_mm512_maskz_cvtps_epi32(kAll16, native(x)));
 #elif defined(__AVX2__)
   return reinterpret_cast<Int32Register>(_mm256_cvtps_epi32(reinterpret_cast<__m256>(x)));
+#elif defined(PC_NEON)
+  return reinterpret_cast<Int32Register>(vcvtnq_s32_f32(reinterpret_cast<float32x4_t>(x)));
 #else
   constexpr float shift = 12582912.0f;
   return truncated((x + shift) - shift);
@@ -298,6 +315,13 @@ inline uint64_t signs_of(const int8_t* numbers) {
     bits |= static_cast<uint64_t>(static_cast<uint32_t>(_mm_movemask_epi8(some))) << 16 * i;
   }
   return bits;
+#elif defined(PC_NEON)
+  constexpr uint8_t kPlaces[16] = {1, 2, 4, 8, 16, 32, 64, 128, 1, 2, 4, 8, 16, 32, 64, 128};
+  const uint8x16_t places = vld1q_u8(kPlaces);
+  uint8x16_t some[4];
+  for (int i = 0; i < 4; ++i) some[i] = vandq_u8(vcltzq_s8(vld1q_s8(numbers + 16 * i)), places);
+  const uint8x16_t pairs = vpaddq_u8(vpaddq_u8(some[0], some[1]), vpaddq_u8(some[2], some[3]));
+  return vgetq_lane_u64(vreinterpretq_u64_u8(vpaddq_u8(pairs, pairs)), 0);
 #else
   uint64_t bits = 0;
   for (int i = 0; i < 64; ++i) bits |= static_cast<uint64_t>(numbers[i] < 0) << i;

@@ -128,6 +128,10 @@ FourInts widened(const uint8_t* from) {
   std::memcpy(&word, from, sizeof word);
   const __m128i zero = _mm_setzero_si128();
   return reinterpret_cast<FourInts>(_mm_unpacklo_epi16(_mm_unpacklo_epi8(_mm_cvtsi32_si128(word), zero), zero));
+#elif defined(PC_NEON)
+  uint32_t word;
+  std::memcpy(&word, from, sizeof word);
+  return reinterpret_cast<FourInts>(vmovl_u16(vget_low_u16(vmovl_u8(vreinterpret_u8_u32(vdup_n_u32(word))))));
 #else
   FourBytes bytes;
   std::memcpy(&bytes, from, sizeof bytes);
@@ -139,6 +143,10 @@ void store_narrowed(uint8_t* to, const FourInts& numbers) {
 #if defined(__SSE2__)
   const __m128i words = _mm_packs_epi32(reinterpret_cast<__m128i>(numbers), reinterpret_cast<__m128i>(numbers));
   const int32_t word = _mm_cvtsi128_si32(_mm_packus_epi16(words, words));
+  std::memcpy(to, &word, sizeof word);
+#elif defined(PC_NEON)
+  const uint16x4_t words = vmovn_u32(reinterpret_cast<uint32x4_t>(numbers));
+  const uint32_t word = vget_lane_u32(vreinterpret_u32_u8(vmovn_u16(vcombine_u16(words, words))), 0);
   std::memcpy(to, &word, sizeof word);
 #else
   const FourBytes bytes = __builtin_convertvector(numbers, FourBytes);
@@ -158,7 +166,7 @@ void mix_bytes(const uint8_t* corner, const Around& around, const Block& block, 
   constexpr float kShift = 8388608.0F;
   constexpr int32_t kShiftBits = 0x4B000000;
   const FourFloats shifted = mixed + kShift;
-  store_narrowed(sampled, reinterpret_cast<const FourInts&>(shifted) - kShiftBits);
+  store_narrowed(sampled, reinterpret_cast<FourInts>(shifted) - kShiftBits);
 }
 
 template <class Value>
