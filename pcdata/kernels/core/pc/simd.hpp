@@ -1,8 +1,8 @@
 // Numbers handled side by side.
 //
 // A register (FloatRegister, Int32Register, ...) holds as many as the processor handles at once: 16 floats with
-// AVX-512, 8 with AVX2, 4 with SSE2 and NEON. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in one to
-// eight registers: what a search for sixteen queries works on.
+// AVX-512, 8 with AVX2, 4 with SSE2 and NEON. A pack (FloatPack, DoublePack) holds sixteen whatever the processor, in
+// one to eight registers: what a search for sixteen queries works on.
 //
 // Arithmetic and comparisons are GCC's and Clang's vector extension; intrinsics stand only where it has no word for an
 // instruction, or where compilers do not find it.
