@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,28 +17,41 @@ from pcdata import extras
 from pcdata.errors import CaptureError
 from pcdata.files.opening import replacing
 from pcdata.report.figures.figure import Panel, figure_of
-from pcdata.report.figures.panels import cloud_panel, funnel_panel, picture_panel, trend_panel
-from pcdata.report.html.gathering import Gathered, Looked, told_trends
+from pcdata.report.figures.overall_figures import (
+    WIDTH,
+    cameras_panel,
+    episodes_figure,
+    gaps_figure,
+    numbers_figure,
+    objects_figure,
+    planes_figure,
+)
+from pcdata.report.figures.panels import cloud_panel, funnel_panel, picture_panel
+from pcdata.report.html.gathering import Gathered, Looked
 from pcdata.report.labels import label_text
-from pcdata.validation.grading import LETTERS
+from pcdata.validation.grading import LETTERS, Grading
 from pcdata.verdicts import Verdict
 
 _COLUMNS = 4
-_WIDTH = 3.9  # inches of a panel
-_MOST_TRENDS = 24
+_LETTERS_PER_INCH = 15.4  # of a reason
+_LINE = 0.17  # inches of a reason
+_HEAD = 0.9  # inches above the reasons
+_MOST_LETTERS = 400  # of one reason
 _MOST_REASONS = 10
 _MOST_PANELS = 16  # of one sample
 _TALLEST = 30_000  # pixels of one picture of all: what programs still open
-_OWN = re.compile(r"sample_\d+\.png")
+_OWN = re.compile(r"(sample_\d+|summary|episodes|gaps|planes|objects|numbers)\.png")
 _LETTER_COLORS = {"A": "#2b7a3f", "B": "#2b7a3f", "C": "#9a6200", "D": "#c02626", "F": "#c02626"}
 
 
 def write_pictures(gathered: Gathered, path: str | Path) -> list[Path]:
     """Write what was gathered as PNG: one picture where the path ends in ``.png``, else a folder of them.
 
-    A folder holds ``summary.png`` (grade, reasons, points after each step), ``sample_01.png`` and on (of each sample
-    that is shown, the worst first: its images, its cloud after each step) and ``numbers.png`` (every check's number
-    over the samples). Pictures of those names are replaced, samples of an earlier, longer run removed.
+    A folder holds ``summary.png`` (grade, reasons, cameras over the captures, points after each step),
+    ``episodes.png`` (bands of verdicts and signals), ``sample_01.png`` and on (of each sample that is shown, the worst
+    first: its images, its cloud after each step), ``gaps.png`` (between cameras), ``planes.png``, ``objects.png`` and
+    ``numbers.png`` (every check's number over the samples): those that there is something to draw for. Pictures of
+    those names are replaced, those of an earlier run that this one has not are removed.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -81,45 +94,64 @@ def check_pictures(path: str | Path) -> Path:
 def _figures(gathered: Gathered) -> Iterator[tuple[str, Any]]:
     """Draw one picture after another: none waits in memory for the next."""
     yield "summary", _summary(gathered)
+    if (episodes := episodes_figure(gathered)) is not None:
+        yield "episodes", episodes
     digits = max(2, len(str(len(gathered.looked))))
     for place, one in enumerate(gathered.looked, 1):
         yield f"sample_{place:0{digits}}", _sample(gathered, one)
-    if trends := told_trends(gathered.grading):
-        panels: list[Panel] = [partial(trend_panel, trend=trend, name=name) for name, trend in trends[:_MOST_TRENDS]]
-        more = f", {len(trends) - _MOST_TRENDS} more are in pcdata grade --json" if len(trends) > _MOST_TRENDS else ""
-        yield (
-            "numbers",
-            figure_of(panels, title=f"Numbers over the samples{more}", columns=_COLUMNS, width=_WIDTH, height=2.2),
-        )
+    rest = {"gaps": gaps_figure, "planes": planes_figure, "objects": objects_figure, "numbers": numbers_figure}
+    for name, draw in rest.items():
+        if (figure := draw(gathered)) is not None:
+            yield name, figure
 
 
 def _summary(gathered: Gathered) -> Any:
-    panels: list[Panel] = [partial(_verdict_panel, gathered=gathered)]
+    """Draw the verdict, and beside it what fits a row: cameras over the captures, points after each step."""
+    beside: list[Panel] = []
+    height = 4.0
+    if (cameras := cameras_panel(gathered)) is not None:
+        beside.append(cameras[0])
+        height = max(height, 0.4 * cameras[1] + 1)
     if gathered.funnel:
-        panels.append(partial(funnel_panel, funnel=gathered.funnel))
-    # As wide as a row of samples, the verdict beside the funnel.
-    width = _COLUMNS * _WIDTH / len(panels)
-    height = max(4.0, 0.35 * len(gathered.funnel) + 1)
-    return figure_of(panels, title=_title(gathered.title), columns=2, width=width, height=height)
+        beside.append(partial(funnel_panel, funnel=gathered.funnel))
+        height = max(height, 0.35 * len(gathered.funnel) + 1)
+    width = WIDTH / (len(beside) + 1)
+    reasons = _reasons(gathered, int(_LETTERS_PER_INCH * width))
+    height = max(height, _HEAD + _LINE * len(reasons) + 0.3)
+    verdict: Panel = partial(_verdict_panel, grading=gathered.grading, reasons=reasons, size=(height, width))
+    return figure_of([verdict, *beside], title=_title(gathered.title), width=width, height=height)
 
 
-def _verdict_panel(axis: Any, gathered: Gathered) -> None:
-    grading = gathered.grading
-    grade = grading.grade()
-    axis.set_axis_off()
-    counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
-    axis.text(0, 1, grade.letter, fontsize=40, fontweight="bold", color=_LETTER_COLORS[grade.letter], va="top")
-    axis.text(0.12, 0.96, f"{LETTERS[grade.letter]}\n{len(grading.ids):,} captures: {counts or 'none'}", va="top")
-    width = 240 if not gathered.funnel else 120
+def _reasons(gathered: Gathered, letters: int) -> list[str]:
+    """Return what keeps the grade from an A as lines of so many letters, the worst first."""
+    reasons = gathered.grading.grade().reasons
+    most = -(-_MOST_LETTERS // letters)
     lines: list[str] = []
-    for reason in grade.reasons[:_MOST_REASONS]:
-        lines += textwrap.wrap(label_text(reason), width, subsequent_indent="    ", max_lines=3, placeholder=" ...")
-    if len(grade.reasons) > _MOST_REASONS:
-        lines.append(f"and {len(grade.reasons) - _MOST_REASONS} more")
+    for reason in reasons[:_MOST_REASONS]:
+        lines += textwrap.wrap(
+            label_text(reason), letters, subsequent_indent="    ", max_lines=most, placeholder=" ..."
+        )
+    if len(reasons) > _MOST_REASONS:
+        lines.append(f"and {len(reasons) - _MOST_REASONS} more")
     if gathered.left_out:
         lines.append(f"{len(gathered.left_out):,} captures were left out of the dataset")
-    told = "\n".join(lines) or "Nothing that these checks look for is wrong."
-    axis.text(0, 0.78, told, va="top", fontsize=8, linespacing=1.4)
+    return lines or ["Nothing that these checks look for is wrong."]
+
+
+def _verdict_panel(axis: Any, grading: Grading, reasons: Sequence[str], size: tuple[float, float]) -> None:
+    letter = grading.grade().letter
+    height, width = size
+    axis.set_axis_off()
+    counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
+    rule = "\n".join(textwrap.wrap(LETTERS[letter], int(0.6 * _LETTERS_PER_INCH * width)))
+    head = f"{rule}\n{len(grading.ids):,} captures: {counts or 'none'}"
+    drawn = [
+        axis.text(0, 1, letter, fontsize=40, fontweight="bold", color=_LETTER_COLORS[letter], va="top"),
+        axis.text(0.7 / width, 0.98, head, va="top", fontsize=9),
+        axis.text(0, 1 - _HEAD / height, "\n".join(reasons), va="top", fontsize=8, linespacing=1.4),
+    ]
+    for text in drawn:
+        text.set_in_layout(False)  # long words would leave the panels beside it no room
 
 
 def _sample(gathered: Gathered, one: Looked) -> Any:
@@ -131,7 +163,7 @@ def _sample(gathered: Gathered, one: Looked) -> Any:
         panels.append(partial(funnel_panel, funnel=one.funnel))
     if one.problem or not panels:
         panels.insert(0, partial(_problem_panel, problem=one.problem or "nothing can be shown"))
-    return figure_of(panels, title=_title(one.sample_id), columns=_COLUMNS, width=_WIDTH, height=3.4)
+    return figure_of(panels, title=_title(one.sample_id), columns=_COLUMNS, width=WIDTH / _COLUMNS, height=3.4)
 
 
 def _problem_panel(axis: Any, problem: str) -> None:

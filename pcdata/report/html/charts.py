@@ -94,10 +94,8 @@ def strip(
     width: int = 720,
 ) -> str:
     """Verdicts over samples in order as one colored band, the worst of each column; gaps as dark marks above it."""
-    count = len(severities)
-    columns = min(count, width)
-    worst = np.full(columns, -1, dtype=np.int64)
-    np.maximum.at(worst, np.arange(count) * columns // max(count, 1), severities)
+    count, worst = len(severities), worst_of_columns(severities, width)
+    columns = len(worst)
     edges = [0, *(np.flatnonzero(np.diff(worst)) + 1).tolist(), columns] if columns else [0]
     drawn = []
     for start, stop in itertools.pairwise(edges):
@@ -108,6 +106,15 @@ def strip(
         x = width * place / max(count, 1)
         drawn.append(f'<path d="M{x - 4:.1f} 0h8l-4 6z" fill="currentColor"/>')
     return _stretched(width, 20, "".join(drawn))
+
+
+def worst_of_columns(severities: NDArray[np.integer], most: int) -> NDArray[np.int64]:
+    """Return the worst of each of up to ``most`` runs of as many samples, in order."""
+    count = len(severities)
+    columns = min(count, most)
+    worst = np.full(columns, -1, dtype=np.int64)
+    np.maximum.at(worst, np.arange(count) * columns // max(count, 1), severities)
+    return worst
 
 
 def verdict_legend() -> str:

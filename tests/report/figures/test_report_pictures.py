@@ -36,9 +36,9 @@ def test_a_folder_holds_the_panels_of_this_run_and_no_page_is_written(captures, 
     for name in ("sample_01.png", "sample_07.png", "own.png"):  # of a longer run, and of somebody else
         (folder / name).write_bytes(b"before")
     assert main(["report", str(captures), "--png", "shown", "--samples", "2"]) == 0
-    assert "pictures shown (4)" in capsys.readouterr().out
+    assert "pictures shown (5)" in capsys.readouterr().out
     assert names(tmp_path) == ["shown"]
-    assert names(folder) == ["numbers.png", "own.png", "sample_01.png", "sample_02.png", "summary.png"]
+    assert names(folder) == ["numbers.png", "own.png", "planes.png", "sample_01.png", "sample_02.png", "summary.png"]
     assert (folder / "own.png").read_bytes() == b"before"
     (folder / "own.png").unlink()
     assert all(colored(file) > 0.01 for file in folder.iterdir())

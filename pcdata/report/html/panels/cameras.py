@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from statistics import median
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,12 @@ from numpy.typing import NDArray
 from pcdata.report.html.charts import bins, curves, strip, verdict_legend
 from pcdata.report.html.gathering import Gathered
 from pcdata.report.html.page import Section
+from pcdata.report.html.pair_gaps import PairGap, pair_gaps
 from pcdata.report.html.text import shown
 from pcdata.validation.by_camera import CameraHistory, cameras_of
 from pcdata.validation.grading import Grading
-from pcdata.validation.overlap_result import PairOverlap
 
-_PLANES = (  # finding, heading, unit that is shown, of it in one of the finding's
+PLANES = (  # finding, heading, unit that is shown, of it in one of the finding's
     ("plane_noise", "Noise: scatter of readings on the largest plane", "mm", 1e3),
     ("plane_height", "Height of the largest plane", "mm", 1e3),
     ("plane_tilt", "Tilt of the largest plane", "degrees", 1.0),
@@ -43,11 +42,7 @@ def _history(camera: CameraHistory) -> str:
 
 def overlap_panel(gathered: Gathered) -> Section | None:
     """The gaps between the surfaces of every two cameras, over the captures that are shown."""
-    pairs: dict[tuple[str, str], list[PairOverlap]] = {}
-    for one in gathered.looked:
-        for pair in one.pairs:
-            pairs.setdefault((pair.first, pair.second), []).append(pair)
-    rows = [_pair_row(names, found) for names, found in sorted(pairs.items(), key=lambda one: -_gap(one[1]))]
+    rows = [_pair_row(gap) for gap in pair_gaps(pair for one in gathered.looked for pair in one.pairs)]
     if not rows:
         return None
     head = (
@@ -62,25 +57,17 @@ def overlap_panel(gathered: Gathered) -> Section | None:
     return Section("Overlap of cameras", f'<div class="wide"><table>{head}{"".join(rows)}</table></div>{note}')
 
 
-def _gap(pairs: Sequence[PairOverlap]) -> float:
-    measured = [pair.median for pair in pairs if math.isfinite(pair.median)]
-    return median(measured) if measured else -1.0
-
-
-def _pair_row(names: tuple[str, str], pairs: Sequence[PairOverlap]) -> str:
-    measured = [pair for pair in pairs if math.isfinite(pair.median)]
-    shared = f"{100 * median(pair.overlap for pair in pairs):.0f} %"
-    if not measured:
+def _pair_row(gap: PairGap) -> str:
+    shared = f"{100 * gap.shared:.0f} %"
+    if math.isnan(gap.half):
         told = f'<td colspan="2">too little is shared</td><td class="number">{shared}</td><td></td>'
     else:
-        verdict = max((pair.verdict for pair in measured), key=lambda one: one.severity)
-        half, most = (1e3 * median(getattr(pair, name) for pair in measured) for name in ("median", "p90"))
-        counts = np.sum([pair.histogram for pair in measured], axis=0)
+        half, most = 1e3 * gap.half, 1e3 * gap.most
         told = (
-            f'<td class="number {verdict}">{half:.1f} mm</td><td class="number">{most:.1f} mm</td>'
-            f'<td class="number">{shared}</td><td>{bins(counts)}</td>'
+            f'<td class="number {gap.verdict}">{half:.1f} mm</td><td class="number">{most:.1f} mm</td>'
+            f'<td class="number">{shared}</td><td>{bins(gap.counts)}</td>'
         )
-    return f"<tr><td>{shown(names[0], 80)} - {shown(names[1], 80)}</td>{told}</tr>"
+    return f"<tr><td>{shown(gap.first, 80)} - {shown(gap.second, 80)}</td>{told}</tr>"
 
 
 def planes_panel(gathered: Gathered) -> Section | None:
@@ -96,7 +83,7 @@ def planes_panel(gathered: Gathered) -> Section | None:
 
 
 def _plane_parts(grading: Grading) -> Iterator[str]:
-    for name, heading, unit, factor in _PLANES:
+    for name, heading, unit, factor in PLANES:
         series = {view: factor * values for view, values in series_of(grading, name).items()}
         if not series:
             continue

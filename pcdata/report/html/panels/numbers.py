@@ -16,7 +16,13 @@ from pcdata.validation.grading import Trend
 from pcdata.verdicts import Verdict
 
 _MOST_TRENDS = 64  # time lines
-_OWN_PANELS = ("plane_noise", "plane_height", "plane_tilt", "object_count", "object_size")
+OWN_PANELS = (
+    "plane_noise",
+    "plane_height",
+    "plane_tilt",
+    "object_count",
+    "object_size",
+)  # checks that are shown elsewhere
 
 
 def funnel_panel(gathered: Gathered) -> Section | None:
@@ -63,7 +69,7 @@ def _sizes(boxes: Sequence[tuple[float, float, float]]) -> str:
 
 def numbers_panel(gathered: Gathered) -> Section:
     """Every check's number; those that pass everywhere are folded."""
-    told = [(name, trend) for name, trend in told_trends(gathered.grading) if trend.name not in _OWN_PANELS]
+    told = [(name, trend) for name, trend in told_trends(gathered.grading) if trend.name not in OWN_PANELS]
     bad = [one for one in told if one[1].verdict.severity >= Verdict.WARN.severity]
     good = [one for one in told if one[1].verdict.severity < Verdict.WARN.severity]
     parts = [_trend(name, trend, gathered.grading.ids) for name, trend in bad[:_MOST_TRENDS]]

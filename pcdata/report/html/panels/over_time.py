@@ -20,10 +20,8 @@ _OPEN = 1  # episodes whose signals are seen at once
 def time_panel(gathered: Gathered) -> Section | None:
     """Return the episodes over time, the worst first, or the whole recording where there are none."""
     grading = gathered.grading
-    if len(grading.ids) < 2:
+    if not is_over_time(gathered):
         return None
-    if not grading.episodes and not any(line.gaps or line.signals for line in gathered.lines):
-        return None  # the cameras' bands say it all
     lines = [_line(grading, line, is_open=number < _OPEN) for number, line in enumerate(gathered.lines)]
     table = _table(grading) if len(grading.episodes) > 1 else ""
     has_gaps = any(line.gaps for line in gathered.lines)
@@ -31,6 +29,13 @@ def time_panel(gathered: Gathered) -> Section | None:
     return Section(
         "Episodes over time" if grading.episodes else "Over time", note + "".join(lines) + verdict_legend() + table
     )
+
+
+def is_over_time(gathered: Gathered) -> bool:
+    """Whether there is more to tell over time than the cameras' bands do: episodes, gaps or signals."""
+    if len(gathered.grading.ids) < 2:
+        return False
+    return bool(gathered.grading.episodes) or any(line.gaps or line.signals for line in gathered.lines)
 
 
 def _line(grading: Grading, line: EpisodeLine, *, is_open: bool) -> str:
