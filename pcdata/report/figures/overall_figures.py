@@ -53,7 +53,7 @@ def cameras_panel(gathered: Gathered) -> tuple[Panel, int] | None:
 
 def _since(camera: CameraHistory) -> str:
     checks = ", ".join(dict.fromkeys(fault.name for fault in camera.faults))
-    return f"{camera.verdict} {camera.since}: {checks}" if camera.faults else f"{camera.verdict}"
+    return f"{camera.verdict} {checks}: {camera.since}" if camera.faults else f"{camera.verdict}"
 
 
 def episodes_figure(gathered: Gathered) -> Any | None:
@@ -106,7 +106,7 @@ def planes_figure(gathered: Gathered) -> Any | None:
     panels: list[Panel] = []
     for name, heading, unit, factor in PLANES:
         series = {view: factor * values for view, values in series_of(gathered.grading, name).items()}
-        named = {f"{view}, median {np.nanmedian(values):.4g}": values for view, values in series.items()}
+        named = {f"median {np.nanmedian(values):.4g}, {view}": values for view, values in series.items()}
         if named:
             panels.append(partial(curves_panel, title=f"{heading} [{unit}]", series=named))
     if not panels:

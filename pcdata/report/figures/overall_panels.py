@@ -17,7 +17,7 @@ from pcdata.report.labels import label_text
 
 _COLUMNS = 720  # of a band: the worst of each is drawn
 _MOST_CURVES = 12
-_MOST_TOLD = 20  # samples named below an axis
+_NAME_WIDTH = 0.85  # inches of a sample's name below an axis
 _NONE = (0, 0, 0, 0)  # clear: no verdict
 
 
@@ -144,7 +144,8 @@ def boxes_panel(axis: Any, samples: Sequence[tuple[str, Sequence[tuple[float, fl
     axis.vlines(across, edges.min(1, initial=np.inf), edges.max(1, initial=0), color="#d9d9d4", linewidth=1, zorder=1)
     for column, name in enumerate(("length", "width", "height")):
         axis.plot(across, edges[:, column], "_", color=PALETTE[column], markersize=7, markeredgewidth=2, label=name)
-    every = -(-len(samples) // _MOST_TOLD)
+    room = axis.get_position().width * axis.figure.get_size_inches()[0]
+    every = -(-len(samples) // max(int(room / _NAME_WIDTH), 1))
     told = [
         f"{label_text(_short(sample_id, 14))}\n{len(own)} object{'s' * (len(own) != 1)}"
         for sample_id, own in samples[::every]

@@ -21,6 +21,7 @@ _VIRIDIS = np.array(
     dtype=np.float64,
 )
 NO_READING = (214, 64, 159)  # not in viridis
+_LEVEL = 5  # of zlib: a third less time than its usual 6, for at most 3 % more bytes (real and made captures)
 _STEP = 0.03  # of the depth: neighbors farther apart are two surfaces, as in Kinect-like sensors up to some metres
 
 
@@ -83,7 +84,7 @@ def viridis(share: NDArray[np.floating]) -> NDArray[np.uint8]:
 def png(image: NDArray[np.uint8]) -> bytes:
     """Return an image (H, W, 3) as the bytes of a PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="png")
+    Image.fromarray(image).save(buffer, format="png", compress_level=_LEVEL)
     return buffer.getvalue()
 
 
@@ -93,7 +94,7 @@ def _ramp_png(share: NDArray[np.floating], there: NDArray[np.bool_]) -> bytes:
     image = Image.fromarray(levels)
     image.putpalette(np.vstack([np.array([NO_READING], np.uint8), viridis(np.linspace(0, 1, 255))]).tobytes())
     buffer = io.BytesIO()
-    image.save(buffer, format="png")
+    image.save(buffer, format="png", compress_level=_LEVEL)
     return buffer.getvalue()
 
 

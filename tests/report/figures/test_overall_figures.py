@@ -58,7 +58,7 @@ def test_the_summary_has_reasons_first_then_since_when_each_camera_is_off(gather
     _, summary = next(_figures(gathered))
     verdict, cameras, funnel = summary.axes
     assert "fail view_pose view 1 (front), in 3 of 6 captures, from 'f3' on" in texts(verdict)
-    assert "view 1 (front)  fail from 'f3' on, in 3 of 6 captures: view_pose" in texts(cameras)
+    assert "view 1 (front)  fail view_pose: from 'f3' on, in 3 of 6 captures" in texts(cameras)
     left, front, right = cameras.images
     assert severities(front) == [0] * MOVED_FROM + [3] * (NUM_FRAMES - MOVED_FROM)
     assert severities(left) == severities(right) == [0] * NUM_FRAMES
@@ -104,7 +104,8 @@ def test_planes_are_drawn_in_millimetres_for_every_camera(gathered):
         series = series_of(gathered.grading, name)
         assert len(axis.lines) == len(series) == 3
         for line, (view, values) in zip(axis.lines, series.items()):
-            assert line.get_label().startswith(f"{view}, median")
+            assert line.get_label().endswith(f", {view}")
+            assert line.get_label().startswith(f"median {factor * np.median(values):.4g}")
             assert line.get_ydata() == pytest.approx(factor * values)
     assert "plane" not in " ".join(axis.get_title() for axis in numbers_figure(gathered).axes)  # each is shown once
 
