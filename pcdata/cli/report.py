@@ -103,7 +103,7 @@ def _report(arguments: argparse.Namespace) -> int:
     if arguments.png:
         written = write_pictures(gathered, arguments.png)
         print(f"pictures {arguments.png} ({len(written)})")
-    return 0
+    return int(gathered.grading.none_read)
 
 
 def _grade(arguments: argparse.Namespace) -> int:

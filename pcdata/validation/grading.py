@@ -107,6 +107,7 @@ class Grading:
         self.together: list[tuple[str, Finding]] = []  # about all captures of a recording: its name, what was found
         self.sample_verdicts = np.full(len(ids), -1, dtype=np.int8)  # severity; -1 = no report yet
         self._place = 0
+        self._num_refused = 0
 
     def add(self, report: SampleReport) -> None:
         """Take the report on the next capture, or on a recording."""
@@ -121,6 +122,7 @@ class Grading:
                 self.names[view] = f"view {view}"
         place, self._place = self._place, self._place + 1
         self.sample_verdicts[place] = report.verdict.severity
+        self._num_refused += report.refused
         for finding in report.findings:
             key = (finding.name, finding.view)
             self.trends.setdefault(key, Trend(*key)).add(place, finding)
@@ -129,12 +131,17 @@ class Grading:
         """How many captures have this verdict."""
         return int((self.sample_verdicts == verdict.severity).sum())
 
+    @property
+    def none_read(self) -> bool:
+        """Whether no capture could be read, of those that came so far."""
+        return self._num_refused == self._place
+
     def grade(self) -> Grade:
         """Grade what came so far."""
         graded = max(int((self.sample_verdicts >= 0).sum()), 1)
         failing, warning = self.count(Verdict.FAIL) / graded, self.count(Verdict.WARN) / graded
         together = {finding.verdict for _, finding in self.together}
-        if Verdict.FAIL in together or failing > MOST_BAD or not (self.sample_verdicts >= 0).any():
+        if Verdict.FAIL in together or failing > MOST_BAD or self.none_read:
             letter = "F"
         elif failing:
             letter = "D"
@@ -189,7 +196,7 @@ class Grading:
         return Counter(self.episodes[int(number)].id for number in inside)
 
     def _reasons(self) -> Iterable[str]:
-        if not (self.sample_verdicts >= 0).any():
+        if self.none_read:
             yield "no capture could be read"
         for severity in (Verdict.FAIL, Verdict.WARN):
             for name, finding in self.together:

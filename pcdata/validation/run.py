@@ -78,8 +78,8 @@ def _reports(source: CaptureSource, limits: CaptureLimits) -> Iterator[SampleRep
     for ids, name in zip(recordings, _names_of(recordings)):
         series = _Series(limits)
         for sample_id in ids:
-            series.views = ()
-            yield SampleReport(sample_id, tuple(series.check(source, sample_id)), views=series.views)
+            found = tuple(series.check(source, sample_id))
+            yield SampleReport(sample_id, found, views=series.views, refused=series.refused)
         if whole := series.whole():
             yield SampleReport(name, tuple(whole), whole=True)
 
@@ -123,10 +123,12 @@ class _Series:
         self._limits = limits
         self._checks = [(check, check.memory()) for check in CHECKS.values()]
         self.views: tuple[str, ...] = ()  # of the last capture
+        self.refused = False  # whether it could not be read
 
     @torch_on_one_thread()
     def check(self, source: CaptureSource, sample_id: str) -> list[Finding]:
         found: list[Finding] = []
+        self.views, self.refused = (), False
         try:
             stored = stored_captures(source, sample_id)
             for layout, own in stored:
@@ -138,6 +140,7 @@ class _Series:
                         found += check.judge(depth, self._limits, found, *memory)
             capture = source.load(sample_id)
         except PcdataError as error:
+            self.refused = True
             return [*found, check_of_error(error)]
         if not isinstance(capture, (DepthFrame, PointCloud)):
             raise DTypeError(

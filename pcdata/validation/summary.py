@@ -24,6 +24,7 @@ class SampleReport:
     findings: tuple[Finding, ...]
     whole: bool = False  # it is about a recording; its id is WHOLE, or ends so
     views: tuple[str, ...] = ()  # what its views are called; () = it has none, or was not read
+    refused: bool = False  # it could not be read
 
     @property
     def verdict(self) -> Verdict:

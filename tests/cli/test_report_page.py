@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from pcdata import PointCloud, write_ply
 from pcdata.cli import main
 from pcdata.report.html.page import page_of
 from pcdata.synthetic import tabletop
@@ -62,6 +63,26 @@ def test_what_is_wrong_comes_first(capsys, frozen, tmp_path):
     first = re.search(r'data-sample="0">show (\w+)<', body)
     assert first is not None
     assert first[1] == "f1"  # the worst is shown first
+
+
+def test_captures_that_all_are_refused_are_told_and_no_success(capsys, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / "broken").mkdir(exist_ok=True)
+        (tmp_path / "broken" / f"{name}.ply").write_bytes(b"no cloud")
+    page, pictures = tmp_path / "report.html", tmp_path / "shown"
+    code, out, _ = run(capsys, "report", tmp_path / "broken", "--out", page, "--png", pictures)
+    assert code == 1
+    assert out.startswith("grade    F\n  no capture could be read\n")
+    assert "No capture could be read." in page.read_text(encoding="utf-8")
+    assert (pictures / "summary.png").stat().st_size > 0
+    code, out, _ = run(capsys, "grade", tmp_path / "broken")
+    assert code == 1
+    assert "\n  no capture could be read\n" in out
+    torch.manual_seed(0)
+    write_ply(tmp_path / "broken" / "c.ply", PointCloud(points=torch.rand(200, 3), frame_id="base"))
+    code, out, _ = run(capsys, "report", tmp_path / "broken", "--out", page)
+    assert code == 0  # one can be looked at
+    assert "no capture" not in out
 
 
 def test_the_steps_of_a_pipeline_are_shown(capsys, made, tmp_path):

@@ -8,11 +8,14 @@ path to leave. The name by which it was asked must be this machine's own: a fore
 from __future__ import annotations
 
 import hmac
+import io
 import json
 import re
 import secrets
+import socket
 import sys
 import threading
+import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -24,7 +27,9 @@ from pcdata.report.serving.samples import Samples
 
 HOST = "127.0.0.1"
 _MOST_AT_ONCE = 16  # requests; more wait for their turn
-_PATIENCE = 20.0  # seconds that a connection may say or take nothing
+_PATIENCE = 20.0  # seconds that a request waits for its turn, and an answer of no length for being taken
+_ASKING = 10.0  # seconds for all of a request: less than others wait, so that whoever says little holds up nobody
+_SLOWEST = 50_000  # bytes a second that an answer is taken with, as over a forwarded port
 _HOST_NAMES = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE | re.ASCII)
 _SAMPLE = re.compile(r"sample/([0-9]{1,12})", re.ASCII)
 _CLOUD = re.compile(r"cloud/([0-9]{1,12})/([0-9]{1,4})", re.ASCII)
@@ -113,9 +118,15 @@ class ViewServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: ViewServer
-    timeout = _PATIENCE  # of every read and write
+    timeout = _PATIENCE
     server_version = "pcdata"
     sys_version = ""
+
+    def setup(self) -> None:
+        """Read what is asked by one deadline: a timeout begins anew with every byte."""
+        super().setup()
+        self.rfile.close()
+        self.rfile = io.BufferedReader(_Asked(self.connection, time.monotonic() + _ASKING))
 
     def do_GET(self) -> None:
         try:
@@ -169,6 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
         return HTTPStatus.NOT_FOUND, _TEXT, b"no such page\n", {}
 
     def _send(self, status: HTTPStatus, kind: str, content: bytes, more: dict[str, str]) -> None:
+        self.connection.settimeout(_PATIENCE + len(content) / _SLOWEST)  # of all that is sent
         self.send_response(status)
         for name, value in {"Content-Type": kind, "Content-Length": str(len(content)), **_SAFE, **more}.items():
             self.send_header(name, value)
@@ -191,6 +203,24 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing: addresses hold the token."""
+
+
+class _Asked(io.RawIOBase):
+    """What a connection says until a deadline."""
+
+    def __init__(self, connection: socket.socket, deadline: float) -> None:
+        self._connection = connection
+        self._deadline = deadline
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        left = self._deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("the request took too long")
+        self._connection.settimeout(left)
+        return self._connection.recv_into(buffer)
 
 
 _SAFE = {

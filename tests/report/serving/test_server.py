@@ -6,9 +6,11 @@ import json
 import socket
 import struct
 import threading
+import time
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
@@ -286,7 +288,7 @@ def test_a_client_that_goes_away_is_no_fault(server, capsys):
 
 
 def test_connections_that_say_nothing_give_their_turn_back(source, monkeypatch):
-    monkeypatch.setattr(server_module._Handler, "timeout", 0.2)
+    monkeypatch.setattr(server_module, "_ASKING", 0.2)
     with served(Counted(source.ids)) as running:
         idle = [socket.create_connection(("127.0.0.1", running.server_port)) for _ in range(40)]
         try:
@@ -295,6 +297,44 @@ def test_connections_that_say_nothing_give_their_turn_back(source, monkeypatch):
         finally:
             for connection in idle:
                 connection.close()
+
+
+def test_connections_that_say_a_letter_now_and_then_give_their_turn_back(source, monkeypatch):
+    monkeypatch.setattr(server_module, "_ASKING", 0.5)
+    with served(Counted(source.ids)) as running:
+        slow = [socket.create_connection(("127.0.0.1", running.server_port)) for _ in range(16)]
+        over = threading.Event()
+
+        def say() -> None:
+            while not over.wait(0.05):
+                for connection in slow:
+                    with suppress(OSError):
+                        connection.sendall(b"G")
+
+        speaker = threading.Thread(target=say)
+        speaker.start()
+        try:
+            assert ask(running, "samples")[0] == 200
+        finally:
+            over.set()
+            speaker.join()
+            for connection in slow:
+                connection.close()
+
+
+def test_an_answer_is_taken_as_slowly_as_over_a_forwarded_port(source, monkeypatch):
+    monkeypatch.setattr(server_module, "_PATIENCE", 0.2)
+    with served(Counted(source.ids)) as running:
+        running.page = bytes(4 << 20)
+        with socket.socket() as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
+            connection.connect(("127.0.0.1", running.server_port))
+            connection.sendall(f"GET /{running.token}/ HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            time.sleep(1.0)  # longer than the patience with a request
+            taken = 0
+            while part := connection.recv(1 << 16):
+                taken += len(part)
+    assert taken > 4 << 20
 
 
 def test_a_port_that_is_taken_is_told(server):

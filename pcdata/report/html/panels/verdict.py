@@ -17,9 +17,10 @@ def verdict_panel(gathered: Gathered, scenes: Mapping[str, int]) -> Section:
     grade = grading.grade()
     counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
     total = int((grading.sample_verdicts >= 0).sum())
+    rule = "no capture could be read" if grading.none_read else LETTERS[grade.letter]
     head = (
         f'<p class="head"><span class="grade {grade.letter}">{grade.letter}</span><span>'
-        f"{shown(_sentence(LETTERS[grade.letter]))}. Of {total:,} captures: {counts or 'none'}.</span></p>"
+        f"{shown(_sentence(rule))}. Of {total:,} captures: {counts or 'none'}.</span></p>"
     )
     found = [
         (finding, _told(finding, grading.name_of(finding.view), f"all captures of {name}"))
