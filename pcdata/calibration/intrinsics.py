@@ -230,7 +230,7 @@ def _refuse_degenerate(tilt: float, focal_uncertainty: float) -> None:
         )
     if not focal_uncertainty <= _MAX_FOCAL_UNCERTAINTY:
         raise CalibrationError(
-            f"calibrate_intrinsics: the focal length is uncertain by {100 * focal_uncertainty:.2g} percent; add views "
+            f"calibrate_intrinsics: the focal length is uncertain by {100 * focal_uncertainty:.3g} percent; add views "
             "that are tilted more, about both axes, closer, and reach into the corners of the image"
         )
 

@@ -17,6 +17,7 @@ from pcdata.cli.options import (
     skip_list,
     tell_skipped,
 )  # fmt: skip
+from pcdata.cli.outputs import text_files
 
 if TYPE_CHECKING:
     from pcdata.structures import Calibration
@@ -59,19 +60,17 @@ def _add_rig_options(command: argparse.ArgumentParser, *, needs_calibration: boo
 
 
 def _overlap(arguments: argparse.Namespace) -> int | None:
-    from pcdata.files.opening import replacing
     from pcdata.files.strict_json import json_text
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
     from pcdata.verdicts import Verdict
 
     rig = _open(arguments, arguments.calibration)
-    captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
-    result = verify_overlap(*captures, names=captures[0].provenance["cameras"])
+    with text_files("overlap", json=arguments.json) as write:
+        captures = [rig.load(sample_id) for sample_id in rig.ids[: arguments.limit]]
+        result = verify_overlap(*captures, names=captures[0].provenance["cameras"])
+        write("json", json_text(result.to_json(), indent=2) + "\n")
     print(result.text())
-    if arguments.json:
-        with replacing("overlap --json", arguments.json) as temporary:
-            temporary.write_text(json_text(result.to_json(), indent=2) + "\n", encoding="utf-8")
     if arguments.figure:
         save_overlap_figure(arguments.figure, captures[0], result)
     return FAILED if result.verdict is Verdict.FAIL else None

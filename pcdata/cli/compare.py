@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 from pcdata.cli.argument_types import positive
 from pcdata.cli.options import add_capture_options, given_flags, open_captures
+from pcdata.cli.outputs import text_files
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -31,21 +31,18 @@ def add_to(commands: Any) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from pcdata.files.opening import replacing
+    from pcdata.files.strict_json import json_text
     from pcdata.report.html.compare_page import compare_page
     from pcdata.validation.comparison import compare_sources
     from pcdata.verdicts import Verdict
 
     a, b = (_opened(path, arguments) for path in (arguments.path, arguments.source))
     _refuse_unused(arguments)
-    with ProgressBar("compare", unit="capture") as progress:
-        result = compare_sources(a, b, captures=arguments.captures, progress=progress)
-    if arguments.json:
-        with replacing("compare --json", arguments.json) as temporary:
-            Path(temporary).write_text(json.dumps(result.to_json(), indent=1, allow_nan=False), encoding="utf-8")
-    if arguments.out:
-        with replacing("compare --out", arguments.out) as temporary:
-            Path(temporary).write_text(compare_page(result), encoding="utf-8")
+    with text_files("compare", json=arguments.json, out=arguments.out) as write:
+        with ProgressBar("compare", unit="capture") as progress:
+            result = compare_sources(a, b, captures=arguments.captures, progress=progress)
+        write("json", json_text(result.to_json(), indent=1))
+        write("out", compare_page(result))
     print(result.text())
     return int(result.verdict is Verdict.FAIL)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from pcdata.cli.argument_types import positive
 from pcdata.cli.options import add_capture_options, open_captures
+from pcdata.cli.outputs import text_files
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -25,24 +25,17 @@ def add_to(commands: Any) -> None:
 
 
 def _drift(arguments: argparse.Namespace) -> int:
-    from pcdata.files.opening import replacing
     from pcdata.files.strict_json import json_text
-    from pcdata.io.sources.capture_source import check_apart
     from pcdata.report.html.drift_page import drift_page
     from pcdata.validation.drift import measure_drift
     from pcdata.verdicts import Verdict
 
-    if arguments.out:
-        check_apart("--out", arguments.out, arguments.path)
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
     reference = open_captures(arguments.reference, arguments) if arguments.reference else None
-    with ProgressBar("drift") as progress:
-        result = measure_drift(source, reference=reference, window=arguments.window, progress=progress)
-    if arguments.json:
-        with replacing("drift --json", arguments.json) as temporary:
-            Path(temporary).write_text(json_text(result.to_json(), indent=1), encoding="utf-8")
-    if arguments.out:
-        with replacing("drift --out", arguments.out) as temporary:
-            Path(temporary).write_text(drift_page(result, f"Drift of {source}"), encoding="utf-8")
+    with text_files("drift", json=arguments.json, out=arguments.out) as write:
+        with ProgressBar("drift") as progress:
+            result = measure_drift(source, reference=reference, window=arguments.window, progress=progress)
+        write("json", json_text(result.to_json(), indent=1))
+        write("out", drift_page(result, f"Drift of {source}"))
     print(result.text())
     return int(result.verdict is Verdict.FAIL)

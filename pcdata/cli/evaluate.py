@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from pcdata.cli.argument_types import positive, whole_numbers
+from pcdata.cli.outputs import text_files
 
 
 def add_to(commands: Any) -> None:
@@ -57,22 +58,21 @@ def _tolerance(text: str) -> float:
 def _evaluate(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
-    from pcdata.files.opening import replacing
     from pcdata.files.strict_json import json_text
     from pcdata.report.segmentation_text import segmentation_text
     from pcdata.validation.label_files import matched_labels, paired_files, read_label_file
     from pcdata.validation.segmentation import mean_scores, score_segmentation
 
-    scores = {}
-    for name, predicted, true in paired_files(arguments.predicted, arguments.true):
-        guess, truth, blank = matched_labels(
-            read_label_file(predicted, background=arguments.background),
-            read_label_file(true, background=arguments.true_background, parts=arguments.true_parts),
-        )
-        scores[name] = score_segmentation(guess, truth, ignore=blank, tolerance=arguments.tolerance)
+    with text_files("evaluate", json=arguments.json) as write:
+        scores = {}
+        for name, predicted, true in paired_files(arguments.predicted, arguments.true):
+            guess, truth, blank = matched_labels(
+                read_label_file(predicted, background=arguments.background),
+                read_label_file(true, background=arguments.true_background, parts=arguments.true_parts),
+            )
+            scores[name] = score_segmentation(guess, truth, ignore=blank, tolerance=arguments.tolerance)
+        told = {"mean": mean_scores([*scores.values()]), "scenes": {name: asdict(one) for name, one in scores.items()}}
+        write("json", json_text(told, indent=1) + "\n")
     print(segmentation_text(scores))
     if arguments.json is not None:
-        told = {"mean": mean_scores([*scores.values()]), "scenes": {name: asdict(one) for name, one in scores.items()}}
-        with replacing("evaluate --json", arguments.json) as temporary:
-            temporary.write_text(json_text(told, indent=1) + "\n", encoding="utf-8")
         print(f"json  {arguments.json}")

@@ -91,7 +91,20 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
 def _refuse_empty(arguments: argparse.Namespace) -> None:
     """Refuse a path without a letter, which would stand for the folder that one is in."""
-    for name in ("path", "dataset", "source", "config", "out", "file", "json", "figure", "png", "calibration", "table"):
+    for name in (
+        "path",
+        "reference",
+        "dataset",
+        "source",
+        "config",
+        "out",
+        "file",
+        "json",
+        "figure",
+        "png",
+        "calibration",
+        "table",
+    ):
         if getattr(arguments, name, None) == "":
             raise ConfigError(f"{name}: is empty; give a path, or leave it out (is a variable of the shell not set?)")
 
@@ -112,7 +125,7 @@ def _refuse_replacing(arguments: argparse.Namespace) -> None:
         place = getattr(arguments, written, None)
         if not isinstance(place, str) or place == "-" or (written == "out" and hasattr(arguments, "out_may_be_url")):
             continue
-        for read in ("path", "source", "images", "poses"):
+        for read in ("path", "source", "reference", "images", "poses"):
             given = getattr(arguments, read, None)
             for path in given if isinstance(given, list) else [given]:
                 if isinstance(path, str):

@@ -8,6 +8,7 @@ from typing import Any
 from pcdata.cli.argument_types import positive
 from pcdata.cli.choices import add_model_options, given_choices
 from pcdata.cli.options import add_import_option
+from pcdata.cli.outputs import text_files
 
 
 def add_to(commands: Any) -> None:
@@ -32,22 +33,20 @@ def add_to(commands: Any) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from pcdata.exports import is_export
-    from pcdata.files.opening import replacing
     from pcdata.files.strict_json import json_text
     from pcdata.io.store.manifest import FILE_NAME
     from pcdata.report.validation_text import validation_text
     from pcdata.verdicts import Verdict
 
-    if arguments.keys:
-        summary = _check_foreign(arguments)
-    elif _holds(arguments.path, FILE_NAME):
-        summary = _check_cache(arguments)
-    else:
-        summary = _check_export(arguments) if is_export(arguments.path) else _check_foreign(arguments)
-    if arguments.json:
-        with replacing("check --json", arguments.json) as temporary, open(temporary, "w", encoding="utf-8") as file:
-            told = {"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}
-            file.write(json_text(told, indent=1))
+    with text_files("check", json=arguments.json) as write:
+        if arguments.keys:
+            summary = _check_foreign(arguments)
+        elif _holds(arguments.path, FILE_NAME):
+            summary = _check_cache(arguments)
+        else:
+            summary = _check_export(arguments) if is_export(arguments.path) else _check_foreign(arguments)
+        told = {"schema": "pcdata.check/1", "model": arguments.model, **summary.to_json()}
+        write("json", json_text(told, indent=1))
     print(validation_text(summary))
     return int(summary.verdict is Verdict.FAIL)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
+import os
 from pathlib import Path
 from typing import Any
 
 from pcdata.cli.argument_types import positive
 from pcdata.cli.known_names import SENSORS
 from pcdata.cli.options import add_capture_options, given_options, open_captures
+from pcdata.cli.outputs import text_files
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -66,7 +67,7 @@ def is_dataset(arguments: argparse.Namespace) -> bool:
 
 def _report(arguments: argparse.Namespace) -> int:
     from pcdata.build import load_config
-    from pcdata.files.opening import replacing
+    from pcdata.errors import ConfigError
     from pcdata.io.sources.capture_source import check_apart
     from pcdata.report.figures.report_pictures import check_pictures, write_pictures
     from pcdata.report.html.capture_report import page_of_captures
@@ -77,9 +78,11 @@ def _report(arguments: argparse.Namespace) -> int:
     if out:
         check_apart("--out", out, arguments.path)
     if arguments.png:
+        if out and os.path.realpath(out) == os.path.realpath(arguments.png):
+            raise ConfigError(f"report: --out and --png are one place, {out}; give two")
         check_pictures(arguments.png)
-    with ExitStack() as opened:
-        temporary = opened.enter_context(replacing("report --out", out)) if out else None
+    page = ""
+    with text_files("report", out=out) as write:
         with ProgressBar("report") as progress:
             if is_dataset(arguments):
                 gathered = gather_dataset(arguments.path, num_shown=arguments.samples, progress=progress)
@@ -91,15 +94,15 @@ def _report(arguments: argparse.Namespace) -> int:
                     num_shown=arguments.samples,
                     progress=progress,
                 )
-        if temporary is not None:
-            page = page_of_captures(gathered).encode()
-            Path(temporary).write_bytes(page)
+        if out:
+            page = page_of_captures(gathered)
+            write("out", page)
     grade = gathered.grading.grade()
     print(f"grade    {grade.letter}")
     for reason in grade.reasons[:3]:
         print(f"  {reason}")
     if out:
-        print(f"page     {out} ({len(page) / 1e6:.1f} MB)")
+        print(f"page     {out} ({len(page.encode()) / 1e6:.1f} MB)")
     if arguments.png:
         written = write_pictures(gathered, arguments.png)
         print(f"pictures {arguments.png} ({len(written)})")
@@ -107,26 +110,24 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _grade(arguments: argparse.Namespace) -> int:
-    from pcdata.files.opening import replacing
     from pcdata.files.strict_json import json_text
     from pcdata.io.sources.capture_source import episodes_of
     from pcdata.report.html.dataset_report import dataset_page
     from pcdata.validation import validate_source
     from pcdata.validation.grading import LETTERS, Grading
 
-    with ProgressBar("grade") as progress:
-        if is_dataset(arguments):
-            _, grading = dataset_page(arguments.path, num_shown=1, progress=progress)
-        else:
-            source = open_captures(arguments.path, arguments, limit=arguments.limit)
-            grading = Grading(source.ids, episodes_of(source))
-            for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
-                grading.add(report)
-                if not report.whole:
-                    progress(done, len(source.ids), report.sample_id)
-    if arguments.json:
-        with replacing("grade --json", arguments.json) as temporary:
-            Path(temporary).write_text(json_text(grading.to_json(), indent=1), encoding="utf-8")
+    with text_files("grade", json=arguments.json) as write:
+        with ProgressBar("grade") as progress:
+            if is_dataset(arguments):
+                _, grading = dataset_page(arguments.path, num_shown=1, progress=progress)
+            else:
+                source = open_captures(arguments.path, arguments, limit=arguments.limit)
+                grading = Grading(source.ids, episodes_of(source))
+                for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
+                    grading.add(report)
+                    if not report.whole:
+                        progress(done, len(source.ids), report.sample_id)
+        write("json", json_text(grading.to_json(), indent=1))
     grade = grading.grade()
     print(f"{grade.letter}: {LETTERS[grade.letter]}")
     for reason in grade.reasons:

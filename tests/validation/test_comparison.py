@@ -244,3 +244,12 @@ def test_numbers_are_of_the_captures_and_not_of_their_order():
     backwards = Source(dict(reversed(tables(50).captures.items())))
     forth, back = compare_sources(tables(0), tables(50)), compare_sources(tables(0), backwards)
     assert np.allclose([one.b for one in forth.measured], [one.b for one in back.measured])
+
+
+@pytest.mark.parametrize("largest", [1e22, 1e30, 3e38])
+def test_coordinates_near_the_end_of_what_a_float_holds_are_compared(largest):
+    points = largest * torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+    far = Source({str(n): PointCloud(points=points, frame_id="base") for n in range(4)})
+    near = Source({str(n): PointCloud(points=points / largest, frame_id="base") for n in range(4)})
+    assert compare_sources(far, far).verdict is not Verdict.FAIL
+    json.dumps(compare_sources(far, near).to_json(), allow_nan=False)

@@ -26,7 +26,7 @@ def behind_camera(cloud: PointCloud, limits: CaptureLimits, before: Sequence[Fin
             "behind_camera",
             fraction,
             (0.0, 0.01),
-            found=f"{100 * fraction:.2g} % of the points have a negative z",
+            found=f"{100 * fraction:.3g} % of the points have a negative z",
             advice="z points backwards (OpenGL axes), or the cloud is in another frame than the camera's: give "
             "frame_id",
         )

@@ -121,7 +121,7 @@ def _saturation(readings: Tensor, limits: CaptureLimits, metres_per_unit: float 
     found, advice = "no pile of readings at either end of the range", ""
     if fraction:
         stored = None if metres_per_unit is None else round(value / metres_per_unit)
-        found = f"{100 * fraction:.2g} % of the readings are exactly {value:.5g} m"
+        found = f"{100 * fraction:.3g} % of the readings are exactly {value:.5g} m"
         advice = "clipped at the end of the sensor's range: store 0 there instead"
         if stored is not None and metres_per_unit != 1.0:
             found += f", stored as {stored}" + (f", {MARKS[stored]}" if stored in MARKS else "")

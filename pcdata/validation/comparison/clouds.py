@@ -46,6 +46,8 @@ def _patches(points: Tensor, away: Tensor, points_each: float) -> _Numbers:
     count = near.sum(1)
     mean = (near @ center) / count[:, None]
     squares = (near @ (center[:, :, None] * center[:, None]).reshape(-1, 9)).reshape(-1, 3, 3) / count[:, None, None]
+    if not bool(torch.isfinite(squares).all()):  # coordinates near the end of what a float holds
+        return {}
     spread = torch.linalg.eigvalsh(squares - mean[:, :, None] * mean[:, None]).clamp(min=0)
     flat = (count >= _LEAST_POINTS) & (spread[:, 1] > _ROUND * spread[:, 2])
     if not bool(flat.any()):

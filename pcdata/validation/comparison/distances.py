@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 _FIRST, _STEPS, _COUNT = 0.125, 2, 18  # metres; classes for every doubling; up to 64 m
 NUM_CLASSES = _COUNT
+_FARTHEST = 2.0**100  # metres, of which the square is a float still
 FACING = -1  # of what has no distance
 
 
@@ -29,4 +30,4 @@ def in_words(number: int) -> str:
 
 def octave(distance: float) -> float:
     """Return 1, 2, 4, ... by the distance in metres: lengths that grow with it, but not with every millimetre."""
-    return float(2.0 ** max(0, round(np.log2(max(distance, 1e-3)))))
+    return float(2.0 ** max(0, round(np.log2(min(max(distance, 1e-3), _FARTHEST)))))
