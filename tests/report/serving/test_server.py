@@ -36,22 +36,24 @@ def server(source) -> Iterator[ViewServer]:
         yield running
 
 
-def test_a_sample_and_its_points_come_when_they_are_asked_for(server, source):
-    assert ask(server)[0] == 200
-    assert source.loads == []
-    status, headers, content = ask(server, "sample/1")
-    assert (status, headers["content-type"]) == (200, "application/json")
-    assert source.loads == ["second"]
-    said = json.loads(content)
-    assert said["name"] == "second"
-    (stage,) = said["stages"]
-    assert stage["cloud"]["blob"] == "cloud/1/0"
-    status, headers, content = ask(server, "cloud/1/0")
-    assert (status, headers["content-type"]) == (200, "application/octet-stream")
-    found = decoded(PackedCloud(stage["cloud"], content))
-    assert abs(found["points"] - source.load("second").points.numpy()).max() < 1e-5
-    assert found["labels"][:, 0].tolist() == list(range(51))
-    assert source.loads == ["second", "second"]  # the second time here: what was read is kept
+def test_a_sample_and_its_points_come_when_they_are_asked_for(source):
+    own = Counted(source.ids)
+    with served(own) as server:
+        assert ask(server)[0] == 200
+        assert own.loads == []
+        status, headers, content = ask(server, "sample/1")
+        assert (status, headers["content-type"]) == (200, "application/json")
+        assert own.loads == ["second"]
+        said = json.loads(content)
+        assert said["name"] == "second"
+        (stage,) = said["stages"]
+        assert stage["cloud"]["blob"] == "cloud/1/0"
+        status, headers, content = ask(server, "cloud/1/0")
+        assert (status, headers["content-type"]) == (200, "application/octet-stream")
+        found = decoded(PackedCloud(stage["cloud"], content))
+        assert abs(found["points"] - own.load("second").points.numpy()).max() < 1e-5
+        assert found["labels"][:, 0].tolist() == list(range(51))
+        assert own.loads == ["second", "second"]  # the second time here: what was read is kept
 
 
 def test_names_are_listed_and_found(server):
