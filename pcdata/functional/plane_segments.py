@@ -12,8 +12,9 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length, checked_places
 from pcdata.errors import NoPlaneError, UnitError
-from pcdata.functional.clusters import dbscan, density_clusters
+from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.plane_choice import chosen_plane
 from pcdata.functional.planes import (
     bound_runs,
     checked_probability,
@@ -28,15 +29,12 @@ from pcdata.functional.planes import (
     refined_planes,
 )
 from pcdata.functional.rows import ptr_from_counts
-from pcdata.functional.selection import over_hull
 from pcdata.functional.voxels import voxel_downsample
 
 # Points that tell which planes there are, and refine the one that is chosen.
 _SAMPLE = 1 << 16
 # Lengths of a cloud, in distances: beyond, float32 does not hold the distances themselves.
 _MOST_SPAN = 1e6
-# A plane that leans away from up by 90 degrees or more counts a tenth of a level one.
-_LEAST_LEAN = 0.1
 
 
 @op(
@@ -159,8 +157,16 @@ def supporting_plane(
     what counts is area, however near the sensor or however often seen. Each scores its area, times one more than the
     area of what stands on it, times how level it is: 0.1 + max(0, cosine of its normal and up); the highest wins, the
     first found of equals. What stands on a plane is what is left without any plane, in connected parts that reach down
-    to it, above it and over its convex hull, less what noise puts below it. The winner is refitted to its inliers, of
-    65,536 points at most, until they no longer change.
+    to it, above it and over its convex hull, less what noise puts below it.
+
+    Where nothing stands on the winner, a plane above it and parallel to it within 10 degrees is taken instead, the
+    highest below the viewpoint: an empty table, rather than the larger floor around it. It must fill half as much of
+    the view as the winner, or an eighth where the winner is seen beneath a tenth of it: the top of a box hides what the
+    box stands on. What is no higher than 2 % of the way to it, the noise of a depth camera, does not stand there, nor
+    do the legs of that table. The view is that from the viewpoint, and areas count where it is not known: with ``up``
+    alone.
+
+    The chosen plane is refitted to its inliers, of 65,536 points at most, until they no longer change.
 
     The result is that of :func:`ransac_plane`: normals along ``up`` where given, else toward the viewpoint.
 
@@ -221,8 +227,8 @@ def supporting_plane(
         seen_from = torch.zeros(3, dtype=torch.float64, device="cpu") if viewpoint is None else viewpoint[b].cpu()
         planes = _turned(planes.cpu(), own_up, seen_from)
         toward = own_up if own_up is not None else None if likely_up is None else likely_up[b].cpu()
-        scores = _scores(means, label, planes, toward, distance, backend)
-        winners.append(planes[int(scores.argmax())])
+        eye = seen_from if viewpoint is not None or up is None else None
+        winners.append(planes[chosen_plane(means, label, planes, toward, eye, distance, backend)])
         samples.append(own)
     sampled = torch.cat(samples)
     sampled_ptr = ptr_from_counts([len(own) for own in samples], device=ptr.device)
@@ -237,37 +243,3 @@ def _turned(planes: Tensor, up: Tensor | None, seen_from: Tensor) -> Tensor:
     """Turn the normals (P, 4) along up, else toward where the sensor stood."""
     side = planes[:, :3] @ seen_from + planes[:, 3] if up is None else planes[:, :3] @ up
     return torch.where((side < 0)[:, None], -planes, planes)
-
-
-def _standing(height: Tensor, over: Tensor, part: Tensor, distance: float) -> int:
-    """Count the voxels above a plane, over its hull, of parts that reach down to it and rise from it."""
-    above = over & (height > 0)
-    nothing = torch.zeros(int(part.max()) + 1, dtype=torch.bool, device=height.device)
-    # What is no higher than this may be noise of the plane.
-    rises = nothing.index_put((part[above & (height > 3 * distance)],), nothing.new_ones(()))
-    touches = nothing.index_put((part[above & (height < 4 * distance)],), nothing.new_ones(()))
-    return int((above & (rises & touches)[part]).sum())
-
-
-def _scores(
-    voxels: Tensor, label: Tensor, planes: Tensor, up: Tensor | None, distance: float, backend: str
-) -> Tensor:  # (P,) float64 on the CPU
-    """Score planes by their area, by what stands on them and by how level they are."""
-    if len(planes) == 1:
-        return torch.ones(1, dtype=torch.float64, device="cpu")
-    rest = voxels[label < 0]
-    part = torch.zeros(0, dtype=torch.int64, device=voxels.device)
-    if len(rest):  # two edges of a voxel: neighbors over a corner
-        part = dbscan(rest, eps=4 * distance, min_points=1, backend=backend)
-    scores = []
-    for number, plane in enumerate(planes.to(voxels.device)):
-        own = voxels[label == number]
-        standing = 0
-        if len(rest):
-            height = rest.double() @ plane[:3] + plane[3]
-            over = over_hull(rest, own, plane, 2 * distance)
-            # Noise of the plane lies above it as below it; nothing stands below.
-            standing = max(0, _standing(height, over, part, distance) - _standing(-height, over, part, distance))
-        level = 1.0 if up is None else _LEAST_LEAN + max(0.0, float(plane[:3].cpu() @ up))
-        scores.append(len(own) * (1 + standing) * level)
-    return torch.tensor(scores, dtype=torch.float64, device="cpu")

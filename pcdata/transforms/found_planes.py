@@ -83,7 +83,8 @@ def map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
 
 
 def plane_facts(
-    own: Tensor,  # (n, 3) the plane's own points
+    own: Tensor,  # (n, 3) points of its surface
+    num_inliers: int,  # points near it, of walls that cross it too
     num_points: int,  # of the cloud
     plane: Tensor,  # (4,) in the cloud's coordinates
     cloud: PointCloud,
@@ -99,8 +100,8 @@ def plane_facts(
         "normal": source_plane[:3].tolist(),
         "offset": float(source_plane[3]),
         "frame": cloud.source_frame,
-        "num_inliers": len(own),
-        "inlier_share": len(own) / max(num_points, 1),
+        "num_inliers": num_inliers,
+        "inlier_share": num_inliers / max(num_points, 1),
         "rms": math.sqrt(float(off.square().mean())) if len(own) else 0.0,
         "hull": moved.cpu().numpy().round(_DIGITS).tolist(),
     }

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pcdata.contracts.host import negated
 from pcdata.errors import ConfigError, PcdataWarning
+from pcdata.functional.plane_patch import plane_patch
 from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import near_planes, ransac_plane
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, pick_rows, ptr_after_mask
@@ -55,7 +56,8 @@ class RemovePlane(RemoveTransform):
     The plane joins ``meta["planes"]`` of every cloud with its inlier share, RMS, tilt and hull, in the source frame, so
     later steps cannot make it stale; :func:`planes_in_cloud` and :func:`plane_hulls_in_cloud` give it in the cloud's
     present coordinates. ``faces`` says what its normal was turned to: ``up``, the ``sensor``, the ``origin`` of the
-    frame it was found in, or ``neither side`` of a plane through that origin.
+    frame it was found in, or ``neither side`` of a plane through that origin. RMS and hull are those of its surface,
+    connected patches a tenth as large as the largest or more: walls that cross the plane are no part of it.
 
     Args:
         distance: inliers are closer to the plane than this.
@@ -82,7 +84,7 @@ class RemovePlane(RemoveTransform):
 
     runs_statistics = True
     decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
-    version = 5
+    version = 6
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000
@@ -161,11 +163,14 @@ class RemovePlane(RemoveTransform):
                 keep &= height > 0
             if self.max_height is not None:
                 keep &= height <= self.max_height
+        parts = [slice(*pair) for pair in pairwise(data.ptr.tolist())]
+        patch = torch.cat(
+            [plane_patch(data.points[part], own[part], plane, self.distance) for part, plane in zip(parts, planes)]
+        )
         if self.keep == "over":
-            parts = [slice(*pair) for pair in pairwise(data.ptr.tolist())]
             keep &= torch.cat(
                 [
-                    over_hull(data.points[part], data.points[part][own[part]], plane, self.margin)
+                    over_hull(data.points[part], data.points[part][patch[part]], plane, self.margin)
                     for part, plane in zip(parts, planes)
                 ]
             )
@@ -174,7 +179,7 @@ class RemovePlane(RemoveTransform):
             "ptr": ptr_after_mask(keep, data.ptr),
             "planes": planes,
             "num_inliers": count_per_cloud(own, data.ptr),
-            "per_point": own,
+            "per_point": patch,
         }
 
     def _found(self, data: PointCloud) -> tuple[Tensor, Tensor]:
@@ -244,7 +249,8 @@ class RemovePlane(RemoveTransform):
         for b, (start, stop) in enumerate(pairwise(data.ptr.tolist())):
             plane = params["planes"][b]
             own = pick_rows({"points": data.points[start:stop]}, params["per_point"][start:stop])["points"]
-            found = plane_facts(own, stop - start, plane, data, b)
+            inliers = int(params["num_inliers"][b])
+            found = plane_facts(own, inliers, stop - start, plane, data, b)
             found["faces"] = self._faces(data, b, plane)
             for name in ("noise", "disparity_noise"):
                 if name in params and math.isfinite(value := float(params[name][b])):

@@ -1,0 +1,94 @@
+"""The part of a plane that is a surface: a plane has no end, and crosses the walls around a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.image_clusters import lowest_rows
+from pcdata.functional.selection import plane_axes
+
+_MOST_POINTS = 1 << 14  # that tell where the surface is
+_REACH = 5  # distances from the plane that tell whether something crosses it
+_MOST_CELLS = 500  # along a side: a stray far away needs no more
+_CELL = 4  # distances: the least edge of a cell
+_MOST_LONELY = 0.2  # of the cells may hold one point alone: those of the rim do; more, and cells are too small
+_CROSSED = 0.5  # a wall that crosses the slab of a plane has a fifth of its points near it within that reach
+_LEAST_PATCH = 0.1  # of the largest: parts of a table behind what stands on it, and no strays at its height
+
+
+def plane_patch(
+    points: Tensor,  # (n, 3)
+    near: Tensor,  # (n,) bool: the points near the plane
+    plane: Tensor,  # (4,) float64
+    distance: float,
+) -> Tensor:  # (n,) bool
+    """Mark those of the points near a plane that are of its surface, rather than of walls and things it crosses.
+
+    In square cells of the plane, a surface has its points near the plane, and what crosses it has most of them above
+    and below. Cells where points near the plane are less than half as frequent, among those within 5 distances, as
+    they are on average are left out; of the others, the connected patches that are a tenth as large as the largest
+    are kept. Cells have an edge of 4 distances, doubled until a fifth at most holds one point alone.
+    """
+    points, plane = points.detach(), plane.detach()
+    stride = max(1, len(points) // _MOST_POINTS)
+    normal, offset = plane[:3].to(points.dtype), float(plane[3])
+    own, height = near[::stride], points[::stride] @ normal + offset
+    around = (own | (height.abs() < _REACH * distance)).nonzero().squeeze(1)
+    own = own[around]
+    if not bool(own.any()):
+        return near
+    places = [points @ axis.to(points.dtype) for axis in plane_axes(plane).T]
+    flat = torch.stack([along[::stride][around] for along in places])
+    low, high = flat.amin(1), flat.amax(1)
+    span = float((high - low).max())
+    edge = max(_CELL * distance, span / _MOST_CELLS)
+    while True:
+        size = [int(cells) + 5 for cells in ((high - low) / edge).tolist()]
+        cell = _cells(flat, low, edge, size)
+        count = torch.bincount(cell[own], minlength=size[0] * size[1])
+        if int((count == 1).sum()) <= _MOST_LONELY * int((count > 0).sum()) or edge > span / 4:
+            break
+        edge *= 2
+    share = count / torch.bincount(cell, minlength=len(count)).clamp(min=1)
+    usual = float((count * share).sum() / count.sum())
+    kept = _large_patches(((count > 0) & (share >= _CROSSED * usual)).reshape(size))
+    # Cells at its rim without any point of those that were looked at.
+    kept = (kept | (_grown(kept) & (count == 0).reshape(size))).reshape(-1)
+    if stride == 1 and bool(kept[cell[own]].all()):
+        return near
+    return near & kept.index_select(0, _cells(places, low, edge, size))
+
+
+def _cells(flat: Iterable[Tensor], low: Tensor, edge: float, size: list[int]) -> Tensor:
+    """Number the cells of places in the plane; beyond each end are two empty ones, the last for all farther away."""
+    row, column = (
+        ((along - float(start)) / edge).floor_().add_(2).clamp_(0, cells - 1).int()
+        for along, start, cells in zip(flat, low, size, strict=True)
+    )
+    return row * size[1] + column
+
+
+def _grown(cells: Tensor) -> Tensor:
+    """Mark cells and the eight around them."""
+    return torch.nn.functional.max_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+
+
+def _large_patches(cells: Tensor) -> Tensor:
+    """Leave out the connected patches, over corners too, that are small beside the largest."""
+    place = cells.nonzero()
+    row_of = torch.full((cells.shape[0] + 2, cells.shape[1] + 2), -1, dtype=torch.int64, device=cells.device)
+    rows = torch.arange(len(place), dtype=torch.int64, device=cells.device)
+    v, u = place.unbind(1)
+    row_of[v + 1, u + 1] = rows
+    pairs = []
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):  # each pair once
+        other = row_of[v + 1 + down, u + 1 + right]
+        pairs.append(torch.stack([rows[other >= 0], other[other >= 0]]))
+    patch = lowest_rows(torch.cat(pairs, 1), len(rows), cells.device)
+    area = torch.bincount(patch, minlength=len(rows))
+    large = torch.zeros_like(cells)
+    large[v, u] = area[patch] >= _LEAST_PATCH * area.max()
+    return large
