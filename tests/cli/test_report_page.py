@@ -85,6 +85,15 @@ def test_captures_that_all_are_refused_are_told_and_no_success(capsys, tmp_path)
     assert "no capture" not in out
 
 
+def test_a_cloud_without_points_is_not_good(capsys, tmp_path):
+    (tmp_path / "clouds").mkdir()
+    write_ply(tmp_path / "clouds" / "a.ply", PointCloud(points=torch.zeros(0, 3), frame_id="base"))
+    code, out, _ = run(capsys, "grade", tmp_path / "clouds")
+    assert code == 1
+    assert "valid_fraction" in out
+    assert "the cloud has no points" in out
+
+
 def test_the_steps_of_a_pipeline_are_shown(capsys, made, tmp_path):
     config = tmp_path / "steps.yaml"
     config.write_text(

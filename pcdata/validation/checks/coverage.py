@@ -40,6 +40,17 @@ def coverage(capture: DepthFrame | PointCloud, limits: CaptureLimits, before: Se
     if isinstance(capture, DepthFrame):
         views = [_coverage_of(depth > 0, limits, view) for view, depth in enumerate(capture.depth)]
         return [finding for view in views for finding in view]
+    if not capture.num_points:
+        return [
+            graded(
+                "valid_fraction",
+                0.0,
+                limits=limits.valid_fraction,
+                at_least=True,
+                found="the cloud has no points",
+                advice="drop it, or look at the step or the program that left nothing",
+            )
+        ]
     size = capture.meta[0].get("organized_size")
     if size is None or capture.source_index is None:
         return []
