@@ -118,6 +118,7 @@ def _widths(seen: torch.Tensor) -> NDArray[np.float64]:
         return np.full(len(seen), 0.02)
     index, apart = knn(seen, k=4)
     own = apart[:, -1]
+    index = index.clamp(max=len(seen) - 1)  # one so far away that a float cannot tell has no neighbor
     widths = 1.25 * torch.minimum(own, 1.3 * own[index[:, 1:]].amin(1)).double().numpy()
     usual = max(float(np.median(widths)), 1e-9)
     return np.where(widths > _STRAY * usual, usual, np.maximum(widths, usual / _STRAY))

@@ -103,7 +103,7 @@ def _step_panels(
 ) -> list[Panel]:
     panels: list[Panel] = []
     funnel: list[tuple[str, float]] = []
-    pairs = [*steps]
+    pairs = [*steps] if isinstance(steps, Iterable) else [steps]  # what is none is refused as a pair
     for place, pair in enumerate(pairs):
         name, data = _checked(pair)
         if isinstance(data, DepthFrame):

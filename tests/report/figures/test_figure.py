@@ -163,6 +163,13 @@ def test_few_points_are_drawn_too(tmp_path, count):
     figure(cloud, title="few").savefig(tmp_path / "few.png")
 
 
+@pytest.mark.parametrize("far", [1e12, 1e30, 3e38])
+def test_a_stray_at_the_end_of_floats_is_drawn(tmp_path, far):
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    cloud = PointCloud(points=torch.cat([points, torch.tensor([[far, 0.0, 0.0]])]), frame_id="base")
+    figure(cloud).savefig(tmp_path / "stray.png")
+
+
 def test_numbers_that_are_none_keep_the_colors_of_the_others():
     values = torch.linspace(0, 1, 100)
     cloud = PointCloud(points=torch.rand(100, 3), extra={"c": values}, kinds={"c": Kind.INVARIANT}, frame_id="base")
@@ -191,7 +198,7 @@ def test_a_color_that_is_not_there_is_refused_with_those_that_are():
         figure(square(0.0, RED), color="color")
 
 
-@pytest.mark.parametrize("wrong", [[1], [("a", 2)], [torch.zeros(3, 3)]])
+@pytest.mark.parametrize("wrong", [None, 5, [1], [("a", 2)], [torch.zeros(3, 3)]])
 def test_something_else_is_refused(wrong):
     with pytest.raises(DTypeError, match="takes a PointCloud, a DepthFrame"):
         figure(wrong)
