@@ -30,6 +30,7 @@ def add_to(commands: Any) -> None:
 
 def _demo(arguments: argparse.Namespace) -> None:
     from pathlib import Path
+    from shlex import quote
 
     from pcdata.cli.demo import run_demo
     from pcdata.report.build_text import build_text
@@ -41,6 +42,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     print(f"\nloaded back with 2 workers: {len(batches)} batches, {points:,} augmented points")
     print(f"dataset  {report.folder}  (python {Path(report.folder, 'load.py')} loads it)")
     print(f"picture  {picture}")
+    print(f"look     pcdata report {quote(report.folder)}, or pcdata view {quote(report.folder)}")
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from pcdata.cli.argument_types import name_and_value, value_of
 from pcdata.cli.capture_flags import COMBINATOR_FLAGS, LAYOUT_FLAGS
-from pcdata.cli.known_names import KINDS
+from pcdata.cli.known_names import KINDS, SENSORS
 
 _NO_OPTIONS = {  # of opening captures, not of their layout
     "path": "the path itself",
@@ -32,6 +32,26 @@ def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: b
     add_combinator_options(command)
     add_skip_options(command, can_skip_refused=can_skip_refused)
     add_import_option(command)
+
+
+def add_depths_of_interest(command: argparse.ArgumentParser) -> None:
+    """Add what the depths are judged against."""
+    depths = command.add_mutually_exclusive_group()
+    depths.add_argument(
+        "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
+    )
+    depths.add_argument(
+        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
+    )
+
+
+def depths_of_interest(arguments: argparse.Namespace) -> Any:
+    """Return the limits of checks that follow from the depths of interest."""
+    from pcdata.validation import CaptureLimits
+
+    if arguments.workspace:
+        return CaptureLimits(workspace=tuple(arguments.workspace))
+    return CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
 
 
 def add_import_option(command: argparse.ArgumentParser) -> None:

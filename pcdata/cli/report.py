@@ -8,16 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from pcdata.cli.argument_types import positive
-from pcdata.cli.known_names import SENSORS
-from pcdata.cli.options import add_capture_options, given_options, open_captures
+from pcdata.cli.options import (
+    add_capture_options,
+    add_depths_of_interest,
+    depths_of_interest,
+    given_options,
+    open_captures,
+)
 from pcdata.cli.outputs import text_files
 from pcdata.cli.progress_bar import ProgressBar
+
+_PATH = "folder of captures, a recording, one cloud file, or a dataset"
 
 
 def add_to(commands: Any) -> None:
     """Add the commands to the parser."""
     report = commands.add_parser("report", help="write one page that shows whether captures are good, and why not")
-    _add_captures(report)
+    report.add_argument("path", metavar="PATH", help=_PATH)
     report.add_argument("--out", metavar="FILE.html", help="the page (default: report.html, unless --png is given)")
     report.add_argument(
         "--png",
@@ -26,26 +33,19 @@ def add_to(commands: Any) -> None:
     )
     report.add_argument("--config", metavar="FILE.yaml", help="show the steps of this pipeline too")
     report.add_argument("--samples", type=positive, metavar="N", default=12, help="captures shown (default: 12)")
+    _add_captures(report)
     report.set_defaults(run=_report)
     grade = commands.add_parser("grade", help="grade a recording from A to F, by camera and episode, with the reasons")
-    _add_captures(grade)
+    grade.add_argument("path", metavar="PATH", help=_PATH)
     grade.add_argument("--json", metavar="FILE", help="write the grade with every check's trend to FILE, replacing it")
+    _add_captures(grade)
     grade.set_defaults(run=_grade)
 
 
 def _add_captures(command: argparse.ArgumentParser) -> None:
-    command.add_argument("path", metavar="PATH", help="folder of captures, a recording, one cloud file, or a dataset")
-    add_capture_options(command)
+    add_depths_of_interest(command)
     command.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
-    command.add_argument(
-        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
-    )
-
-
-def _limits(arguments: argparse.Namespace) -> Any:
-    from pcdata.validation import CaptureLimits
-
-    return CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
+    add_capture_options(command)
 
 
 def is_dataset(arguments: argparse.Namespace) -> bool:
@@ -55,7 +55,7 @@ def is_dataset(arguments: argparse.Namespace) -> bool:
 
     if not Manifest.is_one(Path(arguments.path)):
         return False
-    of_captures = ("config", "limit", "sensor", "kind", "only", "skip", "skip_file", "skip_refused")
+    of_captures = ("config", "limit", "sensor", "workspace", "kind", "only", "skip", "skip_file", "skip_refused")
     given = [name for name in of_captures if getattr(arguments, name, None)] + [*given_options(arguments)]
     if given:
         raise ConfigError(
@@ -90,7 +90,7 @@ def _report(arguments: argparse.Namespace) -> int:
                 gathered = gather_captures(
                     open_captures(arguments.path, arguments, limit=arguments.limit),
                     pipeline=None if arguments.config is None else load_config(arguments.config).pipeline,
-                    limits=_limits(arguments),
+                    limits=depths_of_interest(arguments),
                     num_shown=arguments.samples,
                     progress=progress,
                 )
@@ -98,7 +98,7 @@ def _report(arguments: argparse.Namespace) -> int:
             page = page_of_captures(gathered)
             write("out", page)
     grade = gathered.grading.grade()
-    print(f"grade    {grade.letter}")
+    print(f"grade    {grade.letter}: {gathered.grading.standing()}")
     for reason in grade.reasons[:3]:
         print(f"  {reason}")
     if out:
@@ -114,7 +114,7 @@ def _grade(arguments: argparse.Namespace) -> int:
     from pcdata.io.sources.capture_source import episodes_of
     from pcdata.report.html.dataset_report import dataset_page
     from pcdata.validation import validate_source
-    from pcdata.validation.grading import LETTERS, Grading
+    from pcdata.validation.grading import Grading
 
     with text_files("grade", json=arguments.json) as write:
         with ProgressBar("grade") as progress:
@@ -123,13 +123,13 @@ def _grade(arguments: argparse.Namespace) -> int:
             else:
                 source = open_captures(arguments.path, arguments, limit=arguments.limit)
                 grading = Grading(source.ids, episodes_of(source))
-                for done, report in enumerate(validate_source(source, limits=_limits(arguments)), 1):
+                for done, report in enumerate(validate_source(source, limits=depths_of_interest(arguments)), 1):
                     grading.add(report)
                     if not report.whole:
                         progress(done, len(source.ids), report.sample_id)
         write("json", json_text(grading.to_json(), indent=1))
     grade = grading.grade()
-    print(f"{grade.letter}: {LETTERS[grade.letter]}")
+    print(f"{grade.letter}: {grading.standing()}")
     for reason in grade.reasons:
         print(f"  {reason}")
     return int(grade.letter in "DF")

@@ -10,8 +10,14 @@ from pathlib import Path
 from typing import IO, Any
 
 from pcdata.cli.argument_types import positive
-from pcdata.cli.known_names import CHECKS, SENSORS
-from pcdata.cli.options import add_capture_options, open_captures, said_again
+from pcdata.cli.known_names import CHECKS
+from pcdata.cli.options import (
+    add_capture_options,
+    add_depths_of_interest,
+    depths_of_interest,
+    open_captures,
+    said_again,
+)
 from pcdata.cli.progress_bar import ProgressBar
 
 
@@ -27,13 +33,7 @@ def add_to(commands: Any) -> None:
     )
     add_capture_options(validate, can_skip_refused=False)
     validate.add_argument("--limit", type=positive, metavar="N", help="only the first N captures")
-    depths = validate.add_mutually_exclusive_group()
-    depths.add_argument(
-        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
-    )
-    depths.add_argument(
-        "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
-    )
+    add_depths_of_interest(validate)
     validate.add_argument("--json", metavar="FILE", help="write every check on every capture to FILE, replacing it")
     validate.set_defaults(run=_validate)
 
@@ -43,12 +43,10 @@ def _validate(arguments: argparse.Namespace) -> int:
     from pcdata.files.opening import replacing
     from pcdata.report.unopened_text import needed_options
     from pcdata.report.validation_text import validation_text
-    from pcdata.validation import WHOLE, CaptureLimits, SampleReport, Summary, check_of_error, validate_source
+    from pcdata.validation import WHOLE, SampleReport, Summary, check_of_error, validate_source
     from pcdata.verdicts import Verdict
 
-    limits = CaptureLimits.for_sensor(arguments.sensor) if arguments.sensor else CaptureLimits()
-    if arguments.workspace:
-        limits = CaptureLimits(workspace=tuple(arguments.workspace))
+    limits = depths_of_interest(arguments)
     summary = Summary()
     total = 0
     unread: list[str] = []

@@ -151,6 +151,29 @@ class Grading:
             letter = "B" if warning else "A"
         return Grade(letter, tuple(self._reasons()))
 
+    def standing(self) -> str:
+        """Say in one line what the letter rests on, such as ``3 of 40 captures fail, 5 warn``."""
+        graded = int((self.sample_verdicts >= 0).sum())
+        if not graded:
+            return "no capture could be read"
+        of = f"of {graded:,} capture{'s' * (graded != 1)}"
+        told = [
+            f"{count:,} {of if not number else ''}".rstrip() + f" {word}{'s' * (count == 1)}"
+            for number, (count, word) in enumerate(
+                (self.count(verdict), word)
+                for verdict, word in ((Verdict.FAIL, "fail"), (Verdict.WARN, "warn"))
+                if self.count(verdict)
+            )
+        ] or [f"none {of} warns or fails"]
+        if unknown := self.count(Verdict.UNKNOWN):
+            told.append(f"of {unknown:,} something could not be measured")
+        whole = [finding.verdict for _, finding in self.together]
+        for verdict, word in ((Verdict.FAIL, "fails"), (Verdict.WARN, "warns")):
+            if verdict in whole:
+                told.append(f"a check over all captures {word}")
+                break
+        return ", ".join(told)
+
     def faults(self) -> list[Trend]:
         """The trends that warn or fail, worst first; of as bad ones those of more captures."""
         bad = [trend for trend in self.trends.values() if trend.verdict.severity >= Verdict.WARN.severity]

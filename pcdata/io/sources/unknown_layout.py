@@ -51,7 +51,15 @@ def unknown_layout(path: Path) -> CaptureError:
     if path.is_file() and (fault := _fault_of_file(path)):
         return CaptureError(f"open_source: {path}: {fault}")
     start = f"open_source: {path}: no known layout; found {_contents(path)}."
-    for way in (_by_its_folder, _captures_inside, _recording_inside, _robot_poses, _without_calibration, _images_alone):
+    for way in (
+        _dataset_inside,
+        _by_its_folder,
+        _captures_inside,
+        _recording_inside,
+        _robot_poses,
+        _without_calibration,
+        _images_alone,
+    ):
         if told := way(path):
             return CaptureError(f"{start} {told}. docs/captures.md lists the layouts")
     known = "\n".join(f"  {layout.kind}: {layout.needs}" for layout in LAYOUTS.values())
@@ -113,6 +121,17 @@ def _by_its_folder(path: Path) -> str:
     if is_folder(path) or not _is_capture(path.parent):
         return ""
     return f"The folder that it is in is a capture: {_command(path.parent)}"
+
+
+def _dataset_inside(path: Path) -> str:
+    """Say where in a folder a dataset is that a build wrote."""
+    from pcdata.io.store.manifest import Manifest
+
+    for entry in _entries(path):
+        if is_folder(entry) and (entry / DATASET).is_file() and Manifest.is_one(entry):
+            name = shlex.quote(os.fspath(entry))
+            return f"{entry.name} is a dataset that 'pcdata build' wrote: pcdata view {name}, pcdata report {name}"
+    return ""
 
 
 def _captures_inside(path: Path) -> str:

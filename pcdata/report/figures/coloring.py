@@ -56,7 +56,7 @@ def coloring_of(cloud: UnpackedCloud, mode: str | None, up: NDArray[np.float64])
     if mode not in modes:
         raise ConfigError(
             f"color: {mode!r} is nothing that this cloud can be colored by; it has {', '.join(modes)}"
-            f"{near_matches(mode, modes)}"
+            f"{near_matches(mode, modes)}{'; EstimateNormals gives normals' if mode == 'normals' else ''}"
         )
     kind = cloud.kinds.get(mode)
     if kind in ("color", "normal"):

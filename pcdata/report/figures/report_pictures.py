@@ -29,8 +29,7 @@ from pcdata.report.figures.overall_figures import (
 from pcdata.report.figures.panels import cloud_panel, funnel_panel, picture_panel
 from pcdata.report.html.gathering import Gathered, Looked
 from pcdata.report.labels import label_text
-from pcdata.validation.grading import LETTERS, Grading
-from pcdata.verdicts import Verdict
+from pcdata.validation.grading import Grading
 
 _COLUMNS = 4
 _LETTERS_PER_INCH = 15.4  # of a reason
@@ -142,9 +141,7 @@ def _verdict_panel(axis: Any, grading: Grading, reasons: Sequence[str], size: tu
     letter = grading.grade().letter
     height, width = size
     axis.set_axis_off()
-    counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
-    rule = "\n".join(textwrap.wrap(LETTERS[letter], int(0.6 * _LETTERS_PER_INCH * width)))
-    head = f"{rule}\n{len(grading.ids):,} captures: {counts or 'none'}"
+    head = "\n".join(textwrap.wrap(grading.standing(), int(0.6 * _LETTERS_PER_INCH * width)))
     drawn = [
         axis.text(0, 1, letter, fontsize=40, fontweight="bold", color=_LETTER_COLORS[letter], va="top"),
         axis.text(0.7 / width, 0.98, head, va="top", fontsize=9),

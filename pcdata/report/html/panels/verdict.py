@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pcdata.report.html.gathering import Gathered
 from pcdata.report.html.page import Section
 from pcdata.report.html.text import shown
-from pcdata.validation.grading import LETTERS, Grading, Trend
+from pcdata.validation.grading import Grading, Trend
 from pcdata.verdicts import Finding, Verdict
 
 
@@ -15,12 +15,9 @@ def verdict_panel(gathered: Gathered, scenes: Mapping[str, int]) -> Section:
     """Return the grade and what keeps it from an A, worst first; ``scenes``: sample id -> its number in the viewer."""
     grading = gathered.grading
     grade = grading.grade()
-    counts = ", ".join(f"{grading.count(verdict):,} {verdict}" for verdict in Verdict if grading.count(verdict))
-    total = int((grading.sample_verdicts >= 0).sum())
-    rule = "no capture could be read" if grading.none_read else LETTERS[grade.letter]
     head = (
         f'<p class="head"><span class="grade {grade.letter}">{grade.letter}</span><span>'
-        f"{shown(_sentence(rule))}. Of {total:,} captures: {counts or 'none'}.</span></p>"
+        f"{shown(_sentence(grading.standing()))}.</span></p>"
     )
     found = [
         (finding, _told(finding, grading.name_of(finding.view), f"all captures of {name}"))
