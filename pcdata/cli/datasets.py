@@ -42,7 +42,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     print(f"\nloaded back with 2 workers: {len(batches)} batches, {points:,} augmented points")
     print(f"dataset  {report.folder}  (python {Path(report.folder, 'load.py')} loads it)")
     print(f"picture  {picture}")
-    print(f"look     pcdata report {quote(report.folder)}, or pcdata view {quote(report.folder)}")
+    print(f"look     pcdata report {quote(str(report.folder))}, or pcdata view {quote(str(report.folder))}")
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

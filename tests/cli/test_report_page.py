@@ -44,7 +44,7 @@ def test_the_page_stands_alone(capsys, made, tmp_path):
     page = tmp_path / "report.html"
     code, out, _ = run(capsys, "report", made, "--out", page)
     assert code == 0
-    assert out.startswith("grade    A\n")
+    assert re.match(r"grade    A: none of \d+ captures? warns or fails\n", out)
     text = page.read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=[\"'](?!data:|#)", text)
     assert "default-src 'none'" in text
@@ -72,12 +72,12 @@ def test_captures_that_all_are_refused_are_told_and_no_success(capsys, tmp_path)
     page, pictures = tmp_path / "report.html", tmp_path / "shown"
     code, out, _ = run(capsys, "report", tmp_path / "broken", "--out", page, "--png", pictures)
     assert code == 1
-    assert out.startswith("grade    F\n  no capture could be read\n")
+    assert out.startswith("grade    F: no capture could be read\n")
     assert "No capture could be read." in page.read_text(encoding="utf-8")
     assert (pictures / "summary.png").stat().st_size > 0
     code, out, _ = run(capsys, "grade", tmp_path / "broken")
     assert code == 1
-    assert "\n  no capture could be read\n" in out
+    assert out.startswith("F: no capture could be read\n")
     torch.manual_seed(0)
     write_ply(tmp_path / "broken" / "c.ply", PointCloud(points=torch.rand(200, 3), frame_id="base"))
     code, out, _ = run(capsys, "report", tmp_path / "broken", "--out", page)
@@ -123,7 +123,7 @@ def test_grade_is_for_a_nightly_job(capsys, made, frozen, tmp_path):
     assert run(capsys, "grade", made)[0] == 0
     code, out, _ = run(capsys, "grade", frozen, "--json", tmp_path / "g.json")
     assert code == 1
-    assert out.startswith("F: more than 10% fail")
+    assert re.match(r"F: \d+ of \d+ captures fail", out)
     assert json.loads((tmp_path / "g.json").read_text())["grade"] == "F"
 
 
@@ -163,7 +163,7 @@ def test_a_dataset_is_shown_and_graded_as_it_is(capsys, made, tmp_path):
     assert code == 0
     text = (tmp_path / "set.html").read_text(encoding="utf-8")
     assert "2. FarthestPointSample" in text.split('class="bars"')[1]  # the funnel of the build
-    assert run(capsys, "grade", tmp_path / "set")[1][0] == out.split()[1]
+    assert run(capsys, "grade", tmp_path / "set")[1][0] == out.split()[1][0]
     for option in (["--config", tmp_path / "c.yaml"], ["--limit", 1], ["--frame", "base"]):
         code, _, err = run(capsys, "report", tmp_path / "set", "--out", tmp_path / "set.html", *option)
         assert code == 2

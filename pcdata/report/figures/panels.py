@@ -91,7 +91,7 @@ def confidence_panel(axis: Any, frame: DepthFrame, view: int, name: str) -> None
 def picture_panel(axis: Any, caption: str, png: bytes) -> None:
     """Draw a picture that is there already."""
     axis.set_title(label_text(_short(caption, 90)), fontsize=8, wrap=True)
-    axis.imshow(np.asarray(Image.open(io.BytesIO(png))), interpolation="nearest")
+    axis.imshow(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")), interpolation="nearest")
     _frame(axis)
 
 

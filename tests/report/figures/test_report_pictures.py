@@ -9,6 +9,8 @@ import pytest
 from PIL import Image
 
 from pcdata.cli import main
+from pcdata.report.figures.panels import picture_panel
+from pcdata.report.html.pictures import NO_READING, depth_picture
 from tests.validation.captures import scene, store
 
 pytest.importorskip("matplotlib")
@@ -64,3 +66,16 @@ def test_a_file_is_no_folder_and_captures_are_left_alone(captures, tmp_path, cap
     assert main(["report", str(captures), "--png", str(captures / "shown")]) == 2
     assert "inside the captures" in capsys.readouterr().err
     assert names(captures) == before
+
+
+def test_pixels_without_a_reading_are_magenta_as_on_the_page():
+    from matplotlib.figure import Figure
+
+    frame = scene(num_views=1).noisy_frames(1)[0]
+    frame.depth[:, :20] = 0
+    axis = Figure().add_subplot()
+    picture_panel(axis, caption="depth", png=depth_picture(frame, 0))
+    drawn = np.asarray(axis.get_images()[0].get_array())
+    assert drawn.shape[2] == 3
+    assert (drawn[0, 0] == NO_READING).all()
+    assert not (drawn[-1] == NO_READING).all(axis=1).all()
