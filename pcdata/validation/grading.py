@@ -153,9 +153,9 @@ class Grading:
 
     def standing(self) -> str:
         """Say in one line what the letter rests on, such as ``3 of 40 captures fail, 5 warn``."""
-        graded = int((self.sample_verdicts >= 0).sum())
-        if not graded:
+        if self.none_read:
             return "no capture could be read"
+        graded = int((self.sample_verdicts >= 0).sum())
         of = f"of {graded:,} capture{'s' * (graded != 1)}"
         told = [
             f"{count:,} {of if not number else ''}".rstrip() + f" {word}{'s' * (count == 1)}"

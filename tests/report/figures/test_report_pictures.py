@@ -71,7 +71,7 @@ def test_a_file_is_no_folder_and_captures_are_left_alone(captures, tmp_path, cap
 def test_pixels_without_a_reading_are_magenta_as_on_the_page():
     from matplotlib.figure import Figure
 
-    frame = scene(num_views=1).noisy_frames(1)[0]
+    frame = next(iter(scene(num_views=1).noisy_frames(1)))
     frame.depth[:, :20] = 0
     axis = Figure().add_subplot()
     picture_panel(axis, caption="depth", png=depth_picture(frame, 0))
