@@ -62,7 +62,7 @@ MOST_WAITS = {
     "segment_planes": 199,
     "spatial_filter": 2,
     "statistical_outlier_mask": 33,
-    "supporting_plane": 1057,
+    "supporting_plane": 1200,
     "table_surface": 425,
     "undistort_depth": 14,
     "undistort_image": 13,
