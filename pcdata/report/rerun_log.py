@@ -6,6 +6,8 @@ Source: Rerun, https://rerun.io; entities are named by frame, camera and step, a
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from pcdata.validation.view_names import view_names
 _NO_CLASS = 65535  # of Rerun, for points without a label
 _LARGEST_CLASS = 65534
 _PROBE = 1 << 16  # bytes
+_PATIENCE = 20.0  # seconds without a byte more
 
 
 def save_rerun(
@@ -57,9 +60,7 @@ def save_rerun(
         stream = rerun.RecordingStream("pcdata")
         stream.save(str(temporary))
         logged = log_to_rerun(stream, source, pipeline=pipeline, max_points=max_points, progress=progress)
-        stream.disconnect()  # writes what is left
-        del stream
-        _check_room(Path(temporary), Path(path))
+        _finish(stream, Path(temporary), Path(path))
     return logged
 
 
@@ -216,15 +217,30 @@ def _rgb(color: str) -> tuple[int, ...]:
     return tuple(int(color[place : place + 2], 16) for place in (1, 3, 5))
 
 
-def _check_room(temporary: Path, path: Path) -> None:
-    """Refuse a file that may be cut short: Rerun writes in a thread of its own, and keeps to itself what failed."""
+def _finish(stream: Any, temporary: Path, path: Path) -> None:
+    """Write what is left, and refuse a file that may be cut short.
+
+    Rerun writes in a thread of its own, keeps to itself what failed, and where a disk is full may wait for ever. So it
+    is waited for while the file grows.
+    """
+    writing = threading.Thread(target=stream.disconnect, daemon=True)
+    writing.start()
+    size, since = -1, time.monotonic()
+    while writing.is_alive():
+        writing.join(0.05)
+        if (now := temporary.stat().st_size) != size:
+            size, since = now, time.monotonic()
+        elif time.monotonic() - since > _PATIENCE:
+            raise WriteError(
+                f"save_rerun: {path}: Rerun does not go on writing after {size:,} bytes; is the disk full?"
+            )
     try:
         with open(temporary, "ab") as file:
-            size = file.tell()
+            end = file.tell()
             file.write(bytes(_PROBE))
             file.flush()
-            file.truncate(size)
-        if not size:
-            raise WriteError(f"save_rerun: {path}: nothing was written; is the disk full, or the folder gone?")
+            file.truncate(end)
     except OSError as error:
         raise WriteError(f"save_rerun: {path}: cannot be written whole: {error}") from error
+    if not end:
+        raise WriteError(f"save_rerun: {path}: nothing was written; is the disk full, or the folder gone?")
