@@ -6,8 +6,6 @@ Source: Rerun, https://rerun.io; entities are named by frame, camera and step, a
 from __future__ import annotations
 
 import sys
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 from pcdata import extras
-from pcdata.errors import PcdataError, WriteError
+from pcdata.errors import PcdataError
 from pcdata.files.opening import replacing
+from pcdata.files.pipes import piped
 from pcdata.geometry.rotations import quaternion_from_rotation
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.sources.source import Source
@@ -30,8 +29,6 @@ from pcdata.validation.view_names import view_names
 
 _NO_CLASS = 65535  # of Rerun, for points without a label
 _LARGEST_CLASS = 65534
-_PROBE = 1 << 16  # bytes
-_PATIENCE = 20.0  # seconds without a byte more
 
 
 def save_rerun(
@@ -53,14 +50,18 @@ def save_rerun(
 
     Raises:
         MissingExtraError: rerun is not installed.
-        WriteError: the file cannot be written whole.
+        WriteError: the file cannot be written whole, or the system (Windows) has no named pipes.
     """
     rerun = extras.require("rerun")
-    with replacing("save_rerun", path) as temporary:
+    with replacing("save_rerun", path) as temporary, open(temporary, "wb") as file:
         stream = rerun.RecordingStream("pcdata")
-        stream.save(str(temporary))
-        logged = log_to_rerun(stream, source, pipeline=pipeline, max_points=max_points, progress=progress)
-        _finish(stream, Path(temporary), Path(path))
+        # Rerun's own writer keeps to itself that a disk is full, and may then wait for ever.
+        with piped("save_rerun", file) as pipe:
+            stream.save(str(pipe))
+            try:
+                logged = log_to_rerun(stream, source, pipeline=pipeline, max_points=max_points, progress=progress)
+            finally:
+                stream.disconnect()
     return logged
 
 
@@ -215,32 +216,3 @@ def _gray(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _rgb(color: str) -> tuple[int, ...]:
     return tuple(int(color[place : place + 2], 16) for place in (1, 3, 5))
-
-
-def _finish(stream: Any, temporary: Path, path: Path) -> None:
-    """Write what is left, and refuse a file that may be cut short.
-
-    Rerun writes in a thread of its own, keeps to itself what failed, and where a disk is full may wait for ever. So it
-    is waited for while the file grows.
-    """
-    writing = threading.Thread(target=stream.disconnect, daemon=True)
-    writing.start()
-    size, since = -1, time.monotonic()
-    while writing.is_alive():
-        writing.join(0.05)
-        if (now := temporary.stat().st_size) != size:
-            size, since = now, time.monotonic()
-        elif time.monotonic() - since > _PATIENCE:
-            raise WriteError(
-                f"save_rerun: {path}: Rerun does not go on writing after {size:,} bytes; is the disk full?"
-            )
-    try:
-        with open(temporary, "ab") as file:
-            end = file.tell()
-            file.write(bytes(_PROBE))
-            file.flush()
-            file.truncate(end)
-    except OSError as error:
-        raise WriteError(f"save_rerun: {path}: cannot be written whole: {error}") from error
-    if not end:
-        raise WriteError(f"save_rerun: {path}: nothing was written; is the disk full, or the folder gone?")

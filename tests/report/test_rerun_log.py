@@ -115,9 +115,22 @@ def test_the_command_writes_a_recording(tmp_path, capsys):
 @needs_rerun
 def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
     (tmp_path / "a.rrd").write_bytes(b"old")
-    with largest_file(20_000), pytest.raises(WriteError, match=r"cannot be written whole|is the disk full"):
+    with (
+        largest_file(20_000),
+        pytest.raises(WriteError, match=r"a\.rrd: cannot be written: a file may not become so large"),
+    ):
         save_rerun(tmp_path / "a.rrd", Few())
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("a.rrd", b"old")]
+
+
+@needs_rerun
+def test_an_interrupt_ends_it(tmp_path):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_rerun(tmp_path / "a.rrd", Few(), progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
 
 
 @needs_rerun
