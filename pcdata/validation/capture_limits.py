@@ -29,6 +29,11 @@ class CaptureLimits(Limits):
     workspace_fraction: tuple[float, float] = (0.5, 100_000 / 307_200)
     # A single depth holds less than 1 in 500 readings of any real scene's end; 1 in 100 makes a false wall.
     saturation: tuple[float, float] = (0.002, 0.01)
+    # A voxel or two of a surface may lie at the origin by chance; 1 in 100 points there is an object for a model.
+    at_origin: tuple[float, float] = (0.001, 0.01)
+    # The farthest point over the usual extent of a cloud. At 10 the rest is a tenth of its size once scaled to a unit
+    # sphere; no depth camera sees from 1 to 100 times a distance.
+    extent: tuple[float, float] = (10.0, 100.0)
     # Of the image's width or height. Lenses are mounted within 5 %; K of an image resized by 0.8, the smallest usual
     # change of size, is off by 10 %: halfway.
     principal_point: tuple[float, float] = (0.05, MOST_OFF_CENTER)

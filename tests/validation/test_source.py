@@ -296,10 +296,39 @@ def test_an_organized_cloud_is_judged_on_coverage_and_range(test_data: Path) -> 
     by_id = {report.sample_id: report for report in reports}
     mug = by_id["table_scene_mug_stereo_textured"]
     names = {"valid_fraction", "missing_region", "behind_camera", "depth_unit", "workspace_fraction", "saturation"}
-    assert {check.name for check in mug.findings} == names
+    assert {check.name for check in mug.findings} == names | {"at_origin", "extent"}
     assert mug.verdict is not Verdict.FAIL
     milk = by_id["milk_cartoon_all_small_clorox"]
     assert failed(milk) == {"behind_camera"}, "this file has z pointing backwards"
+
+
+def judged_cloud(folder: Path, points: torch.Tensor) -> dict[str, Finding]:
+    folder.mkdir()
+    write_pcd(folder / "a.pcd", PointCloud(points=points, frame_id="base"))
+    (report,) = validate_source(open_source(folder))
+    return {one.name: one for one in report.findings}
+
+
+@pytest.mark.parametrize(
+    ("stray", "verdict"), [(2.0, Verdict.PASS), (20.0, Verdict.WARN), (1e12, Verdict.FAIL), (1e30, Verdict.FAIL)]
+)
+def test_one_point_that_alone_sets_the_extent_is_found(tmp_path: Path, stray: float, verdict: Verdict) -> None:
+    points = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) + 0.2
+    points[17] = torch.tensor([stray, 0.5, 0.5])
+    finding = judged_cloud(tmp_path / "clouds", points)["extent"]
+    assert finding.verdict is verdict
+    assert verdict is Verdict.PASS or f"({stray:.3g}, 0.5, 0.5); 1 lie beyond" in finding.found
+    # Without it, or of identical points, nothing is found.
+    assert judged_cloud(tmp_path / "rest", points[18:])["extent"].verdict is Verdict.PASS
+    assert judged_cloud(tmp_path / "same", points[:1].expand(9, 3).contiguous())["extent"].verdict is Verdict.PASS
+
+
+@pytest.mark.parametrize(("count", "verdict"), [(0, Verdict.PASS), (30, Verdict.WARN), (400, Verdict.FAIL)])
+def test_points_at_the_origin_are_found(tmp_path: Path, count: int, verdict: Verdict) -> None:
+    points = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) + 0.2
+    points[:count] = 0
+    finding = judged_cloud(tmp_path / "clouds", points)["at_origin"]
+    assert (finding.verdict, finding.value) == (verdict, count / 5000)
 
 
 def test_an_unorganized_cloud_is_judged_on_range_alone(tmp_path: Path) -> None:

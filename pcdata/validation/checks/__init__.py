@@ -9,6 +9,8 @@ from pcdata.validation.checks import largest_plane
 from pcdata.validation.checks import objects
 from pcdata.validation.checks import cameras
 from pcdata.validation.checks import behind_camera
+from pcdata.validation.checks import at_origin
+from pcdata.validation.checks import strays
 from pcdata.validation.checks import sequence
 from pcdata.validation.checks import pose_direction  # not of views whose depth is of another moment or unit
 from pcdata.validation.checks import view_overlap  # not of views whose poses lead the wrong way
@@ -17,6 +19,7 @@ from pcdata.validation.checks import pose_direction_over_time
 
 # isort: on
 __all__ = [
+    "at_origin",
     "behind_camera",
     "cameras",
     "color_on_depth",
@@ -29,5 +32,6 @@ __all__ = [
     "readings",
     "sequence",
     "stored_files",
+    "strays",
     "view_overlap",
 ]
