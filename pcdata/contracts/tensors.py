@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.host import all_finite, any_negative
+from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
 from pcdata.errors import CaptureError, DeviceError, DTypeError, NonFiniteError, ShapeError, TooFewPointsError
 
 _DTYPES: dict[str, tuple[torch.dtype, ...]] = {
@@ -40,6 +41,7 @@ class _TensorSpec:
     """One parsed contract."""
 
     dims: tuple[str, ...]
+    sizes: tuple[int | None, ...]  # those of the dims that are numbers
     dtypes: tuple[torch.dtype, ...]
     is_ptr: bool = False
     is_depth: bool = False  # no value is negative
@@ -59,9 +61,11 @@ def parse_spec(text: str) -> _TensorSpec:
     if text.startswith("ptr "):
         pointers, _, least = text.partition(">=")
         _, rows, clouds = pointers.split()
-        return _TensorSpec((rows, clouds), (torch.int64,), is_ptr=True, least=int(least or 0))
+        return _TensorSpec((rows, clouds), (None, None), (torch.int64,), is_ptr=True, least=int(least or 0))
     shape, _, dtype = (part.strip() for part in text.partition(":"))
-    return _TensorSpec(tuple(shape.split()), _DTYPES[dtype or "float32"], is_depth=dtype == "depth")
+    dims = tuple(shape.split())
+    sizes = tuple([int(dim) if dim.isdigit() else None for dim in dims])
+    return _TensorSpec(dims, sizes, _DTYPES[dtype or "float32"], is_depth=dtype == "depth")
 
 
 def check_tensors(
@@ -114,7 +118,7 @@ def check_tensors(
             check_ptr_values(where, name, value, sizes.get(spec.dims[0]))
             if spec.least:
                 _require_rows(where, value, spec, bound_by.get(spec.dims[0], name))
-        elif finite and value.dtype.is_floating_point and not all_finite(value):
+        elif finite and value.dtype.is_floating_point and not _known_finite(value):
             bad = int((~torch.isfinite(value)).sum())
             raise NonFiniteError(
                 f"{where}: {name} has {bad} NaN or infinite values of {value.numel()}; "
@@ -123,6 +127,16 @@ def check_tensors(
         elif spec.is_depth:
             check_depths(where, name, value)
     return sizes
+
+
+def _known_finite(value: Tensor) -> bool:
+    """Say whether all values are finite; within a chain each tensor is read once."""
+    if is_known(FINITE, value):
+        return True
+    if not all_finite(value):
+        return False
+    note(FINITE, value)
+    return True
 
 
 def check_ptr_values(where: str, name: str, ptr: Tensor, num_rows: int | None) -> None:
@@ -140,12 +154,15 @@ def check_depths(where: str, name: str, depths: Tensor) -> None:
     Raises:
         CaptureError: with how many are negative, and the lowest.
     """
+    if is_known(NOT_NEGATIVE, depths):
+        return
     if any_negative(depths):
         negative = depths < 0
         raise CaptureError(
             f"{where}: {name} must be metres with 0 for no reading, but {int(negative.sum())} values are negative "
             f"(lowest {float(depths.detach().min()):g}); set them to 0 where the image is read"
         )
+    note(NOT_NEGATIVE, depths)
 
 
 def _require_rows(where: str, ptr: Tensor, spec: _TensorSpec, rows: str) -> None:
@@ -163,19 +180,18 @@ def _bind_shape(
     where: str, name: str, value: Tensor, spec: _TensorSpec, sizes: dict[str, int], bound_by: dict[str, str]
 ) -> None:
     given = tuple(value.shape)
-    dims: tuple[str, ...] = spec.dims
-    found: tuple[int, ...] = given
+    dims, wanted, found = spec.dims, spec.sizes, given
     if spec.is_ptr:
         if len(given) != 1 or given[0] < 2:
             raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}; one cloud is [0, N]")
-        dims, found = dims[1:], (given[0] - 1,)
+        dims, wanted, found = dims[1:], wanted[1:], (given[0] - 1,)
     elif len(given) != len(dims):
         raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-    for dim, size in zip(dims, found):
-        if dim.isdigit() and int(dim) != size:
+    for want, size in zip(wanted, found):
+        if want is not None and want != size:
             raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-    for dim, size in zip(dims, found):
-        if dim.isdigit():
+    for dim, want, size in zip(dims, wanted, found):
+        if want is not None:
             continue
         if sizes.setdefault(dim, size) != size:
             raise ShapeError(

@@ -10,14 +10,18 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.host import rising
+from pcdata.contracts.known import RIGID, is_known, note
 from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.rows import counts_from_ptr
+from pcdata.geometry.rigid import are_few_and_rigid
 
 # Kernels number the pixels of an image, with a margin around it, in 63 bits.
 _MOST_PIXELS = 2**31 - 1
 # An image has lines of missing pixels where every so many-th point is before one. Depth that was moved to the image of
 # another camera, and is sparser there, has 0.2 and more; other holes are rarely one pixel wide.
 _LINED = 0.05
+# Of the entries of rotation^T rotation: kernels allow for motions that stretch lengths by up to 5e-5.
+_MOST_OFF = 2e-5
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,8 @@ def checked_grid(where: str, name: str, arguments: Mapping[str, Any]) -> ImageGr
         )
     if grid.camera_from_points is not None:
         _check_rigid(where, grid.camera_from_points, len(ptr) - 1, points.device)
-    if len(pixel) == 0:
+    fact = pixels_rise(grid.size)
+    if len(pixel) == 0 or is_known(fact, pixel, ptr):
         return grid
     filled = counts_from_ptr(ptr) > 0
     first, last = ptr[:-1][filled], ptr[1:][filled] - 1
@@ -75,7 +80,13 @@ def checked_grid(where: str, name: str, arguments: Mapping[str, Any]) -> ImageGr
             f"{where}: grid pixels must increase within each cloud and lie in 0..{height * width - 1}; "
             "the points were reordered or repeated since they were read, so pass grid=None"
         )
+    note(fact, pixel, ptr)
     return grid
+
+
+def pixels_rise(size: tuple[int, int]) -> tuple[str, int, int]:
+    """Name the fact that pixels, with row pointers, are those of images of this size: see ``contracts.known``."""
+    return ("pixels rise", *size)
 
 
 def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.device) -> None:
@@ -84,17 +95,20 @@ def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.devi
         raise ShapeError(f"{name} must be ({num_clouds}, 4, 4), one per cloud, got {tuple(motion.shape)}")
     if motion.device != device:
         raise DeviceError(f"{name} is on {motion.device} but points is on {device}; move one with .to()")
+    if is_known(RIGID, motion) or are_few_and_rigid(motion, tolerance=_MOST_OFF):
+        return
     wide = motion.double()
     rotation, last = wide[:, :3, :3], wide[:, 3]
     off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device=device)).abs().amax((1, 2))
     off = torch.maximum(off, (last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1))
-    # Kernels allow for motions that stretch lengths by up to 5e-5; NaN fails too.
-    wrong = (~(off <= 2e-5) | ~torch.isfinite(wide).all(2).all(1)).nonzero().squeeze(1).tolist()
+    # NaN fails too.
+    wrong = (~(off <= _MOST_OFF) | ~torch.isfinite(wide).all(2).all(1)).nonzero().squeeze(1).tolist()
     if wrong:
         raise ConfigError(
             f"{name}[{wrong[0]}] is not rigid: rotation^T rotation is off the identity by {float(off[wrong[0]]):.2g}; "
             "a window of a scaled or sheared cloud proves nothing, so pass grid=None"
         )
+    note(RIGID, motion)
 
 
 def is_lined(pixel_index: Tensor, size: tuple[int, int]) -> bool:

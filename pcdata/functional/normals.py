@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
+from pcdata.contracts.host import all_finite
+from pcdata.contracts.known import FINITE, is_known
 from pcdata.contracts.numbers import checked_count, checked_length
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
@@ -104,7 +106,7 @@ def _check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None
             raise DTypeError(f"{where}: {name} must be a float tensor, not {getattr(value, 'dtype', type(value))}")
         if value.device != points.device:
             raise DeviceError(f"{where}: {name} is on {value.device} but points is on {points.device}")
-        if not bool(torch.isfinite(value).all()):
+        if not is_known(FINITE, value) and not all_finite(value):
             raise NonFiniteError(f"{where}: {name} has NaN or infinite values; drop those points first")
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise ShapeError(

@@ -49,6 +49,11 @@ def cloud_of_rows(ptr: Tensor) -> Tensor:
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the row pointers of ``rows[mask]`` for a (N,) bool mask."""
+    if mask.device.type == "cpu" and ptr.shape[0] <= _FEW_CLOUDS:
+        flags, ends = mask.numpy(), [0]
+        for start, stop in pairwise(ptr.tolist()):
+            ends.append(ends[-1] + int(np.count_nonzero(flags[start:stop])))
+        return torch.tensor(ends, dtype=torch.int64, device="cpu")
     return ptr_from_counts(count_per_cloud(mask, ptr))
 
 

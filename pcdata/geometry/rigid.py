@@ -76,6 +76,8 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
     """
     if pose.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: a pose must be (..., 4, 4), got {tuple(pose.shape)}")
+    if pose.ndim == 3 and are_few_and_rigid(pose, tolerance=tolerance):
+        return
     flat = pose.detach().double().reshape(-1, 4, 4)
     rotation, last = flat[:, :3, :3], flat[:, 3]
     eye = torch.eye(4, dtype=torch.float64, device=flat.device)
@@ -96,6 +98,27 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
         if bool(mirrored[index]):
             raise PoseError(f"{name} is a mirror (determinant -1), not a rotation; check the axis convention")
         raise PoseError(f"{name} must have the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?")
+
+
+def are_few_and_rigid(matrices: Tensor, *, tolerance: float) -> bool:
+    """Say whether (B, 4, 4) matrices are rotations and translations, for few and in microseconds.
+
+    False may also mean that it takes a closer look.
+    """
+    if len(matrices) > _FEW or not _is_plain(matrices):
+        return False
+    # Entries of R R^T and of R^T R are off those of the identity by at most three times as much as each other.
+    limit = tolerance / 3
+    for (a, b, c, x), (d, e, f, y), (g, h, i, z), last in matrices.tolist():
+        off = max(
+            *(abs(a * a + b * b + c * c - 1.0), abs(d * d + e * e + f * f - 1.0), abs(g * g + h * h + i * i - 1.0)),
+            *(abs(a * d + b * e + c * f), abs(a * g + b * h + c * i), abs(d * g + e * h + f * i)),
+        )
+        is_turn = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+        # Where an entry is NaN, so is the product that says whether it is a turn: then it is none.
+        if not (off <= limit and is_turn and math.isfinite(x + y + z) and last == [0.0, 0.0, 0.0, 1.0]):
+            return False
+    return True
 
 
 def check_affine(where: str, matrix: Tensor) -> None:

@@ -19,6 +19,8 @@ _SPECS = {
     "source_from_cloud": "B 4 4 : float64",
 }
 
+_FIELD_SPECS = {**{name: field.spec for name, field in FIELDS.items()}, "ptr": "ptr N B"}
+
 
 def check_cloud(
     cloud: CloudBatch, fields: Mapping[str, Tensor | None], extra: Mapping[str, Tensor], ptr: Tensor
@@ -38,6 +40,11 @@ def check_cloud(
     check_names("PointCloud", cloud.frame_id, cloud.unit)
     if cloud.recorded_signals:
         check_signals(cloud)
+
+
+def check_fields(fields: Mapping[str, Tensor | None], ptr: Tensor) -> None:
+    """Raise unless shapes, dtypes and devices of fields that every cloud may have fit together."""
+    check_tensors("PointCloud", {**fields, "ptr": ptr}, _FIELD_SPECS, check_values=False)
 
 
 def check_motions(where: str, motions: Mapping[str, Tensor]) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pcdata.contracts.host import any_negative
+from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
 from pcdata.contracts.lengths import check_depth
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, FrameError, ShapeError
@@ -216,7 +217,11 @@ class DepthFrame(Structure):
     def masked(self, *, near: float | None = None, far: float | None = None, mask: Tensor | None = None) -> DepthFrame:
         """Return the frame with "no reading" wherever depth is not in [near, far] or ``mask`` (V, H, W) is False."""
         check_tensors("DepthFrame.masked", {"depth": self.depth, "mask": mask}, _MASKED, check_values=False)
-        return derived(self, depth=mask_depth(self.depth, near, far, mask))
+        depth = mask_depth(self.depth, near, far, mask)
+        note(NOT_NEGATIVE, depth)  # what is NaN or below 0 is no reading
+        if far is not None or is_known(FINITE, self.depth):
+            note(FINITE, depth)
+        return derived(self, depth=depth)
 
     def with_provenance(self, entries: Mapping[str, Any]) -> DepthFrame:
         """Merge JSON-able facts into the provenance."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -60,8 +61,8 @@ def seen_through_pinhole(
 def within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:
     """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
     if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
-        last = ptr[1:][ptr[1:] > ptr[:-1]] - 1
-        if bool((source_index[last] < num_pixels).all()):
+        rows = source_index.numpy()
+        if all(rows[stop - 1] < num_pixels for start, stop in pairwise(ptr.tolist()) if stop > start):
             return source_index
     return source_index % num_pixels
 

@@ -11,14 +11,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from pcdata.contracts.known import FINITE, is_known, note
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
-from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, pixels_rise
 from pcdata.functional.motions import are_plain_motions
 from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_rows, pick_rows, ptr_from_counts
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
-from pcdata.structures.cloud_checks import check_cloud, check_motions
+from pcdata.structures.cloud_checks import check_cloud, check_fields, check_motions
 from pcdata.structures.cloud_summary import cloud_summary
 from pcdata.structures.image_layout import within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
@@ -179,6 +180,9 @@ class PointCloud(CloudBatch):
     def with_fields(self, **values: Tensor | None) -> PointCloud:
         """Replace, add or (None) drop per-point fields of unchanged rows; new extra fields need :meth:`with_extra`."""
         core = {name: value for name, value in values.items() if name in FIELDS}
+        if len(core) == len(values) and "points" not in core:  # the others stay what they are, and fit
+            check_fields({**{name: vars(self)[name] for name in FIELDS}, **core}, self.ptr)
+            return derived(self, **core, layout=None if "source_index" in core else self.layout)
         extra = dict(self.extra)
         for name in values.keys() - core.keys():
             value = values[name]
@@ -233,6 +237,12 @@ class PointCloud(CloudBatch):
         if ptr.device.type == "cpu":
             check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
         layout = self.layout if index.dtype is torch.bool else None
+        if is_known(FINITE, self.points):
+            note(FINITE, rows["points"])
+        if layout is not None and "source_index" in rows:
+            rises = pixels_rise(layout.size)
+            if is_known(rises, vars(self)["source_index"], self.ptr):
+                note(rises, rows["source_index"], ptr)
         return self._with_rows(rows, ptr=ptr, layout=layout)
 
     def _with_rows(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:

@@ -22,6 +22,13 @@ def derived(structure: S, **changes: Any) -> S:
     return copy
 
 
+def made(kind: type[S], **attributes: Any) -> S:
+    """Return a structure of all its attributes, which are known to be what the constructor requires and fills in."""
+    structure = object.__new__(kind)
+    structure.__dict__.update(attributes)
+    return structure
+
+
 def checked_copy(structure: S, **changes: Any) -> S:
     """Return a copy with other attributes, made by the constructor: ``dataclasses.replace`` that reads no attribute.
 

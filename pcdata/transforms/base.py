@@ -30,6 +30,7 @@ from pcdata.errors import (
     UnitError,
     add_note,
 )
+from pcdata.functional.rows import listed_counts
 from pcdata.registry import Registry
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
@@ -328,8 +329,8 @@ class Transform(nn.Module):
         if isinstance(result, DepthFrame):
             (step,) = _NotedSteps(self._note(), _small(params, 1), drawn=drawn, rows=rows)
             return result.with_provenance({"history": [*result.provenance.get("history", ()), step]})
-        before = data.counts.tolist() if isinstance(data, PointCloud) and self.keeps_clouds else None
-        return self.recorded_counts(result, before, result.counts.tolist(), params, drawn=drawn, rows=rows)
+        before = listed_counts(data.ptr) if isinstance(data, PointCloud) and self.keeps_clouds else None
+        return self.recorded_counts(result, before, listed_counts(result.ptr), params, drawn=drawn, rows=rows)
 
     def recorded_counts(
         self,

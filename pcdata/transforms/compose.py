@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Generator, Tensor, nn
 
+from pcdata.contracts.known import forget, keeping_known, knowing_nothing
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
 from pcdata.functional.stored_rows import gather_kept
@@ -115,6 +116,7 @@ class Compose(Transform):
         """
         return self._run(data, generator, after=after)
 
+    @keeping_known()
     def _run(
         self,
         data: Data,
@@ -146,6 +148,7 @@ class Compose(Transform):
                 own = steps[position : position + together]
                 cloud = run_motions(own, data, generator, in_place=is_own, sources=sources)
                 if cloud is not None:
+                    forget()  # the memory may be that of the clouds before
                     data, position, sources = cloud, position + together, None
                     if after is not None:
                         after(range(position - together, position), data)
@@ -315,10 +318,19 @@ class Compose(Transform):
 
 
 def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:
-    if not step.is_random:
-        return step(data, generator=None), generator
-    # One stream per cloud, split off once: random steps in a row draw from the same streams, so that running only the
-    # random suffix on a stored prefix gives the same draws.
-    assert generator is not None
-    generator = Streams.of(generator, num_clouds(data))
-    return step(data, generator=generator), generator
+    own = None
+    if step.is_random:
+        # One stream per cloud, split off once: random steps in a row draw from the same streams, so that running only
+        # the random suffix on a stored prefix gives the same draws.
+        assert generator is not None
+        own = generator = Streams.of(generator, num_clouds(data))
+    if step._forward_hooks or step._forward_pre_hooks or _is_foreign(step):
+        with knowing_nothing():
+            return step(data, generator=own), generator
+    return step(data, generator=own), generator
+
+
+def _is_foreign(step: Transform) -> bool:
+    """Say whether code that is not pcdata's runs in a step: nobody knows what it does to what it has in hand."""
+    within = step.parts() if step._modules else ()
+    return any(not type(part).__module__.startswith("pcdata.") for part in (step, *within))

@@ -11,7 +11,8 @@ from torch import Tensor
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth.deproject import Deprojected, deproject_images
 from pcdata.rng import Streams
-from pcdata.structures import CAMERA_FRAME, DepthFrame, ImageLayout, Kind, PointCloud
+from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, ImageLayout, Kind, PointCloud
+from pcdata.structures.structure import made
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import ConfidenceName, FromSensor, Metres, confidence_named
@@ -89,8 +90,8 @@ class Deproject(Transform):
 
     def transform(self, data: DepthFrame, params: Params) -> PointCloud:
         """Deproject all views in one call."""
-        made = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
-        return self.cloud_of(data, made)
+        own = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
+        return self.cloud_of(data, own)
 
     def cameras_of(self, data: DepthFrame) -> tuple[Tensor, Tensor | None]:
         """Return the intrinsics (V, 3, 3) and distortion (V, D) where the depth lies."""
@@ -102,28 +103,33 @@ class Deproject(Transform):
         images = {"labels": data.labels, "confidence": data.confidence}
         return {name: image for name, image in images.items() if image is not None}
 
-    def cloud_of(self, data: DepthFrame, made: Deprojected) -> PointCloud:
-        """Return the points with all that the capture knows about them."""
+    def cloud_of(self, data: DepthFrame, own: Deprojected) -> PointCloud:
+        """Return the points with all that the capture, which is checked, knows about them."""
         intrinsics, distortion = self.cameras_of(data)
         identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
         frames = {CAMERA_FRAME: identity}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
         history = tuple(data.provenance.get("history", ()))
-        extra = {name: rows for name, rows in made.rows.items() if name != "labels"}
-        return PointCloud(
-            points=made.points,
-            ptr=made.ptr,
+        extra = {name: rows for name, rows in own.rows.items() if name != "labels"}
+        return made(
+            PointCloud,
+            points=own.points,
+            ptr=own.ptr,
             frame_id=CAMERA_FRAME,
-            colors=made.colors,
-            labels=made.rows.get("labels"),
-            source_index=made.source_index,
+            unit=METRE,
+            colors=own.colors,
+            normals=None,
+            labels=own.rows.get("labels"),
+            source_index=own.source_index,
             extra=extra,
             kinds=dict.fromkeys(extra, Kind.MINIMUM),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, dtype=torch.float32, device=data.device),
+            source_from_cloud=identity.clone(),
+            source_frame=CAMERA_FRAME,
             frames=frames,
-            meta=[_view_meta(data, view) for view in range(data.num_views)],
+            meta=tuple([_view_meta(data, view) for view in range(data.num_views)]),
             history=(history,) * data.num_views,
             recorded_signals={name: signal.repeated(data.num_views) for name, signal in data.recorded_signals.items()},
         )

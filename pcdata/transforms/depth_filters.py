@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated, Literal
 
 import torch
 from annotated_types import Ge, Gt, Interval, Le
 
+from pcdata.contracts.host import negated
 from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth, spatial_filter
 from pcdata.functional.depth.flying_pixels import flying_pixel_mask
 from pcdata.functional.depth.holes import fill_holes, fill_rows
 from pcdata.structures import Confidence, DepthFrame
 from pcdata.structures.filled_depth import with_filled_depth
+from pcdata.structures.structure import derived
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
@@ -93,7 +94,8 @@ class RemoveFlyingPixels(MaskTransform):
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Blank the flying pixels of all views."""
         flying = flying_pixel_mask(data.depth, tolerance=self.tolerance, min_neighbors=self.min_neighbors)
-        confidence = data.confidence
-        if confidence is not None:
-            confidence = torch.where(flying, int(Confidence.NO_READING), confidence).to(torch.uint8)
-        return replace(data, depth=torch.where(flying, 0.0, data.depth), confidence=confidence)
+        left = data.masked(mask=negated(flying))
+        if data.confidence is None:
+            return left
+        confidence = torch.where(flying, int(Confidence.NO_READING), data.confidence).to(torch.uint8)
+        return derived(left, confidence=confidence)

@@ -11,8 +11,10 @@ from collections.abc import Sequence
 
 import torch
 
+from pcdata.contracts.known import FINITE, note
 from pcdata.errors import PcdataError
 from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
+from pcdata.functional.image_grid import pixels_rise
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.structure import derived
 from pcdata.transforms.base import Data, Params, Transform
@@ -90,6 +92,9 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     if done is None:
         return None
     made, readings = done
+    note(FINITE, made.points)  # they are within the box
+    if frame.num_views == 1:
+        note(pixels_rise(frame.size), made.source_index, made.ptr)
     cloud = derived(
         moved,
         points=made.points,

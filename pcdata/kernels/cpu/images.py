@@ -191,24 +191,6 @@ def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.contiguous()
 
 
-def rays_of_cameras(intrinsics: Tensor, size: tuple[int, int], distortion: Tensor | None) -> Rays:
-    """Return the rays of columns and rows where they say all, else those of every pixel, kept for the next call."""
-    crossed = None if distortion is not None else _crossed_rays(intrinsics, size)
-    if crossed is not None:
-        return (*crossed, None)
-    return None, None, _cached_rays(_Key(intrinsics), size, None if distortion is None else _Key(distortion))
-
-
-def _crossed_rays(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-    """Return x/z of every column (V, W) and y/z of every row (V, H); None if a skew makes x depend on the row."""
-    if bool((intrinsics[:, 0, 1] != 0).any()):
-        return None
-    top = pixel_rays(intrinsics, (1, size[1]))[:, 0, :, 0]
-    left = pixel_rays(intrinsics, (size[0], 1))[:, :, 0, 1]
-    # An infinite y would make x NaN in the reference.
-    return (top.float(), left.float()) if bool(left.isfinite().all()) else None
-
-
 class _Key:
     """A small tensor that a cache can look up by value."""
 
@@ -221,6 +203,26 @@ class _Key:
 
     def __hash__(self) -> int:
         return hash(self.value)
+
+
+def rays_of_cameras(intrinsics: Tensor, size: tuple[int, int], distortion: Tensor | None) -> Rays:
+    """Return the rays of columns and rows where they say all, else those of every pixel, kept for the next call."""
+    crossed = None if distortion is not None else _crossed_rays(_Key(intrinsics), size)
+    if crossed is not None:
+        return (*crossed, None)
+    return None, None, _cached_rays(_Key(intrinsics), size, None if distortion is None else _Key(distortion))
+
+
+@functools.lru_cache(maxsize=16)  # some kilobytes each
+def _crossed_rays(camera: _Key, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
+    """Return x/z of every column (V, W) and y/z of every row (V, H); None if a skew makes x depend on the row."""
+    intrinsics = camera.tensor
+    if bool((intrinsics[:, 0, 1] != 0).any()):
+        return None
+    top = pixel_rays(intrinsics, (1, size[1]))[:, 0, :, 0]
+    left = pixel_rays(intrinsics, (size[0], 1))[:, :, 0, 1]
+    # An infinite y would make x NaN in the reference.
+    return (top.float().contiguous(), left.float().contiguous()) if bool(left.isfinite().all()) else None
 
 
 @functools.lru_cache(maxsize=4)  # 7 MB each at 1280x720: one per camera of a usual rig

@@ -34,7 +34,7 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
         call("pc_farthest_points", *arrays, wanted, picks)
     else:
         call("pc_wide_farthest_points", *arrays, width, wanted, picks)
-    return picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
+    return picks if len(counts) == 1 else picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
 
 
 @kernel("voxel_means", "cpu")
