@@ -43,6 +43,7 @@ EXTRAS = {
         _Extra("ray", "ray", "builds on a cluster (pcdata build --engine ray)"),
         _Extra("rerun", "rerun", "logs for Rerun's viewer (pcdata view --rerun)"),
         _Extra("rosbags", "ros", "recordings of robots (.bag, .mcap, .db3)"),
+        _Extra("cuda.core", "cuda", "kernels on a GPU (the cuda backend)"),
         _Extra("open3d", "open3d", "global alignment, and handing clouds, meshes and cameras to Open3D and back"),
         _Extra("torch_geometric", "pyg", "handing clouds to PyTorch Geometric and back"),
         _Extra(
@@ -70,7 +71,7 @@ def require(module: str) -> ModuleType:
 def why_missing(module: str) -> str | None:
     """Return None when the dependency can be imported, else what is wrong and what to run."""
     extra = EXTRAS[module]
-    if importlib.util.find_spec(module) is None:
+    if not _is_found(module):
         return f"{module} is not installed; it is needed for {extra.purpose}: run {extra.install}"
     try:
         importlib.import_module(module)
@@ -80,3 +81,10 @@ def why_missing(module: str) -> str | None:
             repair = f"on Debian or Ubuntu run {_OPEN3D_LIBRARIES}"
         return f"{module} is installed but cannot be loaded ({type(error).__name__}: {error}); {repair}"
     return None
+
+
+def _is_found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # nor is the package that it is a part of
+        return False

@@ -14,6 +14,7 @@ from pcdata import extras
 from pcdata.errors import MissingExtraError
 
 PACKAGES = {
+    "cuda.core": "cuda_core",
     "cv2": "opencv_python_headless",
     "rerun": "rerun_sdk",
 }  # where it is no module

@@ -38,12 +38,18 @@ REFERENCE = "torch"
 # Backend name -> module that registers its kernels when imported and defines `unavailable() -> str | None`.
 BACKEND_MODULES = {
     "cpu": "pcdata.kernels.cpu",
+    "cuda": "pcdata.kernels.cuda",
     "torch_tree": "pcdata.kernels.torch_tree",
     "torch_cluster": "pcdata.kernels.torch_cluster",
 }
 
 # What `auto` tries, best first. torch_cluster is chosen only by name: it covers few calls.
-AUTO_ORDER: dict[str, tuple[str, ...]] = {"cpu": ("cpu", "torch_tree", REFERENCE)}
+AUTO_ORDER: dict[str, tuple[str, ...]] = {
+    "cpu": ("cpu", "torch_tree", REFERENCE),
+    "cuda": ("cuda", "torch_tree", REFERENCE),
+}
+# The devices whose memory a backend reads; one that is not named here takes any.
+DEVICES_OF: dict[str, tuple[str, ...]] = {"cpu": ("cpu",), "cuda": ("cuda",)}
 OTHER_DEVICES = ("torch_tree", REFERENCE)
 
 
@@ -214,16 +220,17 @@ def first_live(device: torch.device, has_kernel: Callable[[str], bool]) -> str:
             continue
         if reason is None:
             return name
-        _warn_of_slow_bodies(reason)
+        _warn_of_slow_bodies(device.type, reason)
     return REFERENCE
 
 
 @functools.cache
-def _warn_of_slow_bodies(reason: str) -> None:
+def _warn_of_slow_bodies(device_type: str, reason: str) -> None:
     # A process that another one started (a loader's worker, a build's) leaves the word to that one.
     if multiprocessing.parent_process() is None:
         warnings.warn(
-            f"operations on the CPU run in plain torch, many times slower than compiled: {reason}",
+            f"operations on {'the CPU' if device_type == 'cpu' else device_type.upper()} run in plain torch, many "
+            f"times slower than compiled: {reason}",
             SlowBackendWarning,
             stacklevel=2,
         )
@@ -232,7 +239,7 @@ def _warn_of_slow_bodies(reason: str) -> None:
 def warn_if_slow() -> None:
     """Give the warning of :func:`first_live` now, where worker processes that stay silent are about to be started."""
     if (reason := why_unavailable("cpu")) is not None:
-        _warn_of_slow_bodies(reason)
+        _warn_of_slow_bodies("cpu", reason)
 
 
 def _choose(operation: _Operation, backend: str, device: torch.device, wants_gradient: bool = False) -> str:
@@ -251,4 +258,9 @@ def _choose(operation: _Operation, backend: str, device: torch.device, wants_gra
         raise BackendError(f"{operation.name}: backend {backend!r} is not available: {reason}")
     if not operation.serves(backend):
         raise BackendError(f"{operation.name}: backend {backend!r} has no kernel for it; use backend='auto'")
+    if device.type not in DEVICES_OF.get(backend, (device.type,)):
+        raise BackendError(
+            f"{operation.name}: backend {backend!r} computes on {' or '.join(DEVICES_OF[backend])}, but the tensors "
+            f"are on {device}; move them with .to(), or use backend='auto'"
+        )
     return backend

@@ -16,7 +16,7 @@ import pcdata.kernels
 CORE = Path(pcdata.kernels.__file__).parent / "core"
 MATH = sorted((CORE / "pc" / "math").glob("*.hpp"))
 
-pytestmark = pytest.mark.skipif(not CORE.exists(), reason="the sources of the core are not installed")
+pytestmark = pytest.mark.skipif(not (CORE / "src").exists(), reason="the sources of the core are not installed")
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 
 # What NVRTC has without any header, as far as the core's maths use it.
@@ -83,6 +83,14 @@ def test_every_function_of_the_math_headers_is_marked_for_the_gpu():
         for line in header.read_text().splitlines():
             opens = re.match(r"\s*(?!for|if|while|return|#|//)[\w:<>&*, ]*\b[\w=+\-*/()]+\(.*\{$", line)
             assert not opens or "PC_HD" in line, f"{header.name}: {line}"
+
+
+def test_kernels_of_a_gpu_read_nothing_that_a_wheel_lacks():
+    headers = sorted((CORE / "pc" / "gpu").glob("*.hpp"))
+    assert headers
+    for header in headers:
+        for name in re.findall(r"#include (\S+)", header.read_text()):
+            assert re.fullmatch(r'"pc/(gpu|math)/\w+\.hpp"|"harness/threads\.hpp"', name), f"{header.name}: {name}"
 
 
 @needs_compiler

@@ -1,0 +1,27 @@
+// Rows of ragged clouds: cloud b is rows ptr[b] to ptr[b+1].
+#pragma once
+
+#include "pc/gpu/thread.hpp"
+#include "pc/math/distance.hpp"
+
+namespace pc::gpu {
+
+// The cloud of a row.
+PC_HD int64_t cloud_of(const int64_t* ptr, int64_t clouds, int64_t row) {
+  int64_t low = 0, high = clouds;  // ptr[low] <= row < ptr[high]
+  while (high - low > 1) {
+    const int64_t middle = (low + high) / 2;
+    if (ptr[middle] <= row)
+      low = middle;
+    else
+      high = middle;
+  }
+  return low;
+}
+
+PC_HD float squared_between(const float* points, int64_t a, int64_t b) {
+  const float *p = points + 3 * a, *q = points + 3 * b;
+  return math::squared_distance(p[0], p[1], p[2], q[0], q[1], q[2]);
+}
+
+}  // namespace pc::gpu

@@ -1,0 +1,8 @@
+"""The GPU backend: importing it registers every kernel of ``core/pc/gpu`` beside its reference."""
+
+from __future__ import annotations
+
+from pcdata.kernels.cuda import outliers as cuda_outliers
+from pcdata.kernels.cuda.gpu import unavailable
+
+__all__ = ["cuda_outliers", "unavailable"]

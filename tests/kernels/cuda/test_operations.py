@@ -1,0 +1,67 @@
+"""Every kernel of the GPU gives what the reference gives, whatever the order of its threads."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pcdata.contracts.dispatch import OPERATIONS
+from tests import pretend_device
+from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
+from tests.kernels.cuda import harness
+
+pytestmark = pytest.mark.skipif(harness.unavailable() is not None, reason=str(harness.unavailable()))
+harness.register()
+
+SERVED = [example for example in EXAMPLES if OPERATIONS[example.name].serves(harness.BACKEND)]
+each_served = pytest.mark.parametrize(
+    "example", SERVED, ids=[f"{example.name}-{example.cloud.__name__}" for example in SERVED]
+)
+
+
+@each_served
+def test_it_gives_what_the_reference_gives(example, ordered):
+    arguments = packed(example, clouds_of(example))
+    expected = call(example, arguments, backend="torch")
+    for found, wanted in zip(call(example, arguments, backend=harness.BACKEND), expected, strict=True):
+        if wanted.is_floating_point():
+            torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
+        else:
+            assert torch.equal(found, wanted)
+
+
+@each_served
+def test_a_cloud_in_a_batch_is_what_it_is_alone(example):
+    clouds = clouds_of(example)
+    expected = call(example, packed(example, clouds), backend="torch")
+    together = call(example, packed(example, clouds), backend=harness.BACKEND)
+    assert all(found.shape == wanted.shape for found, wanted in zip(together, expected, strict=True))
+    for cloud in clouds:
+        alone = packed(example, [cloud])
+        for found, wanted in zip(
+            call(example, alone, backend=harness.BACKEND), call(example, alone, backend="torch"), strict=True
+        ):
+            torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.skipif(not pretend_device.AVAILABLE, reason="this PyTorch has no devices written in Python")
+@each_served
+def test_on_a_device_auto_takes_the_kernels_and_results_stay_there(example, monkeypatch):
+    device = harness.as_on_a_gpu(monkeypatch)
+    arguments = packed(example, clouds_of(example))
+    expected = call(example, arguments, backend="torch")
+    launcher = harness.use(0)
+    found = call(example, {key: value.to(device) for key, value in arguments.items()})
+    assert launcher.started
+    for one, wanted in zip(found, expected, strict=True):
+        assert one.device.type == device.type
+        torch.testing.assert_close(pretend_device.host(one), wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_every_kernel_is_run_by_some_operation():
+    ran: set[str] = set()
+    for example in SERVED:
+        launcher = harness.use(0)
+        call(example, packed(example, clouds_of(example)), backend=harness.BACKEND)
+        ran |= set(launcher.started)
+    assert ran == set(harness.kernel_names())
